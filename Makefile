@@ -1,0 +1,54 @@
+# undulog: every target does its own set-up. On a bare machine with Python 3.11:
+#   make demo    simulate, record, analyse, report, replay file under out/demo/
+#   make test    all tests but the slow ones
+PYTHON ?= $(firstword $(shell command -v python3.11 python3 python 2>/dev/null))
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+PACKAGES := capture sim analysis replay
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test slow check format bench docs lock clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(READY): requirements.lock pyproject.toml
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "undulog is set up on Python 3.11 (pybullet has wheels for it); found %d.%d. Use: make PYTHON=python3.11" % sys.version_info[:2])'
+	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
+	@echo "Installing the locked packages into $(VENV) (about a minute) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and replay
+	@$(BIN)/python bench/demo.py out/demo
+
+test: $(READY)  ## all tests but the slow ones
+	$(BIN)/python -m pytest -m "not slow"
+
+slow: $(READY)  ## the slow tests
+	$(BIN)/python -m pytest -m slow
+
+check: $(READY)  ## lint, format, types, layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/pyright
+
+format: $(READY)  ## mend what lint and format can mend
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY)  ## speed, as ratios against named peers
+	$(BIN)/python bench/read_jointstate.py
+
+docs: $(READY)  ## the manual, as HTML under docs/_build/html
+	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
+
+lock: $(READY)  ## renew requirements.lock (needs uv on the path)
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \
+	  --all-extras --group dev pyproject.toml -o requirements.lock
+
+clean:  ## remove what these targets made
+	rm -rf $(VENV) out docs/_build .pytest_cache .ruff_cache

@@ -1,0 +1,278 @@
+"""What an analysis says: frozen values at the border between estimators and readers of results.
+
+``Analysis.to_dict`` is the object that ``undulog analyse --json`` prints and that a result file
+holds. A value that could not be computed is None (null), and ``Analysis.warnings`` says why.
+Angles are in rad, energies in J over the analysed windows, times in s from the session's start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % interval.
+
+    Attributes:
+        value: The estimate, or None where it could not be computed.
+        ci95: Low and high end of the 95 % interval, or None.
+    """
+
+    value: float | None = None
+    ci95: Interval | None = None
+
+
+@dataclass(frozen=True)
+class Window:
+    """A half-open stretch of the session that was analysed.
+
+    Attributes:
+        start_s: From the session's start [s].
+        stop_s: From the session's start [s].
+        cycles: Gait cycles in it.
+    """
+
+    start_s: float
+    stop_s: float
+    cycles: float
+
+
+@dataclass(frozen=True)
+class SessionFacts:
+    """Which session it was.
+
+    Attributes:
+        id: Session id, or the file's name where it has none.
+        path: The file, as named by the user.
+        robot: Robot name, or None.
+        start_ns: Unix time of the first sample [ns].
+        duration_s: [s].
+        verdict: The recorder's health verdict, or None.
+    """
+
+    id: str
+    path: str
+    robot: str | None
+    start_ns: int
+    duration_s: float
+    verdict: str | None
+
+
+@dataclass(frozen=True)
+class GaitFacts:
+    """The rhythm that was found.
+
+    Attributes:
+        frequency_hz: Gait frequency with interval; value None where there is no gait.
+        windows: What was analysed.
+        wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
+        lag_per_joint_rad: Commanded phase step from joint to joint, by plane.
+    """
+
+    frequency_hz: Estimate
+    windows: tuple[Window, ...] = ()
+    wave: str | None = None
+    lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
+
+
+@dataclass(frozen=True)
+class JointResult:
+    """One joint's response to its command.
+
+    Attributes:
+        name: Joint name.
+        plane: ``horizontal``, ``vertical`` or None where no robot description says.
+        command_amplitude_rad: Amplitude of the command at the gait frequency.
+        gain: Amplitude of the response over that of the command.
+        lag_rad: Lag of the response behind the command, in (-pi, pi]; positive = late.
+        energy_net_j: Integral of torque times velocity.
+        energy_plus_j: Its positive part only.
+        energy_abs_j: Its absolute value.
+        energy_el_j: Electrical energy at the motor, integral of u V i (signed).
+        energy_el_clipped_j: Its positive part only (no regeneration).
+        coverage: Fraction of the windows that has samples, 0 to 1.
+        samples: Response samples used.
+        flags: Artefacts seen, e.g. ``saturated``.
+    """
+
+    name: str
+    plane: str | None
+    command_amplitude_rad: float | None
+    gain: Estimate
+    lag_rad: Estimate
+    energy_net_j: float | None
+    energy_plus_j: float | None
+    energy_abs_j: float | None
+    energy_el_j: float | None
+    energy_el_clipped_j: float | None
+    coverage: float
+    samples: int
+    flags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BodyPoint:
+    """Transverse motion of one link, at the gait frequency.
+
+    Attributes:
+        place: ``head``, ``middle`` or ``tail``.
+        link: Link name.
+        amplitude_m: Amplitude across the mean heading.
+        phase_rad: Phase relative to the head link.
+    """
+
+    place: str
+    link: str
+    amplitude_m: Estimate
+    phase_rad: Estimate
+
+
+@dataclass(frozen=True)
+class BodyResult:
+    """Head, middle and tail, with the perfect-tracking null beside them.
+
+    Attributes:
+        plane: Plane of the motion.
+        observed: From the logged head pose and joint angles.
+        null: Name of the null's model (``viscous`` or ``free``) to the same three points, with
+            every joint exactly on its command.
+    """
+
+    plane: str
+    observed: tuple[BodyPoint, ...]
+    null: dict[str, tuple[BodyPoint, ...]]
+
+
+@dataclass(frozen=True)
+class Index:
+    """One heterogeneity index.
+
+    Attributes:
+        value: In ``unit``, or None.
+        ci95: 95 % interval, or None.
+        p: p-value of the index's null, or None where no test belongs to it.
+        unit: SI unit, or ``1``.
+        label: What it measures, in a few words.
+    """
+
+    value: float | None
+    ci95: Interval | None
+    p: float | None
+    unit: str
+    label: str
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Whether the coupling can be told from this session.
+
+    Attributes:
+        identifiable: False for one gait alone (m numbers for m^2 unknowns).
+        why: Why not, or how.
+        record: What to record so that it can be.
+        matrix: Row = responding joint, column = commanded joint; None if not identifiable.
+        condition_number: Of the inversion, or None.
+    """
+
+    identifiable: bool
+    why: str
+    record: str | None = None
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    condition_number: float | None = None
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """How the result was made, so that it can be made again.
+
+    Attributes:
+        command: The command line that makes it.
+        versions: Package name to version.
+        inputs: Input file to SHA-256.
+        options: Option name to value.
+    """
+
+    command: str
+    versions: dict[str, str]
+    inputs: dict[str, str]
+    options: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """All numbers of one session.
+
+    Attributes:
+        session: Which session.
+        gait: The rhythm.
+        joints: In chain order, head to tail.
+        body: Head, middle and tail; None with a warning where it can't be told.
+        heterogeneity: Index name to index.
+        coupling: Identifiable or not.
+        warnings: One sentence each: what is missing or doubtful and why.
+        provenance: How it was made.
+    """
+
+    session: SessionFacts
+    gait: GaitFacts
+    joints: tuple[JointResult, ...]
+    body: BodyResult | None
+    heterogeneity: dict[str, Index]
+    coupling: Coupling
+    warnings: tuple[str, ...]
+    provenance: Provenance
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain JSON values.
+
+        An estimate becomes two keys, e.g. ``gain`` and ``gain_ci95``; ``lag_rad`` has its
+        interval in ``lag_ci95``.
+
+        Returns:
+            A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
+        """
+        gait = dataclasses.asdict(self.gait) | _flat("frequency_hz", self.gait.frequency_hz)
+        return {
+            "session": dataclasses.asdict(self.session),
+            "gait": gait,
+            "joints": [
+                dataclasses.asdict(joint)
+                | _flat("gain", joint.gain)
+                | _flat("lag_rad", joint.lag_rad)
+                for joint in self.joints
+            ],
+            "body": None if self.body is None else _body_dict(self.body),
+            "heterogeneity": {
+                name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
+            },
+            "coupling": dataclasses.asdict(self.coupling),
+            "warnings": list(self.warnings),
+            "provenance": dataclasses.asdict(self.provenance),
+        }
+
+
+def _flat(key: str, estimate: Estimate) -> dict[str, Any]:
+    stem = key.rsplit("_", 1)[0] if key in {"lag_rad", "frequency_hz", "phase_rad"} else key
+    stem = "amplitude" if key == "amplitude_m" else stem
+    return {key: estimate.value, f"{stem}_ci95": estimate.ci95}
+
+
+def _point_dict(point: BodyPoint) -> dict[str, Any]:
+    return (
+        {"place": point.place, "link": point.link}
+        | _flat("amplitude_m", point.amplitude_m)
+        | _flat("phase_rad", point.phase_rad)
+    )
+
+
+def _body_dict(body: BodyResult) -> dict[str, Any]:
+    return {
+        "plane": body.plane,
+        "observed": [_point_dict(point) for point in body.observed],
+        "null": {name: [_point_dict(p) for p in points] for name, points in body.null.items()},
+    }

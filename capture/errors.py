@@ -1,0 +1,175 @@
+"""The one error tree of undulog.
+
+::
+
+    UndulogError
+    |- UsageError (ValueError)              wrong options or arguments; exit code 2
+    |  |- MissingExtraError (ImportError)   a verb whose extra is not installed
+    |  `- OutputExistsError (FileExistsError)
+    |- RobotFileError (ValueError)          a robot description with faults, all listed
+    |- ScenarioError (ValueError)           a scenario file with faults, all listed
+    |- SimulationError (ArithmeticError)    the twin blew up: time, link and likely cause
+    |- DataError (ValueError)               samples unfit for what was asked
+    `- LogError                             a log that cannot be read or written
+       |- NotALogError                      not an MCAP file, or none of it readable
+       |- MissingChannelError (KeyError)    the topic is not there; lists those that are
+       |- ImportFormatError (ValueError)    a foreign log that cannot be imported
+       `- LogWriteError (OSError)           disk full, closed file
+
+Every error says what was found, where, and what to do. ``exit_code`` is what the command
+line returns: 1 the work failed, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class UndulogError(Exception):
+    """Base of all errors that undulog raises on purpose."""
+
+    exit_code: int = 1
+
+
+class UsageError(UndulogError, ValueError):
+    """The command or call is wrong: an option, an argument, a name."""
+
+    exit_code = 2
+
+
+class MissingExtraError(UsageError, ImportError):
+    """A verb needs an optional part that is not installed."""
+
+    def __init__(self, verb: str, extra: str, missing: str) -> None:
+        """Build the message.
+
+        Args:
+            verb: What was asked for, e.g. ``sim run``.
+            extra: The extra that brings it, e.g. ``sim``.
+            missing: The module that could not be imported.
+        """
+        self.extra = extra
+        super().__init__(
+            f"{verb} needs the package {missing}, which is not installed: "
+            f"pip install 'undulog[{extra}]'"
+        )
+
+
+class OutputExistsError(UsageError, FileExistsError):
+    """The output is there already and ``--force`` was not given."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Build the message.
+
+        Args:
+            path: The file that would have been overwritten.
+        """
+        self.path = Path(path)
+        super().__init__(f"{path} exists already; choose another name or give --force")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a description file.
+
+    Attributes:
+        key: Where it is, e.g. ``joints[3].plane``.
+        found: What stands there.
+        valid: What would be valid.
+    """
+
+    key: str
+    found: str
+    valid: str
+
+    def __str__(self) -> str:
+        """One line: key, what was found, what is valid."""
+        return f"{self.key}: found {self.found}; valid: {self.valid}"
+
+
+class FaultyFileError(UndulogError, ValueError):
+    """A description file with faults; the message lists them all."""
+
+    kind = "file"
+
+    def __init__(self, path: Path | str, faults: Iterable[Fault]) -> None:
+        """Build the message.
+
+        Args:
+            path: The file.
+            faults: All its faults, at least one.
+        """
+        self.path = Path(path)
+        self.faults: tuple[Fault, ...] = tuple(faults)
+        count = len(self.faults)
+        head = f"{path}: {count} fault{'s' if count != 1 else ''} in this {self.kind}"
+        super().__init__("\n".join([head, *(f"  {fault}" for fault in self.faults)]))
+
+
+class RobotFileError(FaultyFileError):
+    """A robot description with faults."""
+
+    kind = "robot description"
+
+
+class ScenarioError(FaultyFileError):
+    """A scenario with faults."""
+
+    kind = "scenario"
+
+
+class SimulationError(UndulogError, ArithmeticError):
+    """The twin's state became impossible: says when, which link, and the likely cause."""
+
+
+class DataError(UndulogError, ValueError):
+    """Samples that are unfit for what was asked of them."""
+
+
+class LogError(UndulogError):
+    """A log that cannot be read or written."""
+
+    def __init__(self, path: Path | str, message: str) -> None:
+        """Build the message.
+
+        Args:
+            path: The log file.
+            message: What is wrong and what to do.
+        """
+        self.path = Path(path)
+        super().__init__(f"{path}: {message}")
+
+
+class NotALogError(LogError):
+    """Not an MCAP file, or nothing in it can be read."""
+
+
+class MissingChannelError(LogError, KeyError):
+    """A topic, joint or field that the log does not have."""
+
+    def __init__(self, path: Path | str, wanted: str, available: Sequence[str]) -> None:
+        """Build the message.
+
+        Args:
+            path: The log file.
+            wanted: What was asked for.
+            available: What is there.
+        """
+        self.wanted = wanted
+        self.available = tuple(available)
+        listed = ", ".join(available) if available else "nothing"
+        LogError.__init__(self, path, f"has no {wanted}; it has {listed}")
+
+    def __str__(self) -> str:
+        """The message itself (``KeyError`` would quote it)."""
+        return str(self.args[0])
+
+
+class ImportFormatError(LogError, ValueError):
+    """A foreign log that cannot be imported."""
+
+
+class LogWriteError(LogError, OSError):
+    """The log could not be written: disk full, closed, no permission."""
