@@ -1,0 +1,81 @@
+"""The one colour map along the body: a joint keeps its colour in report, docs and Rerun.
+
+The map is a curve in OKLab (Ottosson 2020, https://bottosson.github.io/posts/oklab/) from blue
+at the head over green to amber at the tail, sampled at equal steps of arc length, so neighbours
+differ equally everywhere. Lightness rises all the way, so the order survives colour blindness
+and grey print, and stays between 0.47 and 0.79, so it reads on white and on black.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import FloatArray, frozen
+
+COMMANDED_RGB: tuple[int, int, int] = (140, 140, 140)
+"""Grey of everything commanded, a null or a reference."""
+
+# Control points of a quadratic Bezier curve in OKLab (lightness, a, b): blue, green, amber.
+_CURVE = np.array([[0.47, -0.01, -0.18], [0.62, -0.20, 0.02], [0.79, 0.06, 0.16]])
+
+# OKLab -> cube roots of cone responses -> linear sRGB (Ottosson 2020).
+_LAB_TO_CONE = np.array(
+    [
+        [1.0, 0.3963377774, 0.2158037573],
+        [1.0, -0.1055613458, -0.0638541728],
+        [1.0, -0.0894841775, -1.2914855480],
+    ]
+)
+_CONE_TO_RGB = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+
+
+def joint_colors(count: int) -> NDArray[np.uint8]:
+    """Colours of the joints (or links) of a chain, head to tail.
+
+    Args:
+        count: Number of joints, at least 1.
+
+    Returns:
+        sRGB and opacity 255, shape (count, 4).
+    """
+    place = np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
+    colors = np.full((count, 4), 255, dtype=np.uint8)
+    colors[:, :3] = np.round(255.0 * _srgb(_oklab(place))).astype(np.uint8)
+    return frozen(colors)
+
+
+def joint_hex(count: int) -> tuple[str, ...]:
+    """The same colours as ``#rrggbb``.
+
+    Args:
+        count: Number of joints, at least 1.
+
+    Returns:
+        One string a joint, head to tail.
+    """
+    return tuple("#" + bytes(color[:3]).hex() for color in joint_colors(count))
+
+
+def _oklab(place: FloatArray) -> FloatArray:
+    """Points of the curve at equal steps of arc length; ``place`` in [0, 1], shape (n,)."""
+    t = np.linspace(0.0, 1.0, 513)[:, None]
+    curve = (1 - t) ** 2 * _CURVE[0] + 2 * t * (1 - t) * _CURVE[1] + t**2 * _CURVE[2]
+    step = np.linalg.norm(np.diff(curve, axis=0), axis=1)
+    arc = np.concatenate([[0.0], np.cumsum(step)]) / step.sum()
+    lab = np.empty((place.size, 3), dtype=np.float64)
+    for channel in range(3):
+        lab[:, channel] = np.interp(place, arc, curve[:, channel])
+    return lab
+
+
+def _srgb(lab: FloatArray) -> FloatArray:
+    """OKLab to gamma-encoded sRGB in [0, 1] (IEC 61966-2-1), shape (n, 3)."""
+    linear = np.clip((lab @ _LAB_TO_CONE.T) ** 3 @ _CONE_TO_RGB.T, 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
