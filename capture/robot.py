@@ -142,6 +142,17 @@ class Sensor:
     axes: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
 
+    @property
+    def topic(self) -> str:
+        """Topic on which a session holds it: ``/ir/NN``, ``/sonar``, ``/imu`` or ``/compass``.
+
+        Further sensors of a kind that has one topic follow below it, by their own names.
+        """
+        if self.kind is SensorKind.IR:
+            return f"/ir/{self.name.removeprefix('ir')}"
+        base = "/imu" if self.kind is SensorKind.ACCELEROMETER else f"/{self.kind}"
+        return base if self.name == self.kind else f"{base}/{self.name}"
+
 
 class Direction(StrEnum):
     """Way of a frame on the bus, seen from the computer on the robot."""
@@ -161,6 +172,8 @@ class Quantity(StrEnum):
     VOLTAGE = "voltage"
     TEMPERATURE = "temperature"
     RANGE = "range"
+    ACCELERATION = "acceleration"
+    MAGNETIC_FIELD = "magnetic_field"
 
 
 @dataclass(frozen=True)
@@ -179,6 +192,7 @@ class BusSignal:
         unit: Unit of the decoded DBC value, e.g. ``deg``.
         scale: Applied to the decoded value (gear ratio, sign), 1 by default.
         offset: Added after ``scale``, in ``unit``.
+        axis: Axis of the sensor's frame for a vector quantity (``x``, ``y``, ``z``), else empty.
     """
 
     message: str
@@ -189,6 +203,7 @@ class BusSignal:
     unit: str
     scale: float = 1.0
     offset: float = 0.0
+    axis: str = ""
 
 
 @dataclass(frozen=True)
@@ -220,6 +235,8 @@ class Robot:
         bus: The bus map, or None.
         toml: The text it was read from; stored in every session.
         databases: DBC file name to text, for the session's attachments.
+        assumed: Parts of the description (``links``, ``servo``, ``bus``, ...) that were assumed
+            rather than known.
     """
 
     name: str
@@ -231,6 +248,7 @@ class Robot:
     bus: Bus | None = None
     toml: str = ""
     databases: tuple[tuple[str, str], ...] = ()
+    assumed: tuple[str, ...] = ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:

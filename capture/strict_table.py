@@ -1,0 +1,381 @@
+"""Strict reading of TOML tables: every fault noted, none raised until all are known.
+
+A :class:`Table` hands out the values of one TOML table. A value that is missing, of the wrong type
+or out of range is noted in a :class:`Faults` and replaced by a harmless stand-in (NaN for numbers,
+so that comparisons with it are false and one fault does not beget another); the caller raises once
+at the end. Keys that nobody asked for are faults too: a mistyped key never passes for a default.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Mapping
+from enum import StrEnum
+from typing import Any, TypeVar, cast
+
+from .errors import Fault
+
+_Choice = TypeVar("_Choice", bound=StrEnum)
+
+NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+"""What a name of a robot, link, joint or sensor looks like: it becomes part of topics and files."""
+
+
+def shown(value: object) -> str:
+    """A value as a fault message shows it.
+
+    Args:
+        value: Anything TOML can hold.
+
+    Returns:
+        Strings quoted, tables and long arrays by kind.
+    """
+    if isinstance(value, Mapping):
+        return "a table"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def listed(words: Iterable[str], found: object = None) -> str:
+    """The valid words, nearest first named where ``found`` looks like a slip.
+
+    Args:
+        words: The valid words.
+        found: What stands there.
+
+    Returns:
+        ``a, b, c`` and, for a near miss, ``; did you mean b?``.
+    """
+    valid = list(words)
+    near = difflib.get_close_matches(found, valid, n=1) if isinstance(found, str) else []
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    return (", ".join(valid) or "none") + hint
+
+
+class Faults:
+    """The faults found so far, in order, each once."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._faults: dict[Fault, None] = {}
+
+    def add(self, key: str, found: str, valid: str) -> None:
+        """Note a fault.
+
+        Args:
+            key: Where it is, e.g. ``joints[3].plane``.
+            found: What stands there.
+            valid: What would be valid.
+        """
+        self._faults[Fault(key, found, valid)] = None
+
+    def all(self) -> tuple[Fault, ...]:
+        """All faults, in the order found."""
+        return tuple(self._faults)
+
+
+class Table:
+    """One TOML table, with optional defaults behind it."""
+
+    def __init__(
+        self,
+        values: Mapping[str, Any],
+        where: str,
+        faults: Faults,
+        defaults: Table | None = None,
+    ) -> None:
+        """Wrap a table.
+
+        Args:
+            values: The parsed table.
+            where: Its key in the file, empty for the top.
+            faults: Where faults are noted.
+            defaults: Looked into for keys that this table lacks.
+        """
+        self._values = values
+        self._where = where
+        self._faults = faults
+        self._defaults = defaults
+        self._asked: dict[str, None] = {}
+
+    def __contains__(self, key: str) -> bool:
+        """Whether the table itself has the key."""
+        return key in self._values
+
+    def key(self, key: str) -> str:
+        """The full key, e.g. ``joints[3].plane``.
+
+        Args:
+            key: Key in this table.
+
+        Returns:
+            Key from the top of the file.
+        """
+        return f"{self._where}.{key}" if self._where else key
+
+    @property
+    def faults(self) -> Faults:
+        """Where faults of this table are noted."""
+        return self._faults
+
+    def fault(self, key: str, valid: str, found: str | None = None) -> None:
+        """Note a fault of one key.
+
+        Args:
+            key: Key in this table.
+            valid: What would be valid.
+            found: What stands there; by default the value itself, ``nothing`` when absent.
+        """
+        where, value = self.look(key)
+        text = found or ("nothing" if value is None else shown(value))
+        self._faults.add(where, text, valid)
+
+    def look(self, key: str) -> tuple[str, object]:
+        """Look a key up, first here, then in the defaults.
+
+        Args:
+            key: Key in this table.
+
+        Returns:
+            The full key where it was found and the value; the key here and None where absent.
+        """
+        self._asked[key] = None
+        if self._defaults is not None:
+            where, value = self._defaults.look(key)
+            if key not in self._values and value is not None:
+                return where, value
+        return self.key(key), self._values.get(key)
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A string; ``""`` after a fault.
+
+        Args:
+            key: Key in this table.
+            default: Taken when absent; None makes it required.
+
+        Returns:
+            The string.
+        """
+        value = self.look(key)[1]
+        if value is None and default is not None:
+            return default
+        if not isinstance(value, str):
+            self.fault(key, "a string")
+            return ""
+        return value
+
+    def name(self, key: str) -> str:
+        """A name that can be part of a topic; ``""`` after a fault.
+
+        Args:
+            key: Key in this table.
+
+        Returns:
+            The name.
+        """
+        value = self.look(key)[1]
+        if not isinstance(value, str) or not NAME_PATTERN.fullmatch(value):
+            self.fault(key, "a name of letters, digits, _ and -, beginning with a letter")
+            return ""
+        return value
+
+    def choice(self, key: str, kinds: type[_Choice]) -> _Choice | None:
+        """One of a few words; None after a fault.
+
+        Args:
+            key: Key in this table.
+            kinds: The words.
+
+        Returns:
+            The member.
+        """
+        value = self.look(key)[1]
+        words = [str(kind) for kind in kinds]
+        if not isinstance(value, str) or value not in words:
+            self.fault(key, listed(words, value))
+            return None
+        return kinds(value)
+
+    def number(
+        self,
+        key: str,
+        *,
+        default: float | None = None,
+        above: float | None = None,
+        at_least: float | None = None,
+        at_most: float | None = None,
+        nonzero: bool = False,
+    ) -> float:
+        """A finite number; NaN after a fault.
+
+        Args:
+            key: Key in this table.
+            default: Taken when absent; None makes it required.
+            above: The value must be greater.
+            at_least: The value must not be less.
+            at_most: The value must not be greater.
+            nonzero: The value must not be zero.
+
+        Returns:
+            The number.
+        """
+        value = self.look(key)[1]
+        if value is None and default is not None:
+            return default
+        number = _finite(value)
+        fits = (
+            number is not None
+            and (above is None or number > above)
+            and (at_least is None or number >= at_least)
+            and (at_most is None or number <= at_most)
+            and not (nonzero and number == 0)
+        )
+        if number is None or not fits:
+            bounds = [
+                *([f"> {above:g}"] if above is not None else []),
+                *([f">= {at_least:g}"] if at_least is not None else []),
+                *([f"<= {at_most:g}"] if at_most is not None else []),
+                *(["other than 0"] if nonzero else []),
+            ]
+            self.fault(key, " ".join(["a finite number", " and ".join(bounds)]).strip())
+            return math.nan
+        return number
+
+    def integer(self, key: str, *, at_least: int) -> int:
+        """A whole number; the least valid one after a fault.
+
+        Args:
+            key: Key in this table.
+            at_least: The value must not be less.
+
+        Returns:
+            The number.
+        """
+        value = self.look(key)[1]
+        if isinstance(value, bool) or not isinstance(value, int) or value < at_least:
+            self.fault(key, f"a whole number >= {at_least}")
+            return at_least
+        return value
+
+    def triple(
+        self,
+        key: str,
+        *,
+        default: tuple[float, float, float] | None = None,
+        above: float | None = None,
+    ) -> tuple[float, float, float]:
+        """Three finite numbers; NaN after a fault.
+
+        Args:
+            key: Key in this table.
+            default: Taken when absent; None makes it required.
+            above: Each value must be greater.
+
+        Returns:
+            The numbers.
+        """
+        value = self.look(key)[1]
+        if value is None and default is not None:
+            return default
+        entries = cast("list[object]", value) if isinstance(value, list) else []
+        numbers = [number for number in map(_finite, entries) if number is not None]
+        bad = above is not None and any(number <= above for number in numbers)
+        if len(entries) != 3 or len(numbers) != 3 or bad:
+            bound = f", each > {above:g}" if above is not None else ""
+            self.fault(key, f"an array of 3 finite numbers{bound}")
+            return math.nan, math.nan, math.nan
+        return numbers[0], numbers[1], numbers[2]
+
+    def words(self, key: str, *, valid: Iterable[str] | None = None) -> tuple[str, ...]:
+        """An array of different strings; empty when absent, without the bad ones after a fault.
+
+        Args:
+            key: Key in this table.
+            valid: The words to choose from; any string when None.
+
+        Returns:
+            The words.
+        """
+        value = self.look(key)[1]
+        if value is None:
+            return ()
+        if not isinstance(value, list):
+            self.fault(key, "an array of strings")
+            return ()
+        choices = None if valid is None else list(valid)
+        good: dict[str, None] = {}
+        for i, word in enumerate(cast("list[object]", value)):
+            where = f"{self.look(key)[0]}[{i}]"
+            if not isinstance(word, str):
+                self._faults.add(where, shown(word), "a string")
+            elif choices is not None and word not in choices:
+                self._faults.add(where, shown(word), listed(choices, word))
+            elif word in good:
+                self._faults.add(where, shown(word), "a word that is not there already")
+            else:
+                good[word] = None
+        return tuple(good)
+
+    def table(self, key: str, defaults: Table | None = None) -> Table:
+        """A sub-table; an empty one when absent or after a fault.
+
+        Args:
+            key: Key in this table.
+            defaults: Defaults of the sub-table.
+
+        Returns:
+            The sub-table.
+        """
+        self._asked[key] = None
+        value = self._values.get(key, {})
+        if not isinstance(value, dict):
+            self.fault(key, "a table")
+            value = {}
+        return Table(cast("dict[str, Any]", value), self.key(key), self._faults, defaults)
+
+    def tables(self, key: str) -> list[tuple[dict[str, Any], str]]:
+        """An array of tables; empty when absent, without the bad ones after a fault.
+
+        Args:
+            key: Key in this table.
+
+        Returns:
+            Each table with its full key, ready for :class:`Table`.
+        """
+        self._asked[key] = None
+        value = self._values.get(key, [])
+        if not isinstance(value, list):
+            self.fault(key, "an array of tables")
+            return []
+        good: list[tuple[dict[str, Any], str]] = []
+        for i, entry in enumerate(cast("list[object]", value)):
+            where = f"{self.key(key)}[{i}]"
+            if isinstance(entry, dict):
+                good.append((cast("dict[str, Any]", entry), where))
+            else:
+                self._faults.add(where, shown(entry), "a table")
+        return good
+
+    def close(self) -> None:
+        """Note every key of this table that nobody asked for."""
+        for key in self._values:
+            if key not in self._asked:
+                near = listed(self._asked, key)
+                self._faults.add(self.key(key), "an unknown key", near)
+
+
+def _finite(value: object) -> float | None:
+    """A finite TOML number, else None; booleans are not numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:  # an integer beyond the range of a double
+        return None
+    return number if math.isfinite(number) else None
