@@ -208,20 +208,23 @@ def _encode_message(out: bytearray, kind: MessageType, values: Mapping[str, Any]
 
 
 def _encode_field(out: bytearray, field: Field, value: Any) -> None:
-    items: list[Any] = (
-        list(cast("list[Any]", value) if value is not None else []) if field.is_array else [value]
-    )
+    default = 0 if field.base in PRIMITIVES else None
+    items: Any  # a list or an array
     if field.length is None:
+        items = [] if value is None else value
         _pad(out, 4)
         out.extend(struct.pack("<I", len(items)))
-    elif field.is_array and not items:
-        items = [None] * field.length
+    elif field.is_array:
+        items = [default] * field.length if value is None else value
+        if len(items) != field.length:
+            raise ValueError(f"{len(items)} values for an array of {field.length}")
+    else:
+        items = [default if value is None else value]
     if field.base in PRIMITIVES:
-        if items:
+        if len(items) > 0:
             dtype = np.dtype(PRIMITIVES[field.base])
             _pad(out, dtype.itemsize)
-            filled = [0 if item is None else item for item in items]
-            out.extend(np.array(filled, dtype=dtype).tobytes())
+            out.extend(np.asarray(items, dtype=dtype).tobytes())
         return
     for item in items:
         if field.nested is not None:
