@@ -163,7 +163,7 @@ class LogFile:
             self.warnings.append(f"{why}; read record by record")
         if not self.channels:
             raise NotALogError(self.path, "an MCAP file without any channel that could be read")
-        self.blocks.sort(key=lambda block: (block.start_ns, block.start))
+        self.blocks.sort(key=lambda block: block.start)
 
     def _load_summary(self) -> None:
         """Fill in everything from the summary.
