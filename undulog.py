@@ -1,1 +1,139 @@
-"""The front door."""
+"""The front door: one command, ``undulog``; each verb is imported when it is used.
+
+Exit codes: 0 done, 1 the work failed, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib.metadata import version
+
+from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
+
+from capture.errors import MissingExtraError, UndulogError
+
+VERBS: dict[str, tuple[str, str]] = {
+    "import": ("capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
+    "log info": ("capture.log_info:log_info", "Say what a log holds."),
+    "log export": ("capture.cli:export_log", "Write a session's raw frames for other tools."),
+    "sim list": ("sim.cli:list_scenarios", "List the shipped scenarios."),
+    "sim run": ("sim.cli:run", "Simulate a scenario and record it."),
+    "analyse": ("analysis.cli:analyse", "Numbers: response, energy, spread over the segments."),
+    "report": ("analysis.report.cli:report", "The offline report, one HTML page."),
+    "view": ("replay.cli:view", "See a session in Rerun."),
+    "info": ("capture.environment:info", "Versions and extras, for a bug report."),
+}
+"""Verb to the function behind it and its line in the list of verbs."""
+
+_GROUPS = {"log": "Look after sessions.", "sim": "The twin: simulate and record."}
+
+_EXTRAS = {
+    "pybullet": "sim",
+    "rerun": "replay",
+    "jinja2": "report",
+    "markupsafe": "report",
+    "matplotlib": "report",
+    "distributed": "cluster",
+}
+"""Optional package to the extra that installs it."""
+
+
+def build(arguments: Sequence[str] = ()) -> App:
+    """The command with all its verbs, none of them imported.
+
+    Args:
+        arguments: The command line; the verb that it names takes its help from its own
+            docstring, the others only have their line in the list.
+
+    Returns:
+        The application.
+    """
+    app = App(
+        name="undulog",
+        help="Record, simulate, measure and replay undulating robots. "
+        "Every session is one MCAP file that explains itself.",
+        version=lambda: version("undulog"),
+        help_format="markdown",
+        help_epilogue="Example: `undulog sim run flat -o run.mcap && undulog analyse run.mcap`",
+        default_parameter=Parameter(negative=()),
+        result_action="return_value",
+    )
+    groups = {name: App(name=name, help=text, help_epilogue="") for name, text in _GROUPS.items()}
+    for group in groups.values():
+        app.command(group)
+    for verb, (target, summary) in VERBS.items():
+        *group, name = verb.split()
+        asked = list(arguments[: len(group) + 1]) == [*group, name]
+        parent = groups[group[0]] if group else app
+        parent.command(target, name=name, help=None if asked else summary, help_epilogue="")
+    return app
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line.
+
+    Args:
+        arguments: Without the program's name.
+
+    Returns:
+        The exit code: 0 done, 1 the work failed, 2 wrong usage.
+    """
+    try:
+        result = build(arguments)(arguments, exit_on_error=False, print_error=False)
+    except UnknownCommandError:  # its own text would import every verb
+        return _complain(_unknown(arguments), 2)
+    except CycloptsError as error:
+        return _complain(f"{error}\nTry 'undulog --help', or --help after the verb.", 2)
+    except UndulogError as error:
+        return _complain(str(error), error.exit_code)
+    except ImportError as error:
+        missing = _missing_extra(error, arguments)
+        if missing is None:
+            raise
+        return _complain(str(missing), missing.exit_code)
+    except KeyboardInterrupt:
+        return _complain("interrupted", 1)
+    return result if isinstance(result, int) else 0
+
+
+def main() -> None:
+    """Run the process's own command line and exit."""
+    try:
+        code = run(sys.argv[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader (head, less) has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    sys.exit(code)
+
+
+def _unknown(arguments: Sequence[str]) -> str:
+    words = [word for word in arguments if not word.startswith("-")][:2]
+    typed = " ".join(words if words and words[0] in _GROUPS else words[:1])
+    near = get_close_matches(typed, VERBS, n=1)
+    hint = f"Did you mean '{near[0]}'? " if near else ""
+    return f"there is no verb '{typed}'. {hint}There are: {', '.join(VERBS)}."
+
+
+def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtraError | None:
+    """The extra that would mend the import, if one would."""
+    cause: BaseException | None = error
+    while cause is not None:
+        package = (getattr(cause, "name", None) or "").partition(".")[0]
+        if package in _EXTRAS:
+            verb = next(verb for verb in VERBS if " ".join(arguments).startswith(verb))
+            return MissingExtraError(f"'undulog {verb}'", _EXTRAS[package], package)
+        cause = cause.__cause__
+    return None
+
+
+def _complain(message: str, code: int) -> int:
+    sys.stderr.write(f"error: {message}\n")
+    return code
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""The verb ``log info``: what a log holds, of our making or not."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from .console import emit_json
+from .session import Session
+
+
+def describe(session: Session) -> dict[str, Any]:
+    """What a session holds, as plain JSON values.
+
+    Args:
+        session: An open session.
+
+    Returns:
+        ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``.
+    """
+    seconds = session.duration_s
+    topics = [
+        {
+            "topic": channel.topic,
+            "type": channel.type_name,
+            "messages": channel.count,
+            "rate_hz": round(channel.count / seconds, 3) if seconds > 0 else None,
+            "unit": channel.metadata.get("unit"),
+        }
+        for _, channel in sorted(session.channels.items())
+    ]
+    return {
+        "session": {
+            "id": session.session_id,
+            "path": str(session.path),
+            "robot": session.robot.name if session.robot is not None else None,
+            "joints": len(session.robot.joints) if session.robot is not None else None,
+            "start_ns": session.start_ns,
+            "start_utc": _utc(session.start_ns),
+            "duration_s": seconds,
+            "size_bytes": session.path.stat().st_size,
+            "profile": session.profile,
+            "library": session.library,
+            "verdict": session.verdict,
+        },
+        "topics": topics,
+        "metadata": {name: dict(facts) for name, facts in session.metadata.items()},
+        "attachments": {name: len(data) for name, data in session.attachments.items()},
+        "warnings": session.warnings,
+    }
+
+
+def log_info(file: Path, /, *, json: bool = False) -> None:
+    """Say what a log holds: robot, times, topics, attachments, and what is wrong with it.
+
+    Example: `undulog log info run.mcap`
+
+    Args:
+        file: An MCAP file, of any make.
+        json: Print one JSON object.
+    """
+    with Session.open(file) as session:
+        facts = describe(session)
+    if json:
+        emit_json(facts)
+        return
+    _print_facts(facts)
+
+
+def _print_facts(facts: dict[str, Any]) -> None:
+    session = facts["session"]
+    robot = f"{session['robot']}, {session['joints']} joints" if session["robot"] else "no robot"
+    messages = sum(topic["messages"] for topic in facts["topics"])
+    print(
+        f"{session['id']}: {robot}, {session['duration_s']:.2f} s from {session['start_utc']}, "
+        f"{messages} messages, {session['size_bytes'] / 1e6:.1f} MB"
+    )
+    for warning in facts["warnings"]:
+        print(f"warning: {warning}")
+    width = max([len(topic["topic"]) for topic in facts["topics"]] + [5])
+    kinds = max([len(topic["type"]) for topic in facts["topics"]] + [4])
+    print(f"\n{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
+    for topic in facts["topics"]:
+        rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
+        print(
+            f"{topic['topic']:<{width}}  {topic['type']:<{kinds}}  {topic['messages']:>8}  "
+            f"{rate}  {topic['unit'] or ''}".rstrip()
+        )
+    if facts["attachments"]:
+        listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())
+        print(f"\nattached: {', '.join(listed)}")
+    print(f"verdict: {session['verdict'] or 'none stored'}; written by {session['library']}")
+
+
+def _utc(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

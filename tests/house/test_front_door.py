@@ -1,0 +1,71 @@
+"""The command line: every verb has help with an example, and wrong words exit with 2."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import undulog
+
+
+@pytest.mark.parametrize("verb", sorted(undulog.VERBS))
+def test_help_of_every_verb_shows_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert undulog.run([*verb.split(), "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"Usage: undulog {verb}" in shown
+    assert f"Example: undulog {verb}" in shown
+
+
+def test_help_lists_all_verbs_without_importing_any() -> None:
+    code = (
+        "import sys, undulog; undulog.run(['--help']);"
+        "heavy = {'pandas', 'scipy', 'pybullet', 'rerun', 'matplotlib', 'can'} & set(sys.modules);"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for word in ("import", "log", "sim", "analyse", "report", "view", "info"):
+        assert word in done.stdout
+
+
+def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert undulog.run(["analyze", "x.mcap"]) == 2
+    said = capsys.readouterr().err
+    assert "no verb 'analyze'" in said
+    assert "Did you mean 'analyse'?" in said
+
+
+def test_a_missing_argument_exits_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert undulog.run(["log", "info"]) == 2
+    assert "FILE" in capsys.readouterr().err
+
+
+def test_a_missing_file_exits_1_and_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert undulog.run(["log", "info", "nowhere.mcap"]) == 1
+    assert "nowhere.mcap: no such file" in capsys.readouterr().err
+
+
+def test_a_missing_extra_says_which_one_to_install() -> None:
+    # None in sys.modules makes Python raise the same ImportError as a package that isn't there.
+    code = (
+        "import sys; sys.modules['pybullet'] = None; import undulog;"
+        "sys.exit(undulog.run(['sim', 'run', 'flat', '-o', 'never.mcap']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert "pip install 'undulog[sim]'" in done.stderr
+
+
+def test_info_names_versions(capsys: pytest.CaptureFixture[str]) -> None:
+    assert undulog.run(["info"]) == 0
+    said = capsys.readouterr().out
+    assert "undulog 0" in said
+    assert "numpy" in said
+
+
+def test_a_closed_pipe_is_no_traceback() -> None:
+    command = f"{sys.executable} -m undulog info --json | true"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr

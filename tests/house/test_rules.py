@@ -1,0 +1,27 @@
+"""Rules of the house that no linter holds."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def _tracked() -> list[str]:
+    done = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        pytest.skip("not a git checkout: the list of tracked files is unknown")
+    return done.stdout.splitlines()
+
+
+def test_no_package_folder_of_the_tests_shadows_ours() -> None:
+    assert [str(p) for p in (ROOT / "tests").rglob("__init__.py")] == []
+
+
+def test_no_recording_or_output_is_tracked() -> None:
+    assert [name for name in _tracked() if name.endswith((".mcap", ".rrd", ".candump.log"))] == []
