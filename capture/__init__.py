@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .robot import Robot
     from .robot_file import load_robot, robot_names
-    from .session import Channel, Session
+    from .session import Session
     from .signals import JointSignals, Signal
+    from .topics import Channel
     from .writer import SessionWriter
 
 __all__ = [
@@ -35,7 +36,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Channel": "session",
+    "Channel": "topics",
     "JointSignals": "signals",
     "Robot": "robot",
     "Session": "session",

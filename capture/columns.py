@@ -78,56 +78,77 @@ class Unread:
     why: str
 
 
-def read_groups(
-    log_file: LogFile,
-    channel_ids: Sequence[int],
-    message_type: MessageType,
-    *,
-    paths: Sequence[str] | None,
-    window_ns: tuple[int | None, int | None] = (None, None),
-    warn: Callable[[str], None],
-) -> tuple[list[Group], list[Unread]]:
-    """Read the messages of a topic.
+@dataclass(frozen=True)
+class Request:
+    """What to read of one topic.
 
-    Args:
-        log_file: The file.
+    Attributes:
         channel_ids: The topic's channels.
         message_type: Their type.
         paths: Leaf paths to keep; None for all.
+    """
+
+    channel_ids: Sequence[int]
+    message_type: MessageType
+    paths: Sequence[str] | None = None
+
+
+@dataclass
+class Messages:
+    """All messages of one topic.
+
+    Attributes:
+        groups: By layout, in order of first appearance.
+        unread: Those that have no layout.
+    """
+
+    groups: list[Group]
+    unread: list[Unread]
+
+
+def read_messages(
+    log_file: LogFile,
+    requests: Sequence[Request],
+    *,
+    window_ns: tuple[int | None, int | None] = (None, None),
+    warn: Callable[[str], None],
+) -> list[Messages]:
+    """Read several topics in one pass over the file: each chunk is decompressed once.
+
+    Args:
+        log_file: The file.
+        requests: What to read, one a topic.
         window_ns: Half-open window of log times [Unix ns]; None for open ends.
         warn: Takes one sentence for each block that couldn't be read.
 
     Returns:
-        The groups, in order of first appearance, and the messages that have no layout.
+        The messages, one entry a request.
     """
-    reader = _GroupReader(message_type, paths)
-    for data, offsets in message_blocks(log_file, channel_ids, window_ns, warn):
-        log_ns = _gather(data, offsets + _LOG_TIME_AT, "<u8").astype(np.int64)
-        keep = np.ones(len(offsets), dtype=bool)
-        if window_ns[0] is not None:
-            keep &= log_ns >= window_ns[0]
-        if window_ns[1] is not None:
-            keep &= log_ns < window_ns[1]
-        reader.add(data, offsets[keep], log_ns[keep])
-    return reader.groups, reader.unread
+    readers = [_GroupReader(request) for request in requests]
+    wanted = [request.channel_ids for request in requests]
+    for data, found in message_blocks(log_file, wanted, window_ns, warn):
+        for reader, offsets in zip(readers, found, strict=True):
+            if len(offsets):
+                reader.add(data, offsets, window_ns)
+    return [Messages(reader.groups, reader.unread) for reader in readers]
 
 
 def message_blocks(
     log_file: LogFile,
-    channel_ids: Sequence[int],
+    wanted: Sequence[Sequence[int]],
     window_ns: tuple[int | None, int | None],
     warn: Callable[[str], None],
-) -> Iterator[tuple[Buffer, IntArray]]:
-    """The payloads that hold messages of a topic, with the offsets of their records.
+) -> Iterator[tuple[Buffer, list[IntArray]]]:
+    """The payloads that hold messages of some topics, with the offsets of their records.
 
     Args:
         log_file: The file.
-        channel_ids: The topic's channels.
+        wanted: Channel ids, one sequence a topic.
         window_ns: Blocks wholly outside this window of log times are passed over.
         warn: Takes one sentence for each block that couldn't be read.
 
     Yields:
-        Payload and checked record offsets, shape (n,), n >= 1.
+        Payload and checked record offsets, one array of shape (n,) a topic, not all empty.
     """
     start, stop = window_ns
     for block in log_file.blocks:
@@ -136,16 +157,19 @@ def message_blocks(
         ):
             continue
         try:
-            found = [log_file.offsets(block, channel_id) for channel_id in channel_ids]
+            found = [
+                np.concatenate([log_file.offsets(block, channel_id) for channel_id in ids])
+                for ids in wanted
+            ]
             if not any(map(len, found)):
                 continue
             data, base = log_file.payload(block)
-            offsets = np.concatenate(found) + base
-            _check(data, offsets)
+            found = [offsets + base for offsets in found]
+            _check(data, np.concatenate(found))
         except LogError as error:
             warn(f"{error}; its messages are missing")
             continue
-        yield data, offsets
+        yield data, found
 
 
 def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
@@ -166,14 +190,23 @@ def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
 class _GroupReader:
     """Sorts messages into groups by layout."""
 
-    def __init__(self, message_type: MessageType, paths: Sequence[str] | None) -> None:
-        self._type = message_type
-        self._paths = None if paths is None else set(paths)
+    def __init__(self, request: Request) -> None:
+        self._type = request.message_type
+        self._paths = None if request.paths is None else set(request.paths)
         self._by_length: dict[int, list[Group]] = {}
         self.groups: list[Group] = []
         self.unread: list[Unread] = []
 
-    def add(self, data: Buffer, offsets: IntArray, log_ns: IntArray) -> None:
+    def add(
+        self, data: Buffer, offsets: IntArray, window_ns: tuple[int | None, int | None]
+    ) -> None:
+        log_ns = _gather(data, offsets + _LOG_TIME_AT, "<u8").astype(np.int64)
+        if window_ns != (None, None):
+            start, stop = window_ns
+            keep = np.ones(len(offsets), dtype=bool)
+            keep &= True if start is None else log_ns >= start
+            keep &= True if stop is None else log_ns < stop
+            offsets, log_ns = offsets[keep], log_ns[keep]
         lengths = _gather(data, offsets + _LENGTH_AT, "<u8").astype(np.int64) - _FIXED_SIZE
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)

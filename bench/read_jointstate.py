@@ -1,0 +1,115 @@
+"""Reader speed: all JointState columns of a session, against mcap + mcap-ros2-support.
+
+Both read the same file in the same run, one thread, the file in the page cache; the ratio of
+medians is what counts, since machines differ. The values are compared, so both did the work.
+
+Run: python bench/read_jointstate.py [--minutes 5] [--runs 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from capture import Session, SessionWriter
+from capture.arrays import FloatArray
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NAMES = [f"joint{i:02d}" for i in range(1, 26)]
+TOPICS = {
+    "/joint_commands": ("position",),
+    "/joint_states": ("position", "velocity", "effort"),
+    "/joint_current": ("position",),
+    "/joint_voltage": ("position",),
+}
+
+
+def write_session(path: Path, minutes: float) -> int:
+    """Write 25 joints at 100 Hz; returns the number of JointState messages."""
+    rng = np.random.default_rng(1)
+    ticks = round(minutes * 6000)
+    with SessionWriter(path, session_id="bench", epoch_ns=EPOCH_NS) as writer:
+        channels = {
+            topic: writer.joint_state(
+                topic, NAMES, unit="1", velocity="velocity" in fields, effort="effort" in fields
+            )
+            for topic, fields in TOPICS.items()
+        }
+        phase = np.arange(25) * 0.5
+        for tick in range(ticks):
+            t_ns = EPOCH_NS + tick * 10_000_000
+            values = 0.4 * np.sin(tick * 0.03 - phase) + rng.normal(scale=1e-3, size=25)
+            for topic, channel in channels.items():
+                channel.write(t_ns, *(values,) * len(TOPICS[topic]))
+    return ticks * len(TOPICS)
+
+
+def read_ours(path: Path) -> dict[str, FloatArray]:
+    """All columns through the session reader."""
+    with Session.open(path) as session:
+        found = session.joint_columns(TOPICS)
+    return {f"{topic}.{field}": np.array(found[topic, field].values) for topic, field in found}
+
+
+def read_peer(path: Path) -> dict[str, FloatArray]:
+    """The same columns through mcap and mcap-ros2-support, message by message."""
+    rows: dict[str, list[list[float]]] = {
+        f"{topic}.{field}": [] for topic, fields in TOPICS.items() for field in fields
+    }
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages(topics=list(TOPICS)):
+            for field in TOPICS[channel.topic]:
+                rows[f"{channel.topic}.{field}"].append(getattr(message, field))
+    return {name: np.array(values).T for name, values in rows.items()}
+
+
+def timed(
+    read: Callable[[Path], dict[str, FloatArray]], path: Path
+) -> tuple[float, dict[str, FloatArray]]:
+    """Seconds of processor time and what was read."""
+    start = time.process_time()
+    columns = read(path)
+    return time.process_time() - start, columns
+
+
+def main() -> None:
+    """Write, read with both in turn, compare, print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--runs", type=int, default=3)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.mcap"
+        count = write_session(path, options.minutes)
+        size = path.stat().st_size / 1e6
+        ours: list[float] = []
+        peer: list[float] = []
+        for _ in range(options.runs):  # in turn, so that a drift of the machine hits both
+            seconds, mine = timed(read_ours, path)
+            ours.append(seconds)
+            seconds, theirs = timed(read_peer, path)
+            peer.append(seconds)
+            for name, values in mine.items():
+                np.testing.assert_array_equal(values, theirs[name])
+    ratio = statistics.median(peer) / statistics.median(ours)
+    print(f"{ratio:.0f} times as fast as mcap + mcap-ros2-support, values equal")
+    print(f"{count} JointState messages, {len(NAMES)} joints, {size:.0f} MB zstd")
+    for name, seconds in (("undulog", ours), ("mcap + mcap-ros2-support", peer)):
+        each = statistics.median(seconds) / count * 1e6
+        print(
+            f"{name:<26} {statistics.median(seconds):8.3f} s "
+            f"(min {min(seconds):.3f}, max {max(seconds):.3f})  {each:8.2f} us a message"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""Reads JointState topics of any make: fields, clocks and sampling times put right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .arrays import FloatArray, IntArray
+from .cdr import layout_of
+from .columns import Messages
+from .errors import DataError, MissingChannelError
+from .joint_rows import JointRows, merge_rows, own_times, rows_of
+from .signals import JointSignals
+from .topics import Topics, Window
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"
+UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+"""Field of a JointState to its unit, where the channel doesn't say otherwise."""
+
+_NS = 1_000_000_000
+_POLLED = {"/joint_states", "/joint_current", "/joint_voltage", "/joint_temperature"}
+"""Topics whose samples are taken joint by joint in the polling cycle."""
+
+_SLACK_NS = 5 * _NS
+"""How far a sampling time may lie from its log time before a window could miss it."""
+
+_FAR_NS = 3600 * _NS
+"""Stamps further than this from the log time are on another clock (simulated time)."""
+
+_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+
+
+class JointReader:
+    """Joint signals of one session."""
+
+    def __init__(self, path: Path, topics: Topics, warn: Callable[[str], None]) -> None:
+        """Keep what reading needs.
+
+        Args:
+            path: The file, for messages.
+            topics: Its topics.
+            warn: Takes one sentence for each irregularity.
+        """
+        self._path = path
+        self._topics = topics
+        self._warn = warn
+        self._shift_ns: int | None = None
+        self._offsets: JointSignals | None = None
+
+    def read(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window, chain: Sequence[str]
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Read fields of JointState topics in one pass over the file.
+
+        Args:
+            wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
+            window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
+            chain: Joint names head to tail; joints not in it come after it.
+
+        Returns:
+            (topic, field) to signals.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If a topic is not of JointStates, or there is no such field.
+        """
+        self._check(wanted)
+        start, stop = window_ns
+        wide = (
+            None if start is None else start - _SLACK_NS,
+            None if stop is None else stop + _SLACK_NS,
+        )
+        if self._shift_ns is None:
+            self._shift_ns = self._find_shift(next(iter(wanted)))
+        found = self._topics.read({topic: [*_STAMP, *wanted[topic]] for topic in wanted}, wide)
+        return {
+            (topic, field): self._signals(topic, field, found[topic], window_ns, chain)
+            for topic in wanted
+            for field in wanted[topic]
+        }
+
+    def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
+        channels = self._topics.channels
+        for topic, fields in wanted.items():
+            if topic not in channels:
+                raise MissingChannelError(self._path, topic, sorted(channels))
+            if channels[topic].type_name != JOINT_STATE:
+                kind = channels[topic].type_name
+                raise DataError(f"{self._path}: {topic} is {kind}, not {JOINT_STATE}")
+            for field in fields:
+                if field not in UNITS:
+                    raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
+
+    def _signals(
+        self, topic: str, field: str, found: Messages, window_ns: Window, chain: Sequence[str]
+    ) -> JointSignals:
+        rows = [rows_of(group, field) for group in found.groups]
+        rows.extend(self._general_rows(topic, field, found))
+        if rows and not any(row.values.size for row in rows):
+            raise MissingChannelError(self._path, f"{field} in {topic}", self._filled(topic))
+        rows = [self._on_log_clock(row, topic) for row in rows]
+        names, times, values = merge_rows(rows, topic, field, self._warn)
+        times = self._at_own_times(topic, names, times)
+        cut = [_cut(t, v, window_ns) for t, v in zip(times, values, strict=True)]
+        unit = UNITS[field]
+        if field == "position":
+            unit = self._topics.channels[topic].metadata.get("unit", unit)
+        signals = JointSignals(
+            topic, field, unit, names, tuple(t for t, _ in cut), tuple(v for _, v in cut)
+        )
+        known = [name for name in chain if name in names]
+        return signals.select(known + [name for name in names if name not in chain])
+
+    def _general_rows(self, topic: str, field: str, found: Messages) -> list[JointRows]:
+        """Rows of messages without a layout, through the general decoder."""
+        if not found.unread:
+            return []
+        decode = self._topics.decoder(topic)
+        rows: list[JointRows] = []
+        lost = 0
+        for item in found.unread:
+            try:
+                message = decode(item.data)
+            except DataError:
+                lost += 1
+                continue
+            stamp = message.header.stamp
+            stamp_ns = int(stamp.sec) * _NS + int(stamp.nanosec)
+            values = np.array([getattr(message, field)], dtype=np.float64)
+            times = np.array([stamp_ns]), np.array([item.log_ns])
+            rows.append(JointRows(tuple(message.name), *times, values))
+        if lost:
+            self._warn(f"{topic}: {lost} messages can't be read: {found.unread[0].why}")
+        return rows
+
+    def _filled(self, topic: str) -> list[str]:
+        """The fields that the topic does carry."""
+        found = self._topics.read({topic: list(UNITS)}, (None, None))[topic]
+        return [name for name in UNITS if any(name in group.columns for group in found.groups)]
+
+    def _find_shift(self, topic: str) -> int:
+        """How far the topic's clock is from the log's [ns], 0 unless it is another clock."""
+        first = self._topics.first(topic)
+        if first is None:
+            return 0
+        log_ns, message, kind = first
+        try:
+            leaves = layout_of(kind, message).leaves
+        except DataError:
+            return 0
+        sec, nanosec = (
+            int(np.frombuffer(message, leaves[path].dtype, 1, leaves[path].offset)[0])
+            for path in _STAMP
+        )
+        stamp_ns = sec * _NS + nanosec
+        if not stamp_ns or abs(log_ns - stamp_ns) <= _FAR_NS:
+            return 0
+        # Whole seconds, so that all topics of the session get the same shift.
+        shift_s = round((log_ns - stamp_ns) / _NS)
+        self._warn(
+            f"header stamps lie {-shift_s} s from the log times (another clock, such as simulated "
+            "time); they are shifted by that"
+        )
+        return shift_s * _NS
+
+    def _on_log_clock(self, row: JointRows, topic: str) -> JointRows:
+        if len(row.stamp_ns) and not row.stamp_ns.any():
+            self._warn(f"{topic}: header stamps are zero; log times are used instead")
+            return JointRows(row.names, row.log_ns, row.log_ns, row.values)
+        if self._shift_ns:
+            return JointRows(row.names, row.stamp_ns + self._shift_ns, row.log_ns, row.values)
+        return row
+
+    def _at_own_times(
+        self, topic: str, names: Sequence[str], times: Sequence[IntArray]
+    ) -> list[IntArray]:
+        if topic not in _POLLED or SAMPLE_OFFSET_TOPIC not in self._topics.channels:
+            return list(times)
+        if self._offsets is None:
+            key = (SAMPLE_OFFSET_TOPIC, "position")
+            self._offsets = self.read({key[0]: [key[1]]}, (None, None), ())[key]
+        offsets = self._offsets
+        if all(not values.any() for values in offsets.values):
+            return list(times)  # sampled together: keep the shared array
+        own: list[IntArray] = []
+        for name, t_ns in zip(names, times, strict=True):
+            if name in offsets.names:
+                signal = offsets.signal(name)
+                own.append(own_times(t_ns, signal.t_ns, signal.values))
+            else:
+                self._warn(f"{SAMPLE_OFFSET_TOPIC} has no {name}: its message stamps are used")
+                own.append(t_ns)
+        return own
+
+
+def _cut(t_ns: IntArray, values: FloatArray, window_ns: Window) -> tuple[IntArray, FloatArray]:
+    """The samples in the half-open window [start, stop); views."""
+    start, stop = window_ns
+    first = 0 if start is None else int(np.searchsorted(t_ns, start, side="left"))
+    last = len(t_ns) if stop is None else int(np.searchsorted(t_ns, stop, side="left"))
+    if (first, last) == (0, len(t_ns)):
+        return t_ns, values
+    return t_ns[first:last], values[first:last]
