@@ -33,9 +33,9 @@ def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str,
     Returns:
         Message name to message, None if a database could not be read.
     """
-    from cantools.database import load_string  # noqa: PLC0415
-    from cantools.database.can import Database  # noqa: PLC0415
-    from cantools.database.errors import UnsupportedDatabaseFormatError  # noqa: PLC0415
+    from cantools.database import load_string
+    from cantools.database.can import Database
+    from cantools.database.errors import UnsupportedDatabaseFormatError
 
     messages: dict[str, Message] = {}
     readable = True
