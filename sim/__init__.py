@@ -1,1 +1,26 @@
-"""sim."""
+"""The twin: body, ground, servos and gait of an undulating robot, recorded like the robot itself.
+
+This package imports light; :mod:`sim.twin` and :mod:`sim.record` bring the physics engine.
+"""
+
+from .contact import FrictionLaw, Ground
+from .gait import Gait, GaitTick, PlaneGait, Serpentine, SerpentineGait, Wave
+from .scenario import Noise, Scenario, World
+from .scenario_file import load_scenario, parse_scenario, scenario_names
+
+__all__ = [
+    "FrictionLaw",
+    "Gait",
+    "GaitTick",
+    "Ground",
+    "Noise",
+    "PlaneGait",
+    "Scenario",
+    "Serpentine",
+    "SerpentineGait",
+    "Wave",
+    "World",
+    "load_scenario",
+    "parse_scenario",
+    "scenario_names",
+]

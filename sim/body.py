@@ -1,0 +1,213 @@
+"""The articulated body: PyBullet steps it, and nothing else.
+
+Contact and servos are this package's own (:mod:`sim.contact`, :mod:`sim.servo`), because the
+engine's anisotropic friction depends on the heading and its position motors have no electrical or
+elastic side. So the body has no collision shapes here and its motors are off; forces and torques
+come in from outside, once a step. It has no mechanical end stops: commands are kept within the
+joint limits, and the twin says when a joint passes its limit all the same.
+
+The base of the engine's body is the head link, so joint and link i of the engine are
+``robot.joints[i]`` and ``robot.links[i + 1]``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Generator, Sequence
+from itertools import chain
+from operator import itemgetter
+from typing import NamedTuple
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.errors import UsageError
+from capture.robot import Plane, Robot
+
+MAX_JOINTS = 127
+"""Links beside the base that the engine can hold."""
+
+
+@contextlib.contextmanager
+def _quiet_stderr() -> Generator[None]:
+    """Drop what C code prints on stderr: the engine greets with its build time on import."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as sink:  # noqa: PTH123 - a device, needed as a descriptor
+            os.dup2(sink.fileno(), 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+
+
+with _quiet_stderr():
+    import pybullet
+
+_AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
+_NO_SHAPE = -1
+_UNTURNED = (0.0, 0.0, 0.0, 1.0)
+
+_link_fields = itemgetter(0, 1, 6, 7)  # centre, orientation, velocity, angular velocity
+_joint_fields = itemgetter(0, 1)  # angle, rate
+_flatten = chain.from_iterable
+
+
+class BodyState(NamedTuple):
+    """Where the body is and how it moves, in the world; the component comes first.
+
+    Attributes:
+        position: Centres of the n links [m], shape (3, n).
+        quaternion: Their orientations x, y, z, w, shape (4, n).
+        velocity: Velocities of the centres [m/s], shape (3, n).
+        spin: Angular velocities [rad/s], shape (3, n).
+        angle: Joint angles [rad], shape (m,).
+        rate: Joint rates [rad/s], shape (m,).
+    """
+
+    position: FloatArray
+    quaternion: FloatArray
+    velocity: FloatArray
+    spin: FloatArray
+    angle: FloatArray
+    rate: FloatArray
+
+
+class Body:
+    """A robot's links and joints in a physics world of their own; :meth:`close` it after use."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        gravity: Sequence[float],
+        height: float,
+        heading: float,
+        velocity: Sequence[float],
+        dt: float,
+    ) -> None:
+        """Build the body, straight, its head above the origin.
+
+        Args:
+            robot: The robot, at most :data:`MAX_JOINTS` joints.
+            gravity: Acceleration of gravity in the world [m/s^2], length 3.
+            height: Height of the links' centres [m].
+            heading: Direction of the head's x axis, about z [rad].
+            velocity: Of the whole body [m/s], length 3.
+            dt: Step [s].
+
+        Raises:
+            UsageError: If the engine cannot hold the robot.
+        """
+        joints, links = robot.joints, robot.links
+        if len(joints) > MAX_JOINTS:
+            raise UsageError(
+                f"robot {robot.name} has {len(joints)} joints; the twin takes at most {MAX_JOINTS}"
+            )
+        self._client = pybullet.connect(pybullet.DIRECT)
+        half = [link.length / 2 for link in links]
+        # The engine wants each joint relative to the joint before it (to the centre for the base).
+        joint_positions = [
+            (-half[0] if i == 0 else -2 * half[i], 0.0, 0.0) for i in range(len(joints))
+        ]
+        self._body = pybullet.createMultiBody(
+            baseMass=links[0].mass,
+            baseCollisionShapeIndex=_NO_SHAPE,
+            baseVisualShapeIndex=_NO_SHAPE,
+            basePosition=(0.0, 0.0, height),
+            baseOrientation=(0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)),
+            linkMasses=[link.mass for link in links[1:]],
+            linkCollisionShapeIndices=[_NO_SHAPE] * len(joints),
+            linkVisualShapeIndices=[_NO_SHAPE] * len(joints),
+            linkPositions=joint_positions,
+            linkOrientations=[_UNTURNED] * len(joints),
+            linkInertialFramePositions=[(-h, 0.0, 0.0) for h in half[1:]],
+            linkInertialFrameOrientations=[_UNTURNED] * len(joints),
+            linkParentIndices=list(range(len(joints))),
+            linkJointTypes=[pybullet.JOINT_REVOLUTE] * len(joints),
+            linkJointAxis=[_AXES[joint.plane] for joint in joints],
+            physicsClientId=self._client,
+        )
+        for i, link in enumerate(links, start=-1):
+            # Two calls: together with damping the engine silently drops the inertia.
+            pybullet.changeDynamics(
+                self._body, i, localInertiaDiagonal=link.inertia, physicsClientId=self._client
+            )
+            pybullet.changeDynamics(
+                self._body,
+                i,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
+                physicsClientId=self._client,
+            )
+        self._joints = list(range(len(joints)))
+        self._count = len(links)
+        pybullet.setJointMotorControlArray(
+            self._body,
+            self._joints,
+            pybullet.VELOCITY_CONTROL,
+            forces=[0.0] * len(joints),
+            physicsClientId=self._client,
+        )
+        pybullet.resetBaseVelocity(
+            self._body, velocity, (0.0, 0.0, 0.0), physicsClientId=self._client
+        )
+        pybullet.setGravity(*gravity, physicsClientId=self._client)
+        pybullet.setTimeStep(dt, physicsClientId=self._client)
+
+    def close(self) -> None:
+        """Free the physics world."""
+        pybullet.disconnect(physicsClientId=self._client)
+
+    def read(self) -> BodyState:
+        """The present state, in arrays of its own.
+
+        Returns:
+            Positions and velocities of links and joints.
+        """
+        client = self._client
+        head = (
+            *pybullet.getBasePositionAndOrientation(self._body, client),
+            *pybullet.getBaseVelocity(self._body, client),
+        )
+        n = self._count
+        # Without the forward kinematics the poses would be one step old, here and in push().
+        links = pybullet.getLinkStates(self._body, self._joints, 1, 1, client)
+        flat = _flatten(_flatten(chain((head,), map(_link_fields, links))))
+        fields = np.ascontiguousarray(np.fromiter(flat, np.float64, 13 * n).reshape(n, 13).T)
+        joints = pybullet.getJointStates(self._body, self._joints, client)
+        flat = _flatten(map(_joint_fields, joints))
+        angles = np.ascontiguousarray(np.fromiter(flat, np.float64, 2 * n - 2).reshape(n - 1, 2).T)
+        return BodyState(fields[:3], fields[3:7], fields[7:10], fields[10:], angles[0], angles[1])
+
+    def push(self, force: FloatArray, point: FloatArray) -> None:
+        """Apply forces to the links during the next step.
+
+        Args:
+            force: In the world [N], shape (3, n); links without vertical force are left out.
+            point: Points of action in the world [m], shape (3, n).
+        """
+        apply, world = pybullet.applyExternalForce, pybullet.WORLD_FRAME
+        body, client = self._body, self._client
+        for i, (vector, at) in enumerate(zip(force.T.tolist(), point.T.tolist(), strict=True), -1):
+            if vector[2] > 0.0:
+                apply(body, i, vector, at, world, client)
+
+    def step(self, torque: FloatArray) -> None:
+        """Advance the body by one step.
+
+        Args:
+            torque: Of the joints [N m], shape (m,).
+        """
+        pybullet.setJointMotorControlArray(
+            self._body,
+            self._joints,
+            pybullet.TORQUE_CONTROL,
+            forces=torque.tolist(),
+            physicsClientId=self._client,
+        )
+        pybullet.stepSimulation(self._client)

@@ -1,0 +1,142 @@
+"""The verbs ``sim list`` and ``sim run``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from capture.console import emit_json, progress, refuse_existing
+from capture.interruption import interruptible
+
+if TYPE_CHECKING:
+    from .record import Recording
+    from .scenario import Scenario
+
+
+def list_scenarios(*, json: bool = False) -> None:
+    """List the shipped scenarios: name, robot, duration, and what each is about.
+
+    Example: `undulog sim list`
+
+    Args:
+        json: Print one JSON array instead of text.
+    """
+    from .scenario_file import load_scenario, scenario_names
+
+    scenarios = [load_scenario(name) for name in scenario_names()]
+    if json:
+        emit_json([_described(scenario) for scenario in scenarios])
+        return
+    width = max(len(scenario.name) for scenario in scenarios)
+    for one in scenarios:
+        print(f"{one.name:{width}}  {one.robot.name:8}  {one.duration_s:5g} s  {one.description}")
+
+
+def run(
+    scenario: str,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    duration: float | None = None,
+    seed: int | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Simulate a scenario and record it as a session, faster than real time.
+
+    The same scenario and seed give the same file, byte for byte. SIGINT and SIGTERM end the run
+    between two samples and leave a whole file.
+
+    Example: `undulog sim run weak-servo-pi3 -o weak.mcap`
+
+    Args:
+        scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
+        output: The session file to write, `.mcap`.
+        duration: Simulated length in seconds, instead of the scenario's.
+        seed: Seed of the sensor noise, instead of the scenario's.
+        force: Replace the output if it is there.
+        json: Print one JSON object instead of text.
+    """
+    from .record import record
+    from .scenario_file import load_scenario
+
+    chosen = load_scenario(scenario).changed(duration_s=duration, seed=seed)
+    refuse_existing(output, force=force)
+    start = time.monotonic()
+    with interruptible() as stop, progress(chosen.name, chosen.duration_s) as bar:
+        recording = record(
+            chosen,
+            output,
+            force=force,
+            stop=stop,
+            on_sample=lambda sample: bar.update(
+                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
+            ),
+        )
+    factor = recording.duration_s / (time.monotonic() - start)
+    if json:
+        emit_json(_reported(chosen, recording, factor))
+    else:
+        print("\n".join(_told(chosen, recording, factor)))
+    return 0 if recording.complete else 1
+
+
+def _described(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "name": scenario.name,
+        "robot": scenario.robot.name,
+        "joints": len(scenario.robot.joints),
+        "duration_s": scenario.duration_s,
+        "settle_s": scenario.settle_s,
+        "description": scenario.description,
+    }
+
+
+def _closure(recording: Recording) -> float | None:
+    """Greater of the two residuals, as a share of the absolute mechanical work."""
+    energy = recording.energy
+    worst = max(abs(energy["mechanical_residual"]), abs(energy["electrical_residual"]))
+    return worst / energy["mechanical_abs"] if energy["mechanical_abs"] > 0 else None
+
+
+def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[str, Any]:
+    return {
+        "path": str(recording.path),
+        "session_id": recording.session_id,
+        "scenario": scenario.name,
+        "robot": scenario.robot.name,
+        "seed": scenario.seed,
+        "duration_s": recording.duration_s,
+        "planned_duration_s": scenario.duration_s,
+        "settle_s": scenario.settle_s,
+        "complete": recording.complete,
+        "samples": recording.sample_count,
+        "energy_j": recording.energy,
+        "energy_closure": _closure(recording),
+        "real_time_factor": factor,
+    }
+
+
+def _told(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+    energy, closure = recording.energy, _closure(recording)
+    if recording.complete:
+        first = f"{recording.path}: {recording.duration_s:g} s of {scenario.name}"
+    else:
+        first = (
+            f"stopped at {recording.duration_s:g} s of {scenario.duration_s:g} s; "
+            f"{recording.path} is complete up to there"
+        )
+    who = f"{scenario.robot.name}, {recording.sample_count} samples of "
+    who += f"{len(scenario.robot.joints)} joints, session {recording.session_id}"
+    work = f"mechanical work {energy['mechanical_net']:.3g} J net, "
+    work += (
+        f"{energy['mechanical_abs']:.3g} J absolute; electrical {energy['electrical_net']:.3g} J"
+    )
+    lines = [first, who, work]
+    if closure is not None:
+        lines.append(f"energy ledger closes within {100 * closure:.2g} % of the absolute work")
+    lines.append(f"simulated at {factor:.1f} x real time")
+    return lines

@@ -1,0 +1,214 @@
+"""The twin's energy ledger: where every joule goes, booked at the physics rate.
+
+It is the best check that a simulation is right, and the truth that energy estimates from logs are
+held against. Forces and torques are constant during a step, so each is booked at mid-step
+velocity, the mean of the velocities before and after: with the semi-implicit Euler rule that body
+and rotors follow, what is left over is a boundary term that does not grow.
+
+Two balances close over any stretch of time::
+
+    mechanical_net = friction_tangential + friction_normal + contact_damping
+                     + change of (kinetic + potential + contact_spring)
+    electrical_net = mechanical_net + copper + viscous + coulomb + gear_damping
+                     + change of (rotor_kinetic + gear_spring)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.kinematics import rotation_from_quaternion
+from capture.robot import Robot
+
+from .body import BodyState
+from .contact import Contact, into_link_axes
+from .servo import Drive, Rotors, Servos
+
+JOINT_TERMS = (
+    "mechanical_net",
+    "mechanical_plus",
+    "mechanical_abs",
+    "electrical_net",
+    "electrical_plus",
+    "copper",
+    "viscous",
+    "coulomb",
+    "gear_damping",
+)
+"""Flows at the joints [J], cumulative: work on the joints (signed, its positive part, absolute),
+electrical work at the motors (signed, its positive part), and the four losses of the servos."""
+
+GROUND_TERMS = ("friction_tangential", "friction_normal", "contact_damping")
+"""What the ground takes [J], cumulative."""
+
+STORED_TERMS = ("kinetic", "potential", "contact_spring", "rotor_kinetic", "gear_spring")
+"""Energies stored at the instant [J]."""
+
+RESIDUAL_TERMS = ("mechanical_residual", "electrical_residual")
+"""Left side minus right side of the two balances since the start [J]: the ledger's own error."""
+
+TERMS = JOINT_TERMS + GROUND_TERMS + STORED_TERMS + RESIDUAL_TERMS
+"""All terms, in the order of :meth:`Ledger.read`."""
+
+
+class Step(NamedTuple):
+    """Everything that acts during one physics step, as it stands at its start."""
+
+    body: BodyState
+    contact: Contact
+    rotors: Rotors
+    drive: Drive
+
+
+def joint_flows(steps: Sequence[Step], servos: Servos, dt: float) -> FloatArray:
+    """Energies that pass the joints during consecutive steps.
+
+    Args:
+        steps: k + 1 steps; the last one closes the one before it.
+        servos: The servos.
+        dt: Step [s].
+
+    Returns:
+        Energies [J], rows as :data:`JOINT_TERMS`, shape (9, m).
+    """
+    rate = _middle([step.body.rate for step in steps])
+    speed = _middle([step.rotors.speed for step in steps])
+    acting = steps[:-1]
+    voltage = np.array([step.drive.voltage for step in acting])
+    viscous, coulomb, gear = np.array([step.drive.drag for step in acting]).swapaxes(0, 1)
+    mechanical = np.array([step.drive.torque for step in acting]) * rate
+    current = servos.current(voltage, speed)
+    electrical = voltage * current
+    powers = (
+        mechanical,
+        np.maximum(mechanical, 0.0),
+        np.abs(mechanical),
+        electrical,
+        np.maximum(electrical, 0.0),
+        servos.resistance * current * current,
+        viscous * speed,
+        coulomb * speed,
+        gear * (speed - rate),
+    )
+    return dt * np.array(powers).sum(axis=1)
+
+
+def ground_flows(steps: Sequence[Step], stiffness: float, dt: float) -> FloatArray:
+    """Energies that the ground takes during consecutive steps.
+
+    Args:
+        steps: k + 1 steps; the last one closes the one before it.
+        stiffness: Of the ground [N/m]; its spring stores energy, the rest is lost.
+        dt: Step [s].
+
+    Returns:
+        Energies [J], as :data:`GROUND_TERMS`, shape (3,).
+    """
+    velocity = _middle([step.contact.velocity for step in steps])
+    acting = [step.contact for step in steps[:-1]]
+    slip = into_link_axes(np.array([c.tangent for c in acting]), velocity)
+    friction = -(np.array([c.friction for c in acting]) * slip).sum(axis=(0, 2))
+    spring = stiffness * np.array([c.penetration for c in acting])
+    damping = np.array([c.force[2] for c in acting]) - spring
+    return dt * np.array([friction[0], friction[1], -(damping * velocity[:, 2]).sum()])
+
+
+class Ledger:
+    """Adds up flows and reads off stored energies."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        servos: Servos,
+        *,
+        gravity: FloatArray,
+        stiffness: float,
+        dt: float,
+        start: Step,
+    ) -> None:
+        """Open the ledger.
+
+        Args:
+            robot: The robot.
+            servos: Its servos.
+            gravity: Acceleration of gravity in the world [m/s^2], shape (3,).
+            stiffness: Of the ground [N/m], 0 where there is none.
+            dt: Step [s].
+            start: The state at which all flows are zero.
+        """
+        self._servos = servos
+        self._mass = np.array([link.mass for link in robot.links])
+        self._inertia = np.array([link.inertia for link in robot.links])
+        self._gravity = gravity
+        self._stiffness = stiffness
+        self._dt = dt
+        self._joints = np.zeros((len(JOINT_TERMS), len(robot.joints)))
+        self._ground = np.zeros(len(GROUND_TERMS))
+        self._start = self.stored(start)
+
+    @property
+    def joints(self) -> FloatArray:
+        """Cumulative flows of each joint [J], rows as :data:`JOINT_TERMS`, shape (9, m)."""
+        return self._joints.copy()
+
+    def book(self, steps: Sequence[Step]) -> None:
+        """Add the flows of consecutive steps.
+
+        Args:
+            steps: k + 1 steps; the last one closes the one before it and is booked next time.
+        """
+        self._joints += joint_flows(steps, self._servos, self._dt)
+        self._ground += ground_flows(steps, self._stiffness, self._dt)
+
+    def stored(self, step: Step) -> FloatArray:
+        """Energies stored at one instant.
+
+        Args:
+            step: The instant.
+
+        Returns:
+            Energies [J], as :data:`STORED_TERMS`, shape (5,).
+        """
+        body, rotors, servos = step.body, step.rotors, self._servos
+        rotation = rotation_from_quaternion(body.quaternion.T)
+        spin = np.einsum("nji,jn->ni", rotation, body.spin)  # in the links' own frames
+        twist = servos.gear_stiffness * (rotors.angle - body.angle) ** 2
+        return np.array(
+            [
+                0.5 * (self._mass * (body.velocity**2).sum(axis=0)).sum()
+                + 0.5 * (self._inertia * spin**2).sum(),
+                -(self._gravity @ body.position) @ self._mass,
+                0.5 * self._stiffness * (step.contact.penetration**2).sum(),
+                0.5 * (servos.inertia * rotors.speed**2).sum(),
+                0.5 * twist.sum(),
+            ]
+        )
+
+    def read(self, step: Step) -> FloatArray:
+        """All terms at one instant.
+
+        Args:
+            step: The instant, up to which all steps are booked.
+
+        Returns:
+            Energies [J], as :data:`TERMS`, shape (19,).
+        """
+        joints = self._joints.sum(axis=1)
+        stored = self.stored(step)
+        change = stored - self._start
+        net, electrical, losses = joints[0], joints[3], joints[5:].sum()
+        residuals = (
+            net - self._ground.sum() - change[:3].sum(),
+            electrical - net - losses - change[3:].sum(),
+        )
+        return np.concatenate((joints, self._ground, stored, residuals))
+
+
+def _middle(values: Sequence[FloatArray]) -> FloatArray:
+    """Means of neighbours: k + 1 arrays to shape (k, ...)."""
+    series = np.array(values)
+    return 0.5 * (series[1:] + series[:-1])

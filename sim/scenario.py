@@ -1,0 +1,171 @@
+"""Scenarios: what the twin is to run, complete.
+
+The TOML form is described in :mod:`sim.scenario_file`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from capture.errors import UsageError
+from capture.robot import Robot
+
+from .contact import Ground
+from .gait import Serpentine
+from .toml_text import toml_text
+
+CONTROL_RATE_HZ = 100
+"""Rate of control and log."""
+
+LONGEST_S = 86400.0
+"""Longest run."""
+
+
+@dataclass(frozen=True)
+class World:
+    """Where the robot is.
+
+    Attributes:
+        gravity: Acceleration of gravity [m/s^2]; the ground is the plane z = 0.
+        heading: Direction of the head at the start, about z [rad].
+        velocity: Of the whole robot at the start, in the world [m/s].
+        ground: The ground, or None: then nothing touches the robot.
+    """
+
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    heading: float = 0.0
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ground: Ground | None = field(default_factory=Ground)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise of what the servos report, as standard deviations.
+
+    Attributes:
+        position: [rad].
+        velocity: [rad/s].
+        effort: [N m].
+    """
+
+    position: float = 0.0
+    velocity: float = 0.0
+    effort: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One run of the twin, complete.
+
+    Attributes:
+        name: Short name.
+        description: One sentence.
+        robot_name: The robot as the scenario names it.
+        robot: The robot, with the scenario's servos.
+        gait: What it is commanded to do.
+        duration_s: Length of the run.
+        settle_s: The first part of it that is not fit for steady-state analysis.
+        world: Where it is.
+        noise: What the encoders add.
+        servo: Servo parameters of all joints that differ from the robot's own.
+        servo_of: The same of single joints, by joint name.
+        seed: Of the noise.
+        epoch_s: Unix time at which the session starts [s].
+        physics_rate_hz: Steps a second, a multiple of :data:`CONTROL_RATE_HZ`.
+    """
+
+    name: str
+    description: str
+    robot_name: str
+    robot: Robot
+    gait: Serpentine
+    duration_s: float
+    settle_s: float = 0.0
+    world: World = field(default_factory=World)
+    noise: Noise = field(default_factory=Noise)
+    servo: Mapping[str, float] = field(default_factory=dict[str, float])
+    servo_of: Mapping[str, Mapping[str, float]] = field(
+        default_factory=dict[str, Mapping[str, float]]
+    )
+    seed: int = 1
+    epoch_s: int = 1_735_689_600  # 2025-01-01T00:00:00Z: near zero, viewers misread stamps
+    physics_rate_hz: int = 1000
+
+    @property
+    def epoch_ns(self) -> int:
+        """Start of the session [Unix ns]."""
+        return self.epoch_s * 1_000_000_000
+
+    @property
+    def tick_count(self) -> int:
+        """Samples of the run: one at the start and one at the end of every control period."""
+        return round(self.duration_s * CONTROL_RATE_HZ) + 1
+
+    @property
+    def session_id(self) -> str:
+        """Hash of everything that decides what the run gives."""
+        parts = (self.toml(), self.robot.toml or repr(self.robot))
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+    def changed(self, *, duration_s: float | None = None, seed: int | None = None) -> Scenario:
+        """The same scenario with another length or seed.
+
+        Args:
+            duration_s: Length of the run; ``settle_s`` is cut to it.
+            seed: Of the noise.
+
+        Returns:
+            The scenario.
+
+        Raises:
+            UsageError: If the length is not at least one control period, or the seed negative.
+        """
+        length = self.duration_s if duration_s is None else duration_s
+        if not 1 / CONTROL_RATE_HZ <= length <= LONGEST_S:
+            raise UsageError(
+                f"a duration of {length:g} s; it can be {1 / CONTROL_RATE_HZ:g} to {LONGEST_S:g} s"
+            )
+        if seed is not None and seed < 0:
+            raise UsageError(f"a seed of {seed}; it can be 0 or a positive whole number")
+        return dataclasses.replace(
+            self,
+            duration_s=length,
+            settle_s=min(self.settle_s, length),
+            seed=self.seed if seed is None else seed,
+        )
+
+    def toml(self) -> str:
+        """The scenario as TOML, every value written out; reading it gives the same scenario."""
+        gait: dict[str, Any] = {"ramp_s": self.gait.ramp_s}
+        gait |= {str(plane): dataclasses.asdict(one) for plane, one in self.gait.planes.items()}
+        ground = self.world.ground
+        world: dict[str, Any] = {
+            "gravity": list(self.world.gravity),
+            "heading": self.world.heading,
+            "velocity": list(self.world.velocity),
+            "surface": "none" if ground is None else "flat",
+        }
+        if ground is not None:
+            world["ground"] = dataclasses.asdict(ground)
+        values: dict[str, Any] = {
+            "name": self.name,
+            "description": self.description,
+            "robot": self.robot_name,
+            "duration_s": self.duration_s,
+            "settle_s": self.settle_s,
+            "seed": self.seed,
+            "epoch_s": self.epoch_s,
+            "physics_rate_hz": self.physics_rate_hz,
+            "gait": gait,
+            "world": world,
+            "noise": dataclasses.asdict(self.noise),
+        }
+        if self.servo:
+            values["servo"] = dict(self.servo)
+        if self.servo_of:
+            values["servo_of"] = {name: dict(one) for name, one in self.servo_of.items()}
+        return toml_text(values)

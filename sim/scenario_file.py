@@ -1,0 +1,290 @@
+"""Scenario files: TOML, read strictly, every fault reported at once.
+
+A scenario::
+
+    description = "Lateral undulation on flat ground."
+    robot = "snake25"               # a shipped robot, or a TOML file beside the scenario
+    duration_s = 20.0
+    settle_s = 8.0                  # the start, not fit for steady-state analysis
+    seed = 1                        # of the noise
+    epoch_s = 1735689600            # Unix time at which the session starts
+    physics_rate_hz = 1000
+
+    [gait]
+    ramp_s = 2.0                    # amplitude and offset grow from nothing over this time
+
+    [gait.horizontal]               # and [gait.vertical]; rad throughout
+    amplitude = 0.4
+    frequency_hz = 0.5
+    lag = 1.0471975511965976        # from one joint of the plane to the next
+    wave = "head-to-tail"           # or "tail-to-head"
+    offset = 0.0
+    phase = 0.0
+
+    [world]
+    gravity = [0.0, 0.0, -9.81]     # m/s^2; tilt it for an incline
+    heading = 0.0                   # rad
+    velocity = [0.0, 0.0, 0.0]      # m/s, of the whole robot at the start
+    surface = "flat"                # or "none": nothing touches the robot
+
+    [world.ground]
+    stiffness = 2000.0              # N/m
+    damping = 20.0                  # N s/m
+    mu_tangential = 0.05
+    mu_normal = 0.5
+    slip_speed = 0.01               # m/s, smoothing of friction
+    law = "ellipse"                 # or "box", "transeth"
+
+    [servo]                         # instead of the robot's own parameters
+    stall_torque = 0.25
+
+    [servo_of.joint07]              # and of single joints
+    stall_torque = 0.2
+
+    [noise]                         # standard deviations of what the servos report
+    position = 0.0                  # rad
+    velocity = 0.0                  # rad/s
+    effort = 0.0                    # N m
+
+Required are ``description``, ``robot``, ``duration_s`` and one plane of the gait with amplitude,
+frequency and lag.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from enum import StrEnum
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from capture.errors import Fault, ScenarioError, UsageError
+from capture.robot import Plane, Robot, Servo
+from capture.robot_file import load_robot, robot_names
+from capture.strict_table import NAME_PATTERN, Faults, Table, listed
+
+from .contact import FrictionLaw, Ground
+from .gait import PlaneGait, Serpentine, Wave
+from .scenario import CONTROL_RATE_HZ, LONGEST_S, Noise, Scenario, World
+
+_LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
+_MAY_BE_ZERO = ("viscous_friction", "coulomb_friction", "gear_damping")
+
+
+class _Surface(StrEnum):
+    FLAT = "flat"
+    NONE = "none"
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Names of the shipped scenarios, sorted."""
+    shipped = resources.files("sim") / "scenarios"
+    names = [Path(entry.name) for entry in shipped.iterdir()]
+    return tuple(sorted(name.stem for name in names if name.suffix == ".toml"))
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """Read a shipped scenario by name, or a scenario from a file.
+
+    Args:
+        name_or_path: A name of :func:`scenario_names`, or the path of a TOML file.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        UsageError: If there is no such scenario or the file cannot be read.
+        ScenarioError: If it has faults; lists all of them.
+        RobotFileError: If the robot's own file has faults.
+    """
+    if str(name_or_path) in scenario_names():
+        shipped = resources.files("sim") / "scenarios" / f"{name_or_path}.toml"
+        return parse_scenario(shipped.read_text(encoding="utf-8"), f"{name_or_path}.toml")
+    path = Path(name_or_path)
+    if not path.is_file():
+        near = listed(scenario_names(), str(name_or_path))
+        raise UsageError(f"no scenario {str(name_or_path)!r}: not a file, nor one of {near}")
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as error:
+        fault = Fault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
+        raise ScenarioError(path, [fault]) from error
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    return parse_scenario(text, path)
+
+
+def parse_scenario(text: str, source: str | Path) -> Scenario:
+    """Read a scenario from text.
+
+    Args:
+        text: The TOML text.
+        source: Where it comes from: for messages, for the default name, and to find a robot's
+            file beside it.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ScenarioError: If it has faults; lists all of them.
+        RobotFileError: If the robot's own file has faults.
+    """
+    source = Path(source)
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
+    faults = Faults()
+    top = Table(values, "", faults)
+    stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
+    robot_name = top.text("robot")
+    robot = _robot(top, robot_name, source.parent)
+    servo = _servo_fields(top.table("servo"))
+    parts: dict[str, Any] = {
+        "name": top.name("name") if "name" in top else stem,
+        "description": top.text("description"),
+        "robot_name": robot_name,
+        "gait": _gait(top.table("gait"), robot),
+        "world": _world(top.table("world")),
+        "noise": _noise(top.table("noise")),
+        "servo": servo,
+        "servo_of": _servos_of(top, robot),
+        "seed": top.integer("seed", at_least=0) if "seed" in top else Scenario.seed,
+        **_times(top),
+    }
+    top.close()
+    if (found := faults.all()) or robot is None:
+        raise ScenarioError(source, found)
+    fitted = _with_servos(robot, servo, parts["servo_of"])
+    return Scenario(robot=fitted, **parts)
+
+
+def _times(top: Table) -> dict[str, float]:
+    duration_s = top.number("duration_s", at_least=1 / CONTROL_RATE_HZ, at_most=LONGEST_S)
+    settle_s = top.number("settle_s", default=0.0, at_least=0.0)
+    if settle_s > duration_s:
+        top.fault("settle_s", f"at most duration_s = {duration_s:g}")
+    rate, epoch_s = Scenario.physics_rate_hz, Scenario.epoch_s
+    if "physics_rate_hz" in top:
+        rate = top.integer("physics_rate_hz", at_least=CONTROL_RATE_HZ)
+        if rate % CONTROL_RATE_HZ:
+            top.fault("physics_rate_hz", f"a multiple of {CONTROL_RATE_HZ}")
+    if "epoch_s" in top:
+        # Viewers misread stamps near zero, so not before 2001.
+        epoch_s = top.integer("epoch_s", at_least=1_000_000_000)
+        if epoch_s + LONGEST_S > _LATEST_EPOCH_S:
+            top.fault("epoch_s", f"at most {_LATEST_EPOCH_S - round(LONGEST_S)}")
+    return {
+        "duration_s": duration_s,
+        "settle_s": settle_s,
+        "physics_rate_hz": rate,
+        "epoch_s": epoch_s,
+    }
+
+
+def _robot(top: Table, name: str, folder: Path) -> Robot | None:
+    """The robot: a shipped name, or a file beside the scenario; None after a fault."""
+    if name in robot_names():
+        return load_robot(name)
+    if name and (folder / name).is_file():
+        return load_robot(folder / name)
+    if name:  # a missing name is a fault already
+        top.fault(
+            "robot", f"a TOML file beside the scenario, or one of {listed(robot_names(), name)}"
+        )
+    return None
+
+
+def _gait(table: Table, robot: Robot | None) -> Serpentine:
+    planes: dict[Plane, PlaneGait] = {}
+    for plane in Plane:
+        if plane not in table:
+            continue
+        part = table.table(plane)
+        wave = part.choice("wave", Wave) if "wave" in part else None
+        planes[plane] = PlaneGait(
+            amplitude=part.number("amplitude", at_least=0.0),
+            frequency_hz=part.number("frequency_hz", above=0.0, at_most=CONTROL_RATE_HZ / 4),
+            lag=part.number("lag", at_least=0.0),
+            wave=wave or PlaneGait.wave,
+            offset=part.number("offset", default=0.0),
+            phase=part.number("phase", default=0.0),
+        )
+        part.close()
+        if robot is not None and not len(robot.joint_indices(plane)):
+            table.fault(plane, f"leave it out: {robot.name} has no {plane} joints")
+    ramp_s = table.number("ramp_s", default=Serpentine.ramp_s, at_least=0.0)
+    if not planes:
+        table.fault(Plane.HORIZONTAL, "a table for at least one plane, horizontal or vertical")
+    table.close()
+    return Serpentine(planes, ramp_s)
+
+
+def _world(table: Table) -> World:
+    gravity = table.triple("gravity", default=World.gravity)
+    heading = table.number("heading", default=World.heading)
+    velocity = table.triple("velocity", default=World.velocity)
+    surface = table.choice("surface", _Surface) if "surface" in table else _Surface.FLAT
+    if surface is _Surface.NONE and "ground" in table:
+        table.fault("ground", 'leave it out: surface is "none"')
+    part = table.table("ground")
+    law = part.choice("law", FrictionLaw) if "law" in part else None
+    ground = Ground(
+        stiffness=part.number("stiffness", default=Ground.stiffness, above=0.0),
+        damping=part.number("damping", default=Ground.damping, at_least=0.0),
+        mu_tangential=part.number("mu_tangential", default=Ground.mu_tangential, at_least=0.0),
+        mu_normal=part.number("mu_normal", default=Ground.mu_normal, at_least=0.0),
+        slip_speed=part.number("slip_speed", default=Ground.slip_speed, above=0.0),
+        law=law or Ground.law,
+    )
+    part.close()
+    table.close()
+    return World(gravity, heading, velocity, None if surface is _Surface.NONE else ground)
+
+
+def _noise(table: Table) -> Noise:
+    names = [item.name for item in dataclasses.fields(Noise)]
+    noise = Noise(**{name: table.number(name, default=0.0, at_least=0.0) for name in names})
+    table.close()
+    return noise
+
+
+def _servo_fields(table: Table) -> dict[str, float]:
+    """The servo parameters that a table gives."""
+    given: dict[str, float] = {}
+    for item in dataclasses.fields(Servo):
+        if item.name not in table:
+            table.number(item.name, default=0.0)  # asked for, so that a slip of it is recognised
+        elif item.name in _MAY_BE_ZERO:
+            given[item.name] = table.number(item.name, at_least=0.0)
+        else:
+            given[item.name] = table.number(item.name, above=0.0)
+    table.close()
+    return given
+
+
+def _servos_of(top: Table, robot: Robot | None) -> dict[str, dict[str, float]]:
+    """The servo parameters of single joints, by joint name."""
+    table = top.table("servo_of")
+    names = robot.joint_names if robot is not None else ()
+    fields = {name: _servo_fields(table.table(name)) for name in names}
+    given = {name: values for name, values in fields.items() if values}
+    if robot is not None:
+        table.close()
+    return given
+
+
+def _with_servos(
+    robot: Robot, servo: Mapping[str, float], servo_of: Mapping[str, Mapping[str, float]]
+) -> Robot:
+    """The robot with other servo parameters."""
+    joints = tuple(
+        dataclasses.replace(
+            joint,
+            servo=dataclasses.replace(joint.servo, **{**servo, **servo_of.get(joint.name, {})}),
+        )
+        for joint in robot.joints
+    )
+    return dataclasses.replace(robot, joints=joints)

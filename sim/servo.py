@@ -1,0 +1,132 @@
+"""The servos: DC motors that drive the joints through series-elastic gears.
+
+The gear's spring sits between rotor and joint, so a weak motor yields to what its neighbours and
+the ground do to the joint: this is where the response of a joint comes to depend on its place in
+the chain. Equations, per joint (rotor angle th and speed om referred to the joint)::
+
+    u      = clip(Kp (q_ref - q), -1, 1)            duty
+    i      = (u V - Kt om) / R                      winding current, Ke = Kt
+    t_g    = k_g (th - q) + c_g (om - q')           gear torque, acts on the joint
+    Jm om' = Kt i - b om - t_c tanh(om / 0.05) - t_g
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.robot import Servo
+
+COULOMB_SPEED = 0.05
+"""Rotor speed at which Coulomb friction is smoothed [rad/s]."""
+
+
+class Rotors(NamedTuple):
+    """State of all rotors, referred to their joints.
+
+    Attributes:
+        angle: th [rad], shape (m,).
+        speed: om [rad/s], shape (m,).
+    """
+
+    angle: FloatArray
+    speed: FloatArray
+
+
+class Drive(NamedTuple):
+    """What the servos do at one instant.
+
+    Attributes:
+        voltage: Motor voltage u V [V], shape (m,).
+        current: Winding current i [A], shape (m,).
+        torque: Gear torque t_g on the joint [N m], shape (m,).
+        drag: Friction torques on rotor and gear [N m], rows: viscous b om, Coulomb
+            t_c tanh(om/0.05), gear damping c_g (om - q'); shape (3, m).
+    """
+
+    voltage: FloatArray
+    current: FloatArray
+    torque: FloatArray
+    drag: FloatArray
+
+
+class Servos:
+    """The servos of all joints, as arrays.
+
+    Attributes:
+        supply, resistance, torque_constant, gain, inertia, viscous, coulomb, gear_stiffness,
+        gear_damping: The parameters of :class:`capture.robot.Servo`, SI, each of shape (m,).
+    """
+
+    def __init__(self, servos: Sequence[Servo]) -> None:
+        """Gather the parameters.
+
+        Args:
+            servos: One a joint, head to tail.
+        """
+
+        def column(values: Sequence[float]) -> FloatArray:
+            return np.array(values, dtype=np.float64)
+
+        self.supply = column([s.supply_v for s in servos])
+        self.resistance = column([s.resistance_ohm for s in servos])
+        self.torque_constant = column([s.torque_constant for s in servos])
+        self.gain = column([s.proportional_gain for s in servos])
+        self.inertia = column([s.rotor_inertia for s in servos])
+        self.viscous = column([s.viscous_friction for s in servos])
+        self.coulomb = column([s.coulomb_friction for s in servos])
+        self.gear_stiffness = column([s.gear_stiffness for s in servos])
+        self.gear_damping = column([s.gear_damping for s in servos])
+
+    def current(self, voltage: FloatArray, speed: FloatArray) -> FloatArray:
+        """Winding current i = (u V - Kt om)/R.
+
+        Args:
+            voltage: u V [V], shape (m,).
+            speed: Rotor speed om [rad/s], shape (m,).
+
+        Returns:
+            Current [A], shape (m,).
+        """
+        return (voltage - self.torque_constant * speed) / self.resistance
+
+    def drive(
+        self, reference: FloatArray, angle: FloatArray, rate: FloatArray, rotors: Rotors
+    ) -> Drive:
+        """What the servos do, given commands and state.
+
+        Args:
+            reference: Commanded joint angles q_ref [rad], shape (m,).
+            angle: Joint angles q [rad], shape (m,).
+            rate: Joint rates q' [rad/s], shape (m,).
+            rotors: State of the rotors.
+
+        Returns:
+            Voltage, current, torque and the friction torques.
+        """
+        duty = np.minimum(np.maximum(self.gain * (reference - angle), -1.0), 1.0)
+        voltage = duty * self.supply
+        drag = np.empty((3, angle.shape[0]))
+        drag[0] = self.viscous * rotors.speed
+        drag[1] = self.coulomb * np.tanh(rotors.speed / COULOMB_SPEED)
+        drag[2] = self.gear_damping * (rotors.speed - rate)
+        torque = self.gear_stiffness * (rotors.angle - angle) + drag[2]
+        return Drive(voltage, self.current(voltage, rotors.speed), torque, drag)
+
+    def advance(self, rotors: Rotors, drive: Drive, dt: float) -> Rotors:
+        """The rotors one step later, by the semi-implicit Euler rule that the body follows too.
+
+        Args:
+            rotors: State of the rotors.
+            drive: What the servos do during the step.
+            dt: Step [s].
+
+        Returns:
+            Their next state.
+        """
+        torque = self.torque_constant * drive.current - drive.drag[0] - drive.drag[1] - drive.torque
+        speed = rotors.speed + dt * torque / self.inertia
+        return Rotors(rotors.angle + dt * speed, speed)
