@@ -1,0 +1,215 @@
+"""Numbers as people read them: degrees, decimals that fit the interval, a true minus sign.
+
+A value keeps its full precision in the page (``<data value=...>``); what is printed here is
+rounded by its interval, as the Particle Data Group does (Review of Particle Physics,
+Introduction, section 5.3): two digits of the half width if they are 35 or less, else one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from datetime import UTC, datetime
+
+from ..result import Estimate, Interval
+
+MISSING = "\N{EN DASH}"
+"""Printed where a value could not be computed."""
+
+MINUS = "\N{MINUS SIGN}"
+
+
+def number(value: float | None, decimals: int) -> str:
+    """A number with fixed decimals, or an en dash.
+
+    Args:
+        value: Any unit; None or not finite prints as an en dash.
+        decimals: Digits after the point, at least 0.
+
+    Returns:
+        For example ``−0.016``.
+    """
+    if value is None or not math.isfinite(value):
+        return MISSING
+    text = f"{value:.{decimals}f}"
+    if float(text) == 0.0:
+        text = text.lstrip("-")
+    return text.replace("-", MINUS)
+
+
+def interval(ci95: Interval | None, decimals: int) -> str:
+    """A 95 % interval in square brackets, or an empty string.
+
+    Args:
+        ci95: Low and high end, or None.
+        decimals: Digits after the point.
+
+    Returns:
+        For example ``[5.9, 6.5]``.
+    """
+    if ci95 is None:
+        return ""
+    low, high = ci95
+    return f"[{number(low, decimals)}, {number(high, decimals)}]"
+
+
+def estimate(quantity: Estimate, decimals: int | None = None, unit: str = "") -> str:
+    """A value with its unit and its interval, for a sentence.
+
+    Args:
+        quantity: The estimate, already in ``unit``.
+        decimals: Digits after the point; chosen from the interval if None.
+        unit: Written behind the value, with its own space where it wants one, e.g. ``" Hz"``.
+
+    Returns:
+        For example ``6.2° [5.9, 6.5]``; an en dash where the value is missing.
+    """
+    if quantity.value is None:
+        return MISSING
+    digits = decimals_for([quantity]) if decimals is None else decimals
+    text = number(quantity.value, digits) + unit
+    return text if quantity.ci95 is None else f"{text} {interval(quantity.ci95, digits)}"
+
+
+def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) -> int:
+    """Decimals that show one or two digits of the typical half width of the intervals.
+
+    Args:
+        quantities: Estimates of one table column, in the unit they are printed in.
+        least: Never fewer.
+        most: Never more.
+
+    Returns:
+        Digits after the point, the same for the whole column so that it lines up. Without any
+        interval, four digits of the largest value.
+    """
+    known = list(quantities)
+    half = sorted(
+        0.5 * (q.ci95[1] - q.ci95[0]) for q in known if q.ci95 is not None and q.ci95[1] > q.ci95[0]
+    )
+    if half:
+        wanted = _decimals_of(half[len(half) // 2])
+    else:
+        wanted = decimals_for_values((q.value for q in known), 4)
+    return min(max(wanted, least), most)
+
+
+def _decimals_of(half_width: float) -> int:
+    """Particle Data Group: 0.0354 shows 0.035, 0.0355 shows 0.04."""
+    if not math.isfinite(half_width):
+        return 0
+    power = math.floor(math.log10(half_width))
+    return (1 if half_width / 10.0**power <= 3.54 else 0) - power
+
+
+def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
+    """Decimals that show so many significant digits of the largest value.
+
+    Args:
+        values: One table column; None is skipped.
+        digits: Significant digits of the largest.
+
+    Returns:
+        Digits after the point, 0 to 6.
+    """
+    finite = [abs(v) for v in values if v is not None and math.isfinite(v)]
+    largest = max(finite, default=0.0)
+    if largest == 0.0:
+        return 0
+    return min(max(digits - 1 - math.floor(math.log10(largest)), 0), 6)
+
+
+def degrees(quantity: Estimate) -> Estimate:
+    """The same estimate in degrees.
+
+    Args:
+        quantity: In rad.
+
+    Returns:
+        In degrees.
+    """
+    return scaled(quantity, 180.0 / math.pi)
+
+
+def scaled(quantity: Estimate, factor: float) -> Estimate:
+    """The same estimate in another unit.
+
+    Args:
+        quantity: The estimate.
+        factor: New units in one old unit, positive.
+
+    Returns:
+        Value and interval times ``factor``.
+    """
+    value, ci95 = quantity.value, quantity.ci95
+    return Estimate(
+        None if value is None else value * factor,
+        None if ci95 is None else (ci95[0] * factor, ci95[1] * factor),
+    )
+
+
+def p_value(p: float | None) -> str:
+    """A p-value: three decimals, never a bare zero.
+
+    Args:
+        p: 0 to 1, or None.
+
+    Returns:
+        For example ``0.013`` or ``< 0.001``.
+    """
+    if p is None or not math.isfinite(p):
+        return MISSING
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def utc(time_ns: int) -> str:
+    """A Unix time as date and time of day in UTC.
+
+    Args:
+        time_ns: Unix time [ns].
+
+    Returns:
+        For example ``2026-03-01 09:30:00 UTC``; the bare number where no calendar reaches it.
+    """
+    try:
+        moment = datetime.fromtimestamp(time_ns // 1_000_000_000, tz=UTC)
+    except (OverflowError, OSError, ValueError):
+        return f"{time_ns} ns"
+    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def plain(text: str) -> str:
+    """Text without characters that neither XML nor a reader can do anything with.
+
+    Args:
+        text: From a log: joint names, link names, warnings.
+
+    Returns:
+        Control characters and lone surrogates become the replacement character; escaping is
+        left to whoever writes the markup.
+    """
+    return "".join(
+        c if c in "\t\n" or (c >= " " and not _forbidden(ord(c))) else "\N{REPLACEMENT CHARACTER}"
+        for c in text
+    )
+
+
+def short(text: str, most: int = 40) -> str:
+    """Text that has to fit into a figure.
+
+    Args:
+        text: From a log.
+        most: Characters kept at most; the middle gives way, since names differ at their ends.
+
+    Returns:
+        Plain text.
+    """
+    known = plain(text)
+    if len(known) <= most:
+        return known
+    return known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
+
+
+def _forbidden(code: int) -> bool:
+    """Code points outside the Char production of XML 1.0, and the C1 controls."""
+    return 0x7F <= code <= 0x9F or 0xD800 <= code <= 0xDFFF or code in (0xFFFE, 0xFFFF)

@@ -1,0 +1,338 @@
+"""The page: one self-contained HTML file that answers first and proves after.
+
+No script, no outside reference: style and figures are inside, and a content security policy
+(W3C CSP3) makes the browser refuse anything else. Everything that comes from a log is escaped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from capture import Session
+from capture.palette import joint_hex
+
+from ..result import Analysis, BodyPoint, Estimate, Index, JointResult
+from . import formats
+from .answer import Answer, answer, answer_to_all, is_driven
+from .figures import Drawing, body_motion, coupling_matrix, segments
+from .signals import command_response, read_traces
+
+LARGEST_BYTES = 3_000_000
+"""A page above this drops its signal plots: it must open on a phone."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the tables of joints.
+
+    Attributes:
+        title: Heading with its unit.
+        note: What it is, shown below the table.
+        cells: One estimate a joint, in the unit of the heading.
+        decimals: Digits after the point.
+    """
+
+    title: str
+    note: str
+    cells: tuple[Estimate, ...]
+    decimals: int
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One key figure.
+
+    Attributes:
+        name: What it is.
+        value: With unit.
+        note: Where or when, in small print; may be empty.
+    """
+
+    name: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class SessionView:
+    """All that the template shows of one session.
+
+    Attributes:
+        key: Prefix of every identifier of this session in the page.
+        analysis: The numbers.
+        answer: The answer in one sentence.
+        facts: Key figures.
+        colors: One colour a joint.
+        response: Columns of the table of responses.
+        energy: Columns of the table of energies.
+        segments: Gain, lag and energy.
+        signals: Command against response, or None.
+        body: Head, middle, tail, or None.
+        matrix: Coupling, or None.
+    """
+
+    key: str
+    analysis: Analysis
+    answer: Answer
+    facts: tuple[Fact, ...]
+    colors: tuple[str, ...]
+    response: tuple[Column, ...]
+    energy: tuple[Column, ...]
+    segments: Drawing | None
+    signals: Drawing | None
+    body: Drawing | None
+    matrix: Drawing | None
+
+
+def render(
+    analyses: Analysis | Sequence[Analysis],
+    sessions: Session | Sequence[Session | None] | None = None,
+) -> str:
+    """Write the report on one or several sessions.
+
+    Args:
+        analyses: The results, one a session.
+        sessions: The open sessions in the same order, for the signal plots; None where a session
+            is not at hand.
+
+    Returns:
+        One HTML page without outside references; the same input gives the same text.
+
+    Raises:
+        ValueError: If there is no analysis, or not one session an analysis.
+    """
+    results = [analyses] if isinstance(analyses, Analysis) else list(analyses)
+    if sessions is None:
+        opened: list[Session | None] = [None] * len(results)
+    elif isinstance(sessions, Session):
+        opened = [sessions]
+    else:
+        opened = list(sessions)
+    if not results or len(results) != len(opened):
+        raise ValueError(f"{len(results)} analyses and {len(opened)} sessions: one each, please")
+    page = _page(results, opened)
+    if len(page.encode()) > LARGEST_BYTES:
+        page = _page(results, [None] * len(results))
+    return page
+
+
+def _page(results: Sequence[Analysis], sessions: Sequence[Session | None]) -> str:
+    views = [
+        view(result, session, f"s{k + 1}")
+        for k, (result, session) in enumerate(zip(results, sessions, strict=True))
+    ]
+    environment = Environment(
+        loader=PackageLoader("analysis.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    filters: dict[str, Callable[..., object]] = {
+        "number": formats.number,
+        "utc": formats.utc,
+        "plain": formats.plain,
+        "p_value": formats.p_value,
+        "degrees": formats.degrees,
+        "scaled": formats.scaled,
+        "softer": _softer,
+        "points": _point_rows,
+        "index": _index_row,
+    }
+    environment.filters.update(filters)
+    style = files("analysis.report").joinpath("templates/style.css").read_text(encoding="utf-8")
+    return environment.get_template("page.html.j2").render(
+        views=views,
+        headline=views[0].answer if len(views) == 1 else answer_to_all([v.answer for v in views]),
+        style=Markup(style),  # noqa: S704  our own file
+        body_gradient=", ".join(joint_hex(9)),
+        MISSING=formats.MISSING,
+    )
+
+
+def view(analysis: Analysis, session: Session | None, key: str) -> SessionView:
+    """Prepare what the template shows of one session.
+
+    Args:
+        analysis: The numbers.
+        session: Open, or None.
+        key: Prefix of every identifier, unique in the page.
+
+    Returns:
+        The view.
+    """
+    joints = analysis.joints
+    traces = read_traces(session, analysis) if session is not None else ()
+    body, matrix = analysis.body, analysis.coupling.matrix
+    driven = [joint.name for joint in joints if is_driven(joint)]
+    return SessionView(
+        key=key,
+        analysis=analysis,
+        answer=answer(analysis),
+        facts=tuple(_facts(analysis)),
+        colors=joint_hex(len(joints)) if joints else (),
+        response=_response_columns(joints),
+        energy=_energy_columns(joints),
+        segments=segments(joints, f"{key}-segments") if _anything(joints) else None,
+        signals=command_response(traces, len(joints), f"{key}-signals") if traces else None,
+        body=body_motion(body, f"{key}-body") if body is not None and body.observed else None,
+        matrix=coupling_matrix(matrix, driven, f"{key}-coupling") if matrix is not None else None,
+    )
+
+
+def _anything(joints: Sequence[JointResult]) -> bool:
+    """Whether any joint has something that the figure of segments shows."""
+    return any(
+        v is not None for j in joints for v in (j.gain.value, j.energy_net_j, j.energy_abs_j)
+    )
+
+
+def _response_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
+    """Command, gain and lag of every joint, angles in degrees."""
+    command = tuple(formats.degrees(Estimate(j.command_amplitude_rad)) for j in joints)
+    gain = tuple(j.gain for j in joints)
+    lag = tuple(formats.degrees(j.lag_rad) for j in joints)
+    return (
+        Column("command [°]", "amplitude of the command at the gait frequency", command, 2),
+        Column(
+            "gain [1]",
+            "amplitude of the response over that of the command",
+            gain,
+            formats.decimals_for(gain),
+        ),
+        Column(
+            "lag [°]",
+            "response behind command, positive is late",
+            lag,
+            formats.decimals_for(lag),
+        ),
+    )
+
+
+def _energy_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
+    """The energies of every joint over the analysed windows, all with the same decimals."""
+    kinds: tuple[tuple[str, str, Callable[[JointResult], float | None]], ...] = (
+        ("E_net", "integral of torque times velocity", lambda j: j.energy_net_j),
+        ("E_plus", "its positive part only", lambda j: j.energy_plus_j),
+        ("E_abs", "its absolute value", lambda j: j.energy_abs_j),
+        ("E_el", "electrical, at the motor, signed", lambda j: j.energy_el_j),
+        ("E_el+", "its positive part only (no regeneration)", lambda j: j.energy_el_clipped_j),
+    )
+    decimals = formats.decimals_for_values((of(j) for _, _, of in kinds for j in joints), 4)
+    return tuple(
+        Column(f"{name} [J]", note, tuple(Estimate(of(j)) for j in joints), decimals)
+        for name, note, of in kinds
+    )
+
+
+def _facts(analysis: Analysis) -> list[Fact]:
+    """Key figures; what is unknown is an en dash."""
+    gait, joints = analysis.gait, analysis.joints
+    driven = [joint for joint in joints if is_driven(joint)]
+    digits = formats.decimals_for([gait.frequency_hz], most=4)
+    frequency = formats.estimate(gait.frequency_hz, digits, " Hz")
+    facts = [
+        Fact("Gait frequency", frequency, _analysed(analysis)),
+        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),
+        Fact("Joints with a command", f"{len(driven)} of {len(joints)}"),
+    ]
+    gains = [(j.gain.value, j.name) for j in joints if j.gain.value is not None]
+    lags = [(math.degrees(v), j.name) for j in joints if (v := j.lag_rad.value) is not None]
+    facts.append(_range("Gain", gains, formats.decimals_for((j.gain for j in joints), most=3), ""))
+    facts.append(_range("Lag", lags, 1, "°"))
+    energies = [j.energy_abs_j for j in joints if j.energy_abs_j is not None]
+    total = math.fsum(energies)
+    digits = formats.decimals_for_values([total])
+    facts.append(
+        Fact(
+            "Mechanical energy E_abs",
+            f"{formats.number(total, digits)} J" if energies else formats.MISSING,
+            f"{len(energies)} of {len(joints)} joints" if energies else "",
+        )
+    )
+    if joints:
+        least = min(joints, key=lambda j: j.coverage)
+        facts.append(Fact("Lowest coverage", _percent(least.coverage), formats.plain(least.name)))
+    points = analysis.body.observed if analysis.body is not None else ()
+    sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
+    facts.append(
+        Fact(
+            "Body amplitude",
+            " / ".join(sizes) + " mm" if sizes else formats.MISSING,
+            formats.plain(" / ".join(p.place for p in points)),
+        )
+    )
+    return facts
+
+
+def _range(name: str, values: Sequence[tuple[float, str]], decimals: int, unit: str) -> Fact:
+    if not values:
+        return Fact(name, formats.MISSING)
+    (low, first), (high, last) = min(values), max(values)
+    if len(values) == 1:
+        return Fact(name, formats.number(low, decimals) + unit, formats.plain(first))
+    text = f"{formats.number(low, decimals)}{unit} to {formats.number(high, decimals)}{unit}"
+    return Fact(name, text, formats.plain(f"{first}, {last}"))
+
+
+def _percent(fraction: float) -> str:
+    return f"{formats.number(100.0 * fraction, 1)} %"
+
+
+def _analysed(analysis: Analysis) -> str:
+    windows = analysis.gait.windows
+    if not windows:
+        return "nothing analysed"
+    cycles = math.fsum(window.cycles for window in windows)
+    spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in windows[:3])
+    more = f" and {len(windows) - 3} more" if len(windows) > 3 else ""
+    return f"{cycles:.1f} cycles, {spans}{more}"
+
+
+def _lag_per_joint(analysis: Analysis) -> str:
+    return ", ".join(
+        f"{formats.number(math.degrees(lag), 1)}° a joint, {formats.plain(plane)}"
+        for plane, lag in analysis.gait.lag_per_joint_rad.items()
+    )
+
+
+def _softer(sentence: str) -> Markup:
+    """Set the intervals of a sentence smaller, so that the sentence is read first."""
+    escaped = str(escape(formats.plain(sentence)))
+    parts: list[str] = []
+    rest = escaped
+    while (start := rest.find("[")) >= 0 and (stop := rest.find("]", start)) >= 0:
+        parts += [rest[:start], '<span class="ci">', rest[start : stop + 1], "</span>"]
+        rest = rest[stop + 1 :]
+    return Markup("".join([*parts, rest]))  # noqa: S704  escaped above
+
+
+def _point_rows(analysis: Analysis) -> list[tuple[str, BodyPoint]]:
+    """Observed points and their nulls, place by place: label and point."""
+    body = analysis.body
+    if body is None:
+        return []
+    rows: list[tuple[str, BodyPoint]] = []
+    for point in body.observed:
+        rows.append(("measured", point))
+        for name, nulls in body.null.items():
+            rows += [(f"perfect tracking, {name}", n) for n in nulls if n.place == point.place]
+    return rows
+
+
+def _index_row(index: Index) -> tuple[Estimate, str, int]:
+    """An index in the unit people read: value, unit, decimals."""
+    quantity = Estimate(index.value, index.ci95)
+    unit = index.unit
+    if unit == "rad":
+        quantity, unit = formats.degrees(quantity), "°"
+    elif unit == "1":
+        unit = ""
+    return quantity, unit, formats.decimals_for([quantity])

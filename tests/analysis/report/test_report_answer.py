@@ -1,0 +1,70 @@
+"""The sentence claims what a test or an interval carries, and no more."""
+
+import dataclasses
+
+import pytest
+
+from analysis.report.answer import Verdict, answer, answer_to_all
+from analysis.result import Index
+
+
+def with_indices(analysis, **indices):
+    return dataclasses.replace(analysis, heterogeneity=indices)
+
+
+def contrast(value, low, high):
+    return Index(value, (low, high), None, "rad", "lag, ends minus middle")
+
+
+def test_the_paper_s_claim(snake):
+    told = answer(snake)
+    assert told.verdict is Verdict.UNLIKE
+    assert told.sentence == (
+        "The segments do not move alike: the middle yaw joints lag 6.20° [5.90, 6.50] more than "
+        "the ends and gain spreads by 4.12 % [3.87, 4.40]."
+    )
+    assert "13 of 25 joints respond to a gait of 0.5000 Hz [0.4998, 0.5002]" in told.detail
+    assert "lag runs from 7.5° (joint01) to 13.7° (joint13)" in told.detail
+    assert "1 joint is flagged" in told.detail
+
+
+def test_late_ends_turn_the_sentence_round(snake):
+    told = answer(with_indices(snake, boundary_contrast_lag=contrast(0.02, 0.01, 0.03)))
+    assert "the ends yaw joints" not in told.sentence
+    assert "the yaw joints at the ends lag" in told.sentence
+
+
+def test_an_interval_over_zero_claims_nothing(snake):
+    told = answer(with_indices(snake, boundary_contrast_lag=contrast(-0.01, -0.03, 0.01)))
+    assert told.verdict is Verdict.OPEN
+    assert told.sentence.startswith("No difference between the segments could be shown")
+
+
+def test_no_gait_gives_the_reason(still):
+    told = answer(still)
+    assert told.verdict is Verdict.NOTHING
+    assert told.sentence == (
+        "No gait was found in this session, so there is no gain and no lag to compare."
+    )
+    assert told.detail == still.warnings[0]
+
+
+def test_one_joint_is_told_alone(single):
+    told = answer(single)
+    assert told.verdict is Verdict.SINGLE
+    assert "its gain is 0.928 [0.924, 0.932], its lag 13.66° [13.45, 13.87]" in told.sentence
+
+
+def test_several_sessions(snake, still, single):
+    told = answer_to_all([answer(snake), answer(still), answer(single)])
+    assert "n 1 of 3 sessions the segments do not move alike" in told.sentence
+    same = answer_to_all([answer(snake), answer(snake)])
+    assert same.sentence == "In all 2 sessions the segments do not move alike."
+
+
+@pytest.mark.parametrize("name", ["snake", "still", "single", "hostile"])
+def test_a_sentence_ends_with_one_stop(name, request):
+    told = answer(request.getfixturevalue(name))
+    for text in (told.sentence, told.detail):
+        assert text.endswith(".")
+        assert not text.endswith("..")

@@ -1,0 +1,276 @@
+"""The page: complete, true to the numbers, escaped, reachable, without outside references."""
+
+import dataclasses
+import math
+import re
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import pytest
+
+from analysis.report import render
+from analysis.result import Coupling, Estimate
+
+VOID = {"meta", "link", "br", "hr", "img", "input"}
+NAMES = ["snake", "still", "single", "hostile"]
+
+
+class Node:
+    def __init__(self, tag, attributes, parent):
+        self.tag, self.attributes, self.parent = tag, attributes, parent
+        self.children = []
+
+    def text(self):
+        return "".join(c if isinstance(c, str) else c.text() for c in self.children)
+
+    def all(self, *tags):
+        for child in self.children:
+            if not isinstance(child, str):
+                if not tags or child.tag in tags:
+                    yield child
+                yield from child.all(*tags)
+
+
+class Tree(HTMLParser):
+    def __init__(self, page):
+        super().__init__(convert_charrefs=True)
+        self.root = self.here = Node("", {}, None)
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        node = Node(tag, dict(attrs), self.here)
+        self.here.children.append(node)
+        if tag not in VOID:
+            self.here = node
+
+    def handle_startendtag(self, tag, attrs):
+        self.here.children.append(Node(tag, dict(attrs), self.here))
+
+    def handle_endtag(self, tag):
+        assert tag == self.here.tag, f"</{tag}> closes <{self.here.tag}>"
+        self.here = self.here.parent
+
+    def handle_data(self, data):
+        self.here.children.append(data)
+
+
+def tree(page):
+    parsed = Tree(page)
+    assert parsed.here is parsed.root, "an element is left open"
+    return parsed.root
+
+
+@pytest.fixture(scope="module", params=[*NAMES, "several"])
+def page(request):
+    if request.param == "several":
+        return render([request.getfixturevalue(name) for name in NAMES])
+    return render(request.getfixturevalue(request.param))
+
+
+@pytest.fixture(scope="module")
+def snake_page(snake):
+    return render(snake)
+
+
+def rows(root, table):
+    node = next(t for t in root.all("table") if t.attributes.get("class") == table)
+    return [list(row.all("td", "th")) for row in node.all("tr")]
+
+
+def numbers(cell):
+    return [float(d.attributes["value"]) for d in cell.all("data")]
+
+
+def test_nothing_is_fetched_from_outside(page):
+    root = tree(page)
+    for node in root.all():
+        assert node.tag not in ("script", "iframe", "img", "object", "embed", "base", "form")
+        for key, value in node.attributes.items():
+            assert not key.startswith("on"), f"{node.tag} {key}"
+            if key in ("src", "href", "xlink:href", "srcset", "action", "data"):
+                assert value.startswith("#") or value == "data:,", f"{node.tag} {key}={value}"
+            if key == "style":
+                assert re.findall(r"url\((?!#)", value) == []
+    for style in root.all("style"):
+        assert "@import" not in style.text()
+        assert "url(" not in style.text()
+        assert "http" not in style.text()
+
+
+def test_identifiers_are_unique_and_every_anchor_lands(page):
+    root = tree(page)
+    ids = [n.attributes["id"] for n in root.all() if "id" in n.attributes]
+    assert len(ids) == len(set(ids))
+    wanted = [n.attributes["href"] for n in root.all("a")]
+    wanted += ["#" + n.attributes["aria-labelledby"] for n in root.all("section", "article", "svg")]
+    assert all(target[1:] in ids for target in wanted)
+
+
+def test_svgs_have_titles_tables_have_captions_headings_have_order(page):
+    root = tree(page)
+    for drawing in root.all("svg"):
+        assert drawing.attributes["role"] == "img"
+        first = drawing.children[0]
+        assert first.tag == "title"
+        assert first.text().strip()
+    for table in root.all("table"):
+        assert table.children[1].tag == "caption", "the caption stands first in its table"
+        assert table.children[1].text().strip()
+        assert all(h.attributes.get("scope") in ("col", "row") for h in table.all("th"))
+    levels = [int(h.tag[1]) for h in root.all("h1", "h2", "h3", "h4", "h5", "h6")]
+    assert levels.count(1) == 1
+    assert levels[0] == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+    assert next(root.all("html")).attributes["lang"] == "en"
+    assert len(list(root.all("main"))) == 1
+
+
+def test_what_scrolls_can_be_reached_by_the_keyboard(page):
+    for node in tree(page).all("div", "pre"):
+        if node.attributes.get("class") == "wide" or node.tag == "pre":
+            assert node.attributes["tabindex"] == "0"
+
+
+def test_the_answer_is_the_first_heading_and_the_method_the_last(snake_page):
+    root = tree(snake_page)
+    headings = [h.text() for h in root.all("h1", "h2", "h3")]
+    assert headings[0].startswith("The segments do not move alike")
+    assert headings[-1] == "Method and provenance"
+
+
+def test_numbers_of_the_joints_are_those_of_the_analysis(snake, snake_page):
+    root = tree(snake_page)
+    head, *body = rows(root, "joints")
+    title = [cell.text() for cell in head]
+    assert len(body) == len(snake.joints) == 25
+    for joint, row in zip(snake.joints, body, strict=True):
+        cell = dict(zip(title, row, strict=True))
+        assert cell["joint"].text() == joint.name
+        assert cell["plane"].text() == joint.plane
+        assert cell["flags"].text() == ", ".join(joint.flags)
+        assert cell["samples"].text() == str(joint.samples)
+        for name, quantity, scale in (
+            ("gain [1]", joint.gain, 1.0),
+            ("lag [°]", joint.lag_rad, 180 / math.pi),
+            ("command [°]", Estimate(joint.command_amplitude_rad), 180 / math.pi),
+            ("coverage [%]", Estimate(joint.coverage), 100.0),
+        ):
+            known = [] if quantity.value is None else [quantity.value, *(quantity.ci95 or ())]
+            assert numbers(cell[name]) == pytest.approx([v * scale for v in known], rel=1e-12)
+            if not known:
+                assert "–" in cell[name].text()
+            for shown in cell[name].all("data"):  # what is read is what is stored, rounded
+                read = float(shown.text().replace("−", "-"))
+                digits = len(shown.text().partition(".")[2])
+                assert read == pytest.approx(
+                    float(shown.attributes["value"]), abs=0.51 * 10**-digits
+                )
+
+
+def test_energies_are_those_of_the_analysis(snake, snake_page):
+    head, *body = rows(tree(snake_page), "energies")
+    assert [c.text() for c in head[2:]] == [
+        "E_net [J]",
+        "E_plus [J]",
+        "E_abs [J]",
+        "E_el [J]",
+        "E_el+ [J]",
+    ]
+    for joint, row in zip(snake.joints, body, strict=True):
+        energies = (
+            joint.energy_net_j,
+            joint.energy_plus_j,
+            joint.energy_abs_j,
+            joint.energy_el_j,
+            joint.energy_el_clipped_j,
+        )
+        assert [numbers(c) for c in row[2:]] == [[] if e is None else [e] for e in energies]
+
+
+def test_indices_and_body_are_those_of_the_analysis(snake, snake_page):
+    root = tree(snake_page)
+    _, *body = rows(root, "indices")
+    for (name, index), row in zip(snake.heterogeneity.items(), body, strict=True):
+        scale = 180 / math.pi if index.unit == "rad" else 1.0
+        assert row[0].text() == name
+        assert row[1].text() == index.label
+        assert numbers(row[2]) == pytest.approx([index.value * scale])
+        assert numbers(row[3]) == pytest.approx([v * scale for v in index.ci95 or ()])
+        assert numbers(row[4]) == ([] if index.p is None else [index.p])
+    _, *body = rows(root, "body")
+    assert len(body) == 6  # three places, each with its null
+    head, head_null = body[0], body[1]
+    assert numbers(head[3])[0] == pytest.approx(52.0)
+    assert head_null[2].text() == "perfect tracking, viscous"
+    assert numbers(head_null[3]) == pytest.approx([55.0])
+
+
+def test_provenance_is_complete(snake, snake_page):
+    root = tree(snake_page)
+    shown = {row[1].text(): row[2].text() for row in rows(root, "provenance")[1:]}
+    made = snake.provenance
+    assert shown["weak.mcap"] == made.inputs["weak.mcap"]
+    assert shown["numpy"] == made.versions["numpy"]
+    assert shown["harmonics"] == "1"
+    assert "–" in shown["settle_s"]
+    assert next(root.all("pre")).text() == made.command
+
+
+def test_every_warning_is_shown(snake, still):
+    for analysis in (snake, still):
+        items = [li.text() for li in tree(render(analysis)).all("li")]
+        assert all(warning in items for warning in analysis.warnings)
+
+
+def test_nulls_are_dashes_never_zeros(still):
+    root = tree(render(still))
+    for row in rows(root, "joints")[1:]:
+        for cell in row[3:6]:
+            assert cell.text().startswith("–")
+            assert "not computed" in cell.text()
+    assert not list(root.all("svg"))
+
+
+def test_hostile_names_stay_text(hostile):
+    page = render(hostile)
+    assert "<script" not in page
+    assert "\x00" not in page
+    shown = [row[1].text() for row in rows(tree(page), "joints")[1:]]
+    assert shown[0].startswith("<script>alert('x')</script>$")
+    assert shown[0].endswith("蛇joint01")
+
+
+def test_same_input_same_bytes(snake, snake_page):
+    assert render(snake) == snake_page
+
+
+def test_coupling_that_was_identified_is_drawn_and_listed(single):
+    matrix = ((0.8, -0.2), (0.1, 0.9))
+    known = Coupling(True, "local kicks around one gait", None, matrix, 3.4)
+    root = tree(render(dataclasses.replace(single, coupling=known)))
+    assert [numbers(c)[0] for row in rows(root, "coupling")[1:] for c in row[1:]] == [
+        0.8,
+        -0.2,
+        0.1,
+        0.9,
+    ]
+    assert "Coupling matrix" in [s.children[0].text() for s in root.all("svg")]
+    assert "condition number 3.4" in next(root.all("main")).text()
+
+
+def test_coupling_that_was_not_says_what_to_record(snake_page):
+    said = next(tree(snake_page).all("main")).text()
+    assert "Not identifiable from this session: one gait gives 13 numbers" in said
+    assert "undulog plan phase-kicks" in said
+
+
+def test_size_stays_small(snake_page):
+    assert len(snake_page.encode()) < 300_000
+
+
+def test_analyses_and_sessions_must_pair(snake):
+    with pytest.raises(ValueError, match="1 analyses and 2 sessions"):
+        render([snake], [None, None])
+    with pytest.raises(ValueError, match="0 analyses"):
+        render([])
