@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -86,11 +87,9 @@ def export_log(
             part.open("w", encoding="utf-8", newline="\n") as stream,
             progress(f"export {output.name}", len(frames)) as bar,
         ):
+            lines = candump_lines(frames, chosen, which, directions=directions)
             for start in range(0, len(frames), _LINES_PER_WRITE):
-                window = slice(start, start + _LINES_PER_WRITE)
-                stream.writelines(
-                    candump_lines(frames[window], chosen, which[window], directions=directions)
-                )
+                stream.writelines(islice(lines, _LINES_PER_WRITE))
                 bar.update(start)
         part.replace(output)
     except OSError as error:

@@ -1,0 +1,158 @@
+"""The verbs ``import`` and ``log export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from .console import emit_json
+from .errors import UsageError
+
+if TYPE_CHECKING:
+    from .column_map import ColumnMap
+    from .import_output import ImportReport
+    from .robot import Robot
+
+
+def import_log(
+    log: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    robot: Annotated[str, Parameter(name=["--robot", "-r"])],
+    columns: Path | None = None,
+    map_: Annotated[tuple[str, ...], Parameter(name="--map", show_default=False)] = (),
+    bus: str | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Turn another tool's log into a session.
+
+    CAN traces (candump .log, .asc, .blf, .trc, python-can .csv and .db, .mf4) keep every frame and
+    its direction; the robot's bus map says which of them are joint commands, states and sensor
+    values. Any other CSV needs a column map, as a file or as --map options.
+
+    Example: `undulog import trace.log -o run.mcap --robot arcsnake-joint`
+
+    A CSV: `undulog import joint.csv -o run.mcap --robot arcsnake-joint --map time=time:s
+    --map angle=joint01.position:deg,wrap=360`
+
+    Args:
+        log: The foreign log.
+        output: The session to write, `.mcap`.
+        robot: A shipped robot (snake25, snake13, arcsnake-joint) or a robot TOML.
+        columns: Column map of a CSV, as TOML.
+        map_: One column of a CSV: `COLUMN=time:UNIT`, or `COLUMN=JOINT.QUANTITY:UNIT` with
+            `,wrap=PERIOD`, `,scale=FACTOR`, `,offset=VALUE` where needed. May be repeated.
+        bus: The bus to decode, where the log has several; the first one by default.
+        force: Replace an existing output.
+        json: Report as one JSON object.
+    """
+    from .can_import import import_can
+    from .console import refuse_existing
+    from .csv_import import import_csv
+    from .interruption import interruptible
+    from .robot_file import load_robot
+
+    _require_mcap(output)
+    refuse_existing(output, force=force)
+    described = load_robot(robot)
+    column_map = _column_map(log, described, columns, map_)
+    if column_map is not None and bus is not None:
+        raise UsageError(f"{log} holds no CAN frames; --bus is for those")
+    with interruptible() as stop:
+        if column_map is None:
+            report = import_can(log, output, described, bus=bus, force=force, stop=stop)
+        else:
+            report = import_csv(log, output, described, column_map, force=force, stop=stop)
+    if json:
+        emit_json(report.as_json())
+    else:
+        _print_import(report)
+    return 0 if report.complete else 1
+
+
+def export_log(
+    session: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    bus: str | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> None:
+    """Write a session's raw CAN frames for other tools.
+
+    The suffix of the output says the format: .log for candump. A candump log that was imported
+    comes back bit for bit.
+
+    Example: `undulog log export run.mcap -o trace.log`
+
+    Args:
+        session: The session.
+        output: The log to write.
+        bus: The bus to write; all by default.
+        force: Replace an existing output.
+        json: Report as one JSON object.
+    """
+    from .log_export import export_log as export
+
+    report = export(session, output, bus=bus, force=force)
+    if json:
+        emit_json(
+            {
+                "source": str(report.source),
+                "output": str(report.output),
+                "frames": sum(report.buses.values()),
+                "buses": report.buses,
+            }
+        )
+        return
+    total = sum(report.buses.values())
+    print(f"{output}: {total} frames of {', '.join(report.buses)}, in the format of candump -L")
+
+
+def _column_map(
+    log: Path, robot: Robot, columns: Path | None, options: tuple[str, ...]
+) -> ColumnMap | None:
+    """The column map of a CSV log; None for a log of CAN frames."""
+    from .csv_import import is_frame_csv
+
+    if not log.is_file():
+        raise UsageError(f"{log}: no such file")
+    if log.suffix.lower() != ".csv" or is_frame_csv(log):
+        if columns is not None or options:
+            raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
+        return None
+    from .column_map import column_map_from_options, read_column_map
+
+    if (columns is None) == (not options):
+        given = "not both" if options else "to say what its columns mean"
+        raise UsageError(f"{log} needs --columns MAP.toml or --map options, {given}")
+    if columns is not None:
+        return read_column_map(columns, robot)
+    return column_map_from_options(options, robot)
+
+
+def _require_mcap(output: Path) -> None:
+    if output.suffix.lower() != ".mcap":
+        raise UsageError(f"{output}: a session is an .mcap file, not {output.suffix or 'nameless'}")
+
+
+def _print_import(report: ImportReport) -> None:
+    frames = f"{report.frames} CAN frames, " if report.frames is not None else ""
+    print(
+        f"{report.output}: {report.duration_s:.1f} s of {report.robot}, {frames}"
+        f"verdict {report.verdict}"
+    )
+    if not report.complete:
+        print("stopped on request; the file is complete up to there")
+    width = max(map(len, report.samples), default=0)
+    for topic, count in sorted(report.samples.items()):
+        print(f"  {topic:<{width}}  {count} messages")
+    for problem in report.problems:
+        print(f"  problem: {problem}")
+    for note in report.notes:
+        print(f"  note: {note}")
