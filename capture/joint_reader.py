@@ -12,6 +12,7 @@ from .cdr import layout_of
 from .columns import Messages
 from .errors import DataError, MissingChannelError
 from .joint_rows import JointRows, merge_rows, own_times, rows_of
+from .rosmsg import MessageType
 from .signals import JointSignals
 from .topics import Topics, Window
 
@@ -90,6 +91,8 @@ class JointReader:
             if channels[topic].type_name != JOINT_STATE:
                 kind = channels[topic].type_name
                 raise DataError(f"{self._path}: {topic} is {kind}, not {JOINT_STATE}")
+            if not _is_joint_state(self._topics.message_type(topic)):
+                raise DataError(f"{self._path}: {topic}: its schema is not that of {JOINT_STATE}")
             for field in fields:
                 if field not in UNITS:
                     raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
@@ -194,6 +197,23 @@ class JointReader:
                 self._warn(f"{SAMPLE_OFFSET_TOPIC} has no {name}: its message stamps are used")
                 own.append(t_ns)
         return own
+
+
+def _is_joint_state(found: MessageType) -> bool:
+    """Whether a type has all that a JointState has, whatever else it has."""
+    fields = {field.name: field for field in found.fields}
+    arrays = [fields.get(name) for name in UNITS]
+    header = fields["header"].nested if "header" in fields else None
+    stamp = [field.nested for field in header.fields if field.name == "stamp"] if header else []
+    time = stamp[0] if stamp else None
+    parts = [part.name for part in time.fields] if time is not None else []
+    return (
+        "sec" in parts
+        and "nanosec" in parts
+        and all(field is not None and field.is_array and field.base for field in arrays)
+        and "name" in fields
+        and fields["name"].base == "string"
+    )
 
 
 def _cut(t_ns: IntArray, values: FloatArray, window_ns: Window) -> tuple[IntArray, FloatArray]:

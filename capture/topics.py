@@ -73,11 +73,30 @@ class Topics:
             DataError: If a topic's type can't be read.
         """
         requests = [
-            Request(self._channel_ids(topic), self._type(topic), paths)
+            Request(self._channel_ids(topic), self.message_type(topic), paths)
             for topic, paths in wanted.items()
         ]
         found = read_messages(self._file, requests, window_ns=window_ns, warn=self._warn)
         return dict(zip(wanted, found, strict=True))
+
+    def message_type(self, topic: str) -> MessageType:
+        """The type of a topic's messages.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            The parsed schema.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the schema can't be read.
+        """
+        if topic not in self._types:
+            schema = self._schema(topic)
+            text = schema.data.decode("utf-8", "replace")
+            self._types[topic] = parse_message_type(schema.name, text)
+        return self._types[topic]
 
     def first(self, topic: str) -> tuple[int, bytes, MessageType] | None:
         """The first message of a topic.
@@ -92,7 +111,7 @@ class Topics:
             MissingChannelError: If the log has no such topic.
             DataError: If the topic's type can't be read.
         """
-        kind = self._type(topic)
+        kind = self.message_type(topic)
         for log_ns, message in self.raw(topic):
             return log_ns, message, kind
         return None
@@ -177,10 +196,3 @@ class Topics:
                 f"{self._file.path}: {topic} is {found}; only ROS 2 messages (cdr) are read"
             )
         return schema
-
-    def _type(self, topic: str) -> MessageType:
-        if topic not in self._types:
-            schema = self._schema(topic)
-            text = schema.data.decode("utf-8", "replace")
-            self._types[topic] = parse_message_type(schema.name, text)
-        return self._types[topic]

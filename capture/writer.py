@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -141,9 +142,10 @@ class SessionWriter:
             self._writer.finish()
             self._stream.flush()
         except OSError as error:
+            with suppress(OSError):  # closing would say the same again
+                self._stream.close()
             raise _write_error(self.path, error) from error
-        finally:
-            self._stream.close()
+        self._stream.close()
 
     # -- channels --------------------------------------------------------------------------
 
@@ -390,6 +392,8 @@ class _Guarded:
 
 
 def _write_error(path: Path, error: OSError) -> LogWriteError:
+    if isinstance(error, LogWriteError):
+        return error
     return LogWriteError(path, f"can't be written: {error.strerror or error}")
 
 
