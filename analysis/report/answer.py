@@ -90,7 +90,7 @@ def answer(analysis: Analysis) -> Answer:
     verdict = _verdict(analysis)
     lead = {
         Verdict.UNLIKE: "The segments do not move alike",
-        Verdict.ALIKE: "The segments move alike within the stated margins",
+        Verdict.ALIKE: f"The segments move alike, {_margins(analysis)}",
     }.get(verdict, "No difference between the segments could be shown")
     numbers = _numbers(analysis)
     return Answer(
@@ -145,14 +145,19 @@ def find(indices: dict[str, Index], *words: str) -> Index | None:
 
 def _verdict(analysis: Analysis) -> Verdict:
     indices = analysis.heterogeneity
-    equal = [i.p for name, i in indices.items() if "equivalence" in name and i.p is not None]
-    tests = [i.p for name, i in indices.items() if "equivalence" not in name and i.p is not None]
-    contrasts = [find(indices, "boundary", quantity) for quantity in ("lag", "gain")]
-    apart = any(c is not None and _leaves_out_zero(c) for c in contrasts)
-    if apart or (tests and min(tests) * len(tests) < SIGNIFICANT):
-        # Different for certain, yet perhaps by less than matters: equivalence has the last word.
-        return Verdict.ALIKE if equal and max(equal) < SIGNIFICANT else Verdict.UNLIKE
-    return Verdict.ALIKE if equal and max(equal) < SIGNIFICANT else Verdict.OPEN
+    equal = [find(indices, "equivalence", quantity) for quantity in ("gain", "lag")]
+    if all(index is not None and _small(index.p) for index in equal):
+        # Different for certain they may be, but by less than the margins: that has the last word.
+        return Verdict.ALIKE
+    contrasts = [find(indices, "boundary", quantity) for quantity in ("gain", "lag")]
+    if any(index is not None and _leaves_out_zero(index) for index in contrasts):
+        return Verdict.UNLIKE
+    tests = [i.p for name, i in indices.items() if "common_response" in name and i.p is not None]
+    return Verdict.UNLIKE if tests and _small(min(tests) * len(tests)) else Verdict.OPEN
+
+
+def _small(p: float | None) -> bool:
+    return p is not None and p < SIGNIFICANT
 
 
 def _leaves_out_zero(index: Index) -> bool:
@@ -182,6 +187,12 @@ def _numbers(analysis: Analysis) -> str:
         size = formats.scaled(Estimate(spread.value, spread.ci95), 100.0)
         parts.append(f"gain spreads by {formats.estimate(size, unit=' %')}")
     return " and ".join(parts)
+
+
+def _margins(analysis: Analysis) -> str:
+    """The margins of the equivalence tests, from their labels."""
+    tests = [i for name, i in analysis.heterogeneity.items() if "equivalence" in name]
+    return " and ".join(test.label.rpartition("H1: ")[2] for test in tests)
 
 
 def _size(index: Index) -> Estimate:

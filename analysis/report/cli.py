@@ -30,7 +30,9 @@ def report(
         json: Print one JSON object: the page and the answer to each session.
     """
     if not files:
-        raise UsageError("report needs at least one session, e.g. undulog report run.mcap -o x.html")
+        raise UsageError(
+            "report needs at least one session, e.g. undulog report run.mcap -o x.html"
+        )
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: the report is an HTML page; end its name in .html")
     refuse_existing(output, force=force)

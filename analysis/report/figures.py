@@ -366,7 +366,8 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
             _harmonic(axes, point, cycle, colors[k], "-")
             axes.set_title(short(f"{point.place} ({point.link})", 28))
             axes.set_xticks([0.0, 90.0, 180.0, 270.0, 360.0])
-        grid[0, 0].set_ylabel("across the heading [mm]")
+        sideways = body.plane != "vertical"
+        grid[0, 0].set_ylabel("left of the heading [mm]" if sideways else "up [mm]")
         figure.supxlabel("phase of the gait [°], zero at the head link's peak", fontsize=8.0)
         measured = key([], [], color=colors[len(colors) // 2], label="measured, 95 %")
         nulls = [
@@ -382,7 +383,7 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
             + ". Dashed grey: the same body with every joint exactly on its command.",
         )
     caption = (
-        "Motion of the links at the gait frequency, across the mean heading. Dashed grey is the "
+        "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
         "perfect-tracking null: the same body with every joint exactly on its command. Head, "
         "middle and tail differ there already, by kinematics alone, so only what departs from the "
         "dashed line speaks of the joints."

@@ -9,7 +9,7 @@ import numpy as np
 
 from capture import Session
 from capture.arrays import FloatArray, frozen
-from capture.errors import MissingChannelError
+from capture.errors import DataError, MissingChannelError
 from capture.palette import joint_hex
 
 from ..result import Analysis, JointResult
@@ -104,14 +104,15 @@ def read_traces(
         One trace a chosen joint; empty where a topic or all samples are missing.
     """
     start_s, stop_s = stretch_s(analysis)
+    start_ns = analysis.session.start_ns
     bounds = {
-        "start_ns": session.start_ns + round(start_s * 1e9),
-        "stop_ns": session.start_ns + round(stop_s * 1e9),
+        "start_ns": start_ns + round(start_s * 1e9),
+        "stop_ns": start_ns + round(stop_s * 1e9),
     }
     try:
         command = session.joints(commands, "position", **bounds)
         response = session.joints(states, "position", **bounds)
-    except MissingChannelError:
+    except (MissingChannelError, DataError):
         return ()
     traces: list[Trace] = []
     for place in chosen_joints(analysis.joints):
@@ -122,7 +123,7 @@ def read_traces(
         for signals in (command, response):
             if joint.name in signals.names:
                 signal = signals.signal(joint.name)
-                t_s: FloatArray = np.asarray((signal.t_ns - session.start_ns) * 1e-9, np.float64)
+                t_s: FloatArray = np.asarray((signal.t_ns - start_ns) * 1e-9, np.float64)
                 columns += _thinned(t_s, signal.values)
             else:
                 columns += [np.empty(0), np.empty(0)]

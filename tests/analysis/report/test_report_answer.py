@@ -40,6 +40,33 @@ def test_an_interval_over_zero_claims_nothing(snake):
     assert told.sentence.startswith("No difference between the segments could be shown")
 
 
+def test_a_small_p_of_the_common_response_is_enough(snake):
+    told = answer(with_indices(snake, common_response=Index(9.0, None, 0.01, "1", "F of H0")))
+    assert told.verdict is Verdict.UNLIKE
+
+
+def test_only_an_equivalence_test_says_alike(snake):
+    gain = Index(0.001, None, 0.01, "1", "largest deviation from the mean; H1: gain within 2 %")
+    lag = Index(
+        0.001, None, 0.02, "rad", "largest deviation from the mean; H1: lag within 1 degree"
+    )
+    told = answer(
+        with_indices(
+            snake,
+            boundary_contrast_lag=contrast(-0.002, -0.003, -0.001),  # sure, but too small to matter
+            equivalence_gain=gain,
+            equivalence_lag=lag,
+        )
+    )
+    assert told.verdict is Verdict.ALIKE
+    assert told.sentence.startswith(
+        "The segments move alike, gain within 2 % and lag within 1 degree: "
+    )
+    doubtful = dataclasses.replace(lag, p=0.2)
+    told = answer(with_indices(snake, equivalence_gain=gain, equivalence_lag=doubtful))
+    assert told.verdict is Verdict.OPEN
+
+
 def test_no_gait_gives_the_reason(still):
     told = answer(still)
     assert told.verdict is Verdict.NOTHING

@@ -1,0 +1,90 @@
+"""Command against response: the right joints, the right stretch, the samples as they were."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from analysis.report import render, signals
+from capture import Session, SessionWriter
+
+RATE_HZ = 100
+EPOCH_NS = 1_767_225_600_000_000_000
+
+
+@pytest.fixture(scope="module")
+def recorded(snake, tmp_path_factory):
+    """A session of the snake: commands and responses follow the analysis to the letter."""
+    path = tmp_path_factory.mktemp("session") / "weak.mcap"
+    names = [joint.name for joint in snake.joints]
+    amplitude = np.array([joint.command_amplitude_rad or 0.0 for joint in snake.joints])
+    gain = np.array([joint.gain.value or 0.0 for joint in snake.joints])
+    lag = np.array([joint.lag_rad.value or 0.0 for joint in snake.joints])
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", names, unit="rad")
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        for k in range(16 * RATE_HZ + 1):
+            phase = 2 * np.pi * 0.5 * k / RATE_HZ - np.pi / 6 * np.arange(25)
+            position = amplitude * gain * np.sin(phase - lag)
+            if k == 1400:
+                position[0] = np.nan
+            t_ns = EPOCH_NS + k * (1_000_000_000 // RATE_HZ)
+            commands.write(t_ns, amplitude * np.sin(phase))
+            states.write(t_ns, position)
+    return path
+
+
+def test_head_middle_and_tail_of_the_driven_plane(snake, still, single):
+    assert signals.chosen_joints(snake.joints) == [0, 12, 24]
+    assert signals.chosen_joints(still.joints) == [0, 2, 3]
+    assert signals.chosen_joints(single.joints) == [0]
+
+
+def test_the_last_cycles_of_the_last_window(snake, still):
+    assert signals.stretch_s(snake) == (11.0, 16.0)  # 2.5 cycles of 0.5 Hz
+    assert signals.stretch_s(still) == (0.0, 3.0)
+
+
+def test_traces_are_the_samples(snake, recorded):
+    with Session.open(recorded) as session:
+        traces = signals.read_traces(session, snake)
+    assert [trace.joint.name for trace in traces] == ["joint01", "joint13", "joint25"]
+    head, middle, _ = traces
+    np.testing.assert_allclose(middle.command_t_s, np.arange(1100, 1600) / RATE_HZ, atol=1e-9)
+    np.testing.assert_allclose(
+        middle.command_rad, 0.4 * np.sin(np.pi * middle.command_t_s - 2 * np.pi), atol=1e-12
+    )
+    assert np.max(middle.response_rad) == pytest.approx(0.4 * middle.joint.gain.value, rel=1e-3)
+    assert head.response_rad.size == head.command_rad.size - 1  # the NaN is not drawn
+
+
+def test_long_stretches_are_thinned(snake, recorded, monkeypatch):
+    monkeypatch.setattr(signals, "MOST_POINTS", 100)
+    with Session.open(recorded) as session:
+        traces = signals.read_traces(session, snake)
+    assert traces[1].response_rad.size == 100
+
+
+def test_the_figure_is_on_the_page(snake, recorded):
+    with Session.open(recorded) as session:
+        page = render(snake, session)
+    assert "Command and response of joint01, joint13, joint25" in page
+    assert len(page.encode()) < 300_000
+
+
+def test_without_topics_the_page_has_no_such_figure(snake, tmp_path):
+    path = tmp_path / "empty.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        writer.log("/rosout").write(EPOCH_NS, "info", "test", "nothing else here")
+    with Session.open(path) as session:
+        assert signals.read_traces(session, snake) == ()
+        assert "Command and response of joint" not in render(snake, session)
+
+
+def test_joints_that_the_log_does_not_know_are_left_out(snake, recorded):
+    joints = list(snake.joints)
+    joints[12] = dataclasses.replace(joints[12], name="stranger")
+    other = dataclasses.replace(snake, joints=tuple(joints))
+    with Session.open(recorded) as session:
+        traces = signals.read_traces(session, other)
+    assert [trace.joint.name for trace in traces] == ["joint01", "joint25"]
