@@ -1,0 +1,52 @@
+"""The manual: `make docs` builds it to docs/_build/html."""
+
+from importlib.metadata import version as package_version
+from pathlib import Path
+
+project = "undulog"
+author = "the undulog developers"
+copyright = "the undulog developers, Apache-2.0"  # noqa: A001 - the name that Sphinx reads
+release = version = package_version("undulog")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"undulog {version}"
+html_static_path: list[str] = []
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_mock_imports: list[str] = []
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+
+
+def _command_line_page() -> str:
+    """The help of every verb, as the terminal shows it."""
+    import os
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    import undulog
+
+    os.environ["COLUMNS"] = "92"
+    parts = [
+        "# Command line",
+        "",
+        (
+            "One command, `undulog`. Exit codes: 0 done, 1 the work failed, 2 wrong usage. Nothing "
+            "is overwritten without `--force`; Ctrl-C and SIGTERM leave a readable file. Bars of "
+            "progress go to stderr, and only on a terminal."
+        ),
+        "",
+    ]
+    for verb in undulog.VERBS:
+        shown = StringIO()
+        with redirect_stdout(shown):
+            undulog.run([*verb.split(), "--help"])
+        parts += [f"## {verb}", "", "```text", shown.getvalue().rstrip(), "```", ""]
+    return "\n".join(parts)
+
+
+(Path(__file__).parent / "command-line.md").write_text(_command_line_page())
