@@ -34,7 +34,7 @@ class Window:
     Attributes:
         start_s: From the session's start [s].
         stop_s: From the session's start [s].
-        cycles: Gait cycles in it.
+        cycles: Gait cycles in it; 0 where there is no gait.
     """
 
     start_s: float
@@ -69,15 +69,19 @@ class GaitFacts:
 
     Attributes:
         frequency_hz: Gait frequency with interval; value None where there is no gait.
-        windows: What was analysed.
+        windows: What was analysed: energies, coverage and body motion are taken over these whole
+            cycles (0 cycles where there is no gait).
         wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
         lag_per_joint_rad: Commanded phase step from joint to joint, by plane.
+        fitted: The stretch whose samples gain, lag and frequency are fitted to: the windows and
+            the part of a cycle that is left over; None where there is no gait.
     """
 
     frequency_hz: Estimate
     windows: tuple[Window, ...] = ()
     wave: str | None = None
     lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
+    fitted: Window | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,236 @@
+"""A session in, all its numbers out: pure orchestration of the estimators."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import numpy as np
+
+from capture import Session
+from capture.environment import base_versions
+from capture.signals import Signal
+
+from .body_motion import body_motion
+from .coupling import one_gait_coupling
+from .fitting import GaitFit, fit_gait
+from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
+from .heterogeneity import energy_indices, response_indices
+from .joints import Energies, Span, joint_energies, joint_results
+from .reading import Warn, by_plane, drag_ratio, read_columns, settle_time_s
+from .response import CONFIDENCE, around, t_factor
+from .result import (
+    Analysis,
+    Estimate,
+    GaitFacts,
+    Index,
+    JointResult,
+    Provenance,
+    SessionFacts,
+    Window,
+)
+from .series import Series, clean
+from .spectrum import BINS_PER_SIDE
+from .stretch import Options, choose_stretch
+from .windows import Stretch, whole_cycles
+
+_NS = 1e9
+
+
+def analyse_session(session: Session, options: Options | None = None) -> Analysis:
+    """Compute everything that one session can tell.
+
+    Args:
+        session: An open session.
+        options: What the user chose; the defaults choose by themselves.
+
+    Returns:
+        The result. What can't be computed is None, and a warning says why.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
+    options = options or Options()
+    warnings: list[str] = []
+
+    def warn(sentence: str) -> None:
+        if sentence not in warnings:
+            warnings.append(sentence)
+
+    columns = read_columns(session, options.command_topic, options.response_topic, warn)
+    stretch = choose_stretch(session, columns, options, warn)
+    origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
+    commands = _series(columns.names, columns.command, stretch, origin_ns)
+    responses = _series(columns.names, columns.position, stretch, origin_ns)
+    _warn_dropped(commands, responses, warn)
+    gait = fit_gait(commands, responses, stretch.duration_s, warn)
+    span = _span(stretch, origin_ns, gait)
+    energies = joint_energies(columns, span, warn)
+    joints = joint_results(
+        session.robot,
+        columns,
+        commands=commands,
+        responses=responses,
+        gait=gait,
+        energies=energies,
+        span=span,
+    )
+    _warn_flags(joints, warn)
+    body = body_motion(session, responses, gait, span, warn)
+    heterogeneity = _heterogeneity(session, gait, energies, warn)
+    return Analysis(
+        session=SessionFacts(
+            id=session.session_id,
+            path=str(session.path),
+            robot=session.robot.name if session.robot is not None else None,
+            start_ns=session.start_ns,
+            duration_s=session.duration_s,
+            verdict=session.verdict,
+        ),
+        gait=_gait_facts(session, gait, span, stretch),
+        joints=joints,
+        body=body,
+        heterogeneity=heterogeneity,
+        coupling=one_gait_coupling(0 if gait is None else len(gait.answered)),
+        warnings=(*session.warnings, *warnings),
+        provenance=_provenance(session, options),
+    )
+
+
+def _series(
+    names: tuple[str, ...], signals: Mapping[str, Signal], stretch: Stretch, origin_ns: int
+) -> dict[str, Series]:
+    """The signals of a stretch as series, in chain order."""
+    result: dict[str, Series] = {}
+    for name in (one for one in names if one in signals):
+        t_ns, values = signals[name].t_ns, signals[name].values
+        i, j = np.searchsorted(t_ns, (stretch.start_ns, stretch.stop_ns), side="left")
+        result[name] = clean(name, t_ns[i:j], values[i:j], origin_ns)
+    return result
+
+
+def _warn_dropped(
+    commands: Mapping[str, Series], responses: Mapping[str, Series], warn: Warn
+) -> None:
+    for kind, series in (("command", commands), ("response", responses)):
+        lost = [one for one in series.values() if one.dropped_nan or one.dropped_duplicates]
+        if lost:
+            nan = sum(one.dropped_nan for one in lost)
+            double = sum(one.dropped_duplicates for one in lost)
+            warn(
+                f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
+                f"time that was there already ({', '.join(one.name for one in lost)})"
+            )
+
+
+def _warn_flags(joints: tuple[JointResult, ...], warn: Warn) -> None:
+    meaning = {
+        "saturated": "at the joint limit",
+        "frozen": "frozen while commanded to move",
+        "stale": "repeats old samples",
+        "gaps": "has gaps",
+        "not_recorded": "has no response samples",
+    }
+    for flag, text in meaning.items():
+        names = [joint.name for joint in joints if flag in joint.flags]
+        if names:
+            warn(f"{text} (an artefact or a limit, not mechanics): {', '.join(names)}")
+
+
+def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
+    start_s = (stretch.start_ns - origin_ns) / _NS
+    stop_s = (stretch.stop_ns - origin_ns) / _NS
+    if gait is None:
+        return Span(origin_ns, start_s, stop_s, 0)
+    first_s, stop_s, cycles = whole_cycles(start_s, stop_s, gait.fit.frequency_hz)
+    return Span(origin_ns, first_s, stop_s, cycles)
+
+
+def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Stretch) -> GaitFacts:
+    shift_s = (span.origin_ns - session.start_ns) / _NS
+    window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
+    if gait is None:
+        return GaitFacts(Estimate(), (window,))
+    half = t_factor(gait.omega_dof) * gait.omega_error / (2 * np.pi)
+    frequency = gait.fit.frequency_hz
+    steps: dict[str, float] = {}
+    main, largest = None, 0.0
+    for plane, names in by_plane(session.robot, gait.driven).items():
+        if len(names) > 1:
+            waves = gait.fit.fundamental[[gait.command_of(name) for name in names]]
+            steps[plane] = phase_step(waves)
+            if np.abs(waves).max() > largest:
+                main, largest = plane, float(np.abs(waves).max())
+    return GaitFacts(
+        frequency_hz=Estimate(frequency, around(frequency, half)),
+        windows=(window,),
+        wave=None if main is None else wave_name(steps[main]),
+        lag_per_joint_rad=steps,
+        fitted=Window(
+            (stretch.start_ns - session.start_ns) / _NS,
+            (stretch.stop_ns - session.start_ns) / _NS,
+            stretch.duration_s * frequency,
+        ),
+    )
+
+
+def _heterogeneity(
+    session: Session, gait: GaitFit | None, energies: Mapping[str, Energies], warn: Warn
+) -> dict[str, Index]:
+    """Indices of each driven plane; their names carry the plane where both are driven."""
+    if gait is None or gait.response is None:
+        return {}
+    planes = by_plane(session.robot, gait.answered)
+    result: dict[str, Index] = {}
+    for plane, names in planes.items():
+        response = gait.response.select([gait.answered.index(name) for name in names])
+        found = response_indices(response)
+        powers = [energies[name].mechanical for name in names]
+        known = [power.abs_j for power in powers if power is not None]
+        if known and len(known) == len(names):
+            found |= energy_indices(np.stack(known))
+        suffix = f"_{plane}" if len(planes) > 1 else ""
+        result |= {f"{name}{suffix}": index for name, index in found.items()}
+        if not found:
+            warn("fewer than two joints respond in one plane: no heterogeneity indices")
+    if result:
+        result["module_share"] = Index(
+            None, None, None, "1", "share of the spread that is due to the modules themselves"
+        )
+        warn(
+            "boundary or module: not separable from a wave in one direction (module_share is "
+            "null); record the reverse"
+        )
+    return result
+
+
+def _provenance(session: Session, options: Options) -> Provenance:
+    """What makes the same numbers again."""
+    command = ["undulog", "analyse", str(session.path)]
+    chosen = {key: value for key, value in asdict(options).items() if value != _DEFAULTS[key]}
+    for key, value in chosen.items():
+        command += [f"--{key.removesuffix('_s').replace('_', '-')}", str(value)]
+    with session.path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Provenance(
+        command=shlex.join(command),
+        versions=base_versions(),
+        inputs={str(session.path): digest},
+        options={
+            **asdict(options),
+            "confidence": CONFIDENCE,
+            "harmonics": HARMONICS,
+            "min_cycles": MIN_CYCLES,
+            "min_explained": MIN_EXPLAINED,
+            "bins_per_side": BINS_PER_SIDE,
+            "settle_s": settle_time_s(session),
+            "drag_ratio": drag_ratio(session),
+        },
+    )
+
+
+_DEFAULTS = asdict(Options())

@@ -1,0 +1,176 @@
+"""Is there a gait, and at which frequency?
+
+A session has a gait when one rhythm, common to all joints, explains the commands: at least
+``MIN_CYCLES`` cycles of it, and at least ``MIN_EXPLAINED`` of the commands' variance by that
+frequency and its harmonics. A sine with a fifth of its power in noise passes (0.83), and so does
+a square wave (0.90); a ramp, whose best fit with three cycles is a saw-tooth, reaches
+(6 / pi^2)(1/9 + 1/36 + 1/81) = 0.09.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import BoolArray, ComplexArray, FloatArray
+from capture.errors import DataError
+
+from .harmonic import HarmonicModel, fit_shared
+from .series import Series
+
+MIN_CYCLES = 3.0
+MIN_EXPLAINED = 0.8
+HARMONICS = 3
+NYQUIST_SHARE = 0.45
+"""Highest harmonic as a share of the sampling rate; half would be the limit."""
+
+DRIVEN_SHARE = 0.01
+"""A joint whose command moves less than this share of the largest is not driven."""
+
+_SCOUTS = 4
+"""Channels that the first search looks at: the livelier ones."""
+
+_PADDING = 4
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """A rhythm common to several channels.
+
+    Attributes:
+        omega: Angular frequency [rad/s].
+        explained: Share of all channels' variance that it explains, 0 to 1.
+        model: Basis that the sampling rate allows.
+    """
+
+    omega: float
+    explained: float
+    model: HarmonicModel
+
+
+def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
+    """Look for the rhythm that explains the channels best.
+
+    Args:
+        series: Channels; those that never move are ignored.
+        duration_s: Length of the stretch [s].
+
+    Returns:
+        The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
+        where nothing moves or the samples are too few.
+    """
+    moving = [one for one in series if one.count > 16 and np.ptp(one.values) > 0]
+    if not moving or duration_s <= 0:
+        return None
+    peak = _periodogram_peak(moving, duration_s)
+    if peak is None:
+        return None
+    # A second harmonic that is stronger than the fundamental makes the peak an octave too high.
+    found = [_try(moving, omega) for omega in (peak, peak / 2)]
+    rhythms = [one for one in found if one and one.omega * duration_s >= 2 * np.pi * MIN_CYCLES]
+    if not rhythms:
+        return None
+    best = max(rhythms, key=lambda one: one.explained)
+    # The octave below explains what the peak explains, and a little noise more.
+    return rhythms[0] if rhythms[0].explained >= MIN_EXPLAINED else best
+
+
+def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> HarmonicModel:
+    """The basis that the slowest channel's sampling rate allows.
+
+    Args:
+        series: Channels.
+        omega: Angular frequency [rad/s].
+        trend: Degree of the polynomial.
+
+    Returns:
+        One to ``HARMONICS`` harmonics.
+    """
+    slowest = max(one.period_s for one in series)
+    highest = int(NYQUIST_SHARE * 2 * np.pi / (slowest * omega)) if slowest > 0 else 1
+    return HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)), trend=trend)
+
+
+def driven(amplitudes: ComplexArray, explained: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Which joints the gait drives.
+
+    Args:
+        amplitudes: Fundamentals of the commands, shape (m,).
+        explained: Share of each command's variance that the rhythm explains, shape (m,).
+
+    Returns:
+        Driven joints, and joints that are commanded something else than the common rhythm,
+        each of shape (m,).
+    """
+    size = np.abs(amplitudes)
+    lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
+    follows = explained >= MIN_EXPLAINED
+    return lively & follows, lively & ~follows
+
+
+def phase_step(fundamentals: ComplexArray) -> float:
+    """Mean phase step from joint to joint, signed as in Eq. 2.
+
+    Args:
+        fundamentals: Complex amplitudes of one plane's commands, head to tail, shape (k,), k > 1.
+
+    Returns:
+        In (-pi, pi] [rad]; negative when the wave runs from head to tail.
+    """
+    return float(np.angle(np.sum(fundamentals[1:] * fundamentals[:-1].conj())))
+
+
+def wave_name(step_rad: float) -> str:
+    """Which way a wave runs.
+
+    Args:
+        step_rad: Phase step from joint to joint [rad].
+
+    Returns:
+        ``head-to-tail``, ``tail-to-head``, or ``standing`` where the step is 0 or pi.
+    """
+    if abs(np.sin(step_rad)) < 1e-3:
+        return "standing"
+    return "head-to-tail" if step_rad < 0 else "tail-to-head"
+
+
+def _try(series: Sequence[Series], omega: float) -> Rhythm | None:
+    model = allowed_model(series, omega)
+    if any(one.count <= model.size + 1 for one in series):
+        return None
+    try:
+        fit = fit_shared(series, omega, model)
+    except DataError:
+        return None
+    explained = 1.0 - float(fit.rss.sum() / fit.total.sum())
+    return Rhythm(fit.omega, explained, model)
+
+
+def _periodogram_peak(series: Sequence[Series], duration_s: float) -> float | None:
+    """Peak of the summed periodogram of the liveliest channels [rad/s].
+
+    Only a starting point: the channels are interpolated to an even grid and tapered, and the
+    Gauss-Newton fit does the rest on the true times.
+    """
+    scouts = sorted(series, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
+    step = max(one.period_s for one in scouts)
+    start = max(one.t_s[0] for one in scouts)
+    stop = min(one.t_s[-1] for one in scouts)
+    count = int((stop - start) / step) + 1 if stop > start and step > 0 else 0
+    if count < 16:
+        return None
+    grid = start + step * np.arange(count)
+    length = 1 << int(np.ceil(np.log2(_PADDING * count)))
+    power = np.zeros(length // 2 + 1)
+    taper = np.hanning(count)
+    for one in scouts:
+        values = one.at(grid)
+        power += np.abs(np.fft.rfft((values - values.mean()) * taper, length)) ** 2
+    frequency = np.fft.rfftfreq(length, step)
+    # Half a cycle below the limit: the peak of a rhythm of just three cycles must be found.
+    inside = (frequency >= (MIN_CYCLES - 0.5) / duration_s) & (frequency <= NYQUIST_SHARE / step)
+    if not np.any(inside) or np.max(power[inside]) == 0:
+        return None
+    return float(2 * np.pi * frequency[inside][np.argmax(power[inside])])

@@ -1,0 +1,208 @@
+"""The columns of a session that an analysis needs, and what is known about how it was run."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+from capture import Session
+from capture.errors import MissingChannelError
+from capture.robot import Robot
+from capture.signals import JointSignals, Signal
+
+from .null import DRAG_RATIO
+
+COMMAND_TOPIC = "/joint_commands"
+RESPONSE_TOPIC = "/joint_states"
+CURRENT_TOPIC = "/joint_current"
+VOLTAGE_TOPIC = "/joint_voltage"
+
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Signals by joint name; a joint or a quantity that was not recorded is absent.
+
+    Attributes:
+        names: All joints, head to tail.
+        command: Commanded positions [rad].
+        position: Measured positions [rad].
+        velocity: [rad/s].
+        effort: [N m].
+        current: Motor current [A].
+        voltage: Motor voltage [V].
+    """
+
+    names: tuple[str, ...]
+    command: Mapping[str, Signal]
+    position: Mapping[str, Signal]
+    velocity: Mapping[str, Signal]
+    effort: Mapping[str, Signal]
+    current: Mapping[str, Signal]
+    voltage: Mapping[str, Signal]
+
+
+def read_columns(session: Session, command_topic: str, response_topic: str, warn: Warn) -> Columns:
+    """Read what is there, and say what is not.
+
+    Args:
+        session: An open session.
+        command_topic: JointState topic of the commands.
+        response_topic: JointState topic of the responses.
+        warn: Takes one sentence for each thing missing.
+
+    Returns:
+        The columns.
+
+    Raises:
+        MissingChannelError: If neither topic is there; the message lists those that are.
+        DataError: If a topic is not of JointStates.
+    """
+    wanted = {
+        "command": (command_topic, "position"),
+        "position": (response_topic, "position"),
+        "velocity": (response_topic, "velocity"),
+        "effort": (response_topic, "effort"),
+        "current": (CURRENT_TOPIC, "position"),
+        "voltage": (VOLTAGE_TOPIC, "position"),
+    }
+    if not {command_topic, response_topic} & set(session.channels):
+        joint_topics = [
+            topic
+            for topic, channel in session.channels.items()
+            if channel.type_name == "sensor_msgs/msg/JointState"
+        ]
+        raise MissingChannelError(
+            session.path, f"{command_topic} or {response_topic}", sorted(joint_topics)
+        )
+    wanted = {key: one for key, one in wanted.items() if one[0] in session.channels}
+    found = _read(session, wanted)
+    if "command" not in found:
+        warn(f"no commands on {command_topic}: gain and lag are null")
+    if "position" not in found:
+        warn(f"no positions on {response_topic}: gain and lag are null")
+    if "velocity" not in found or "effort" not in found:
+        lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
+        warn(f"{response_topic} carries no {lacking}: mechanical energies are null")
+    _check_voltage(session, found, warn)
+    names = session.robot.joint_names if session.robot is not None else ()
+    seen = dict.fromkeys(names)
+    for key in ("command", "position"):
+        if key in found:
+            seen |= dict.fromkeys(found[key].names)
+    by_name = {
+        key: {name: signals.signal(name) for name in signals.names}
+        for key, signals in found.items()
+    }
+    absent: dict[str, Signal] = {}
+    return Columns(names=tuple(seen), **{key: by_name.get(key, absent) for key in _QUANTITIES})
+
+
+_QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage")
+
+
+def settle_time_s(session: Session) -> float:
+    """Settling time that the session states [s]; 0 where it states none.
+
+    Args:
+        session: An open session.
+
+    Returns:
+        From the session's start.
+    """
+    stated = session.metadata.get("undulog", {}).get("settle_s")
+    try:
+        return max(0.0, float(stated)) if stated is not None else 0.0
+    except ValueError:
+        return 0.0
+
+
+def drag_ratio(session: Session) -> float:
+    """Ratio of the drag across a link to that along it, for the viscous null.
+
+    Args:
+        session: An open session.
+
+    Returns:
+        mu_normal / mu_tangential of the attached scenario's ground, else the default.
+    """
+    try:
+        scenario: Any = tomllib.loads(session.attachments["scenario.toml"].decode())
+        ground = cast("dict[str, float]", scenario["world"]["ground"])
+        ratio = float(ground["mu_normal"]) / float(ground["mu_tangential"])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return DRAG_RATIO
+    return ratio if 0 < ratio < float("inf") else DRAG_RATIO
+
+
+def planes_of(robot: Robot | None) -> dict[str, str]:
+    """Plane of each joint by name; empty without a robot description.
+
+    Args:
+        robot: The robot, or None.
+
+    Returns:
+        Joint name to ``horizontal`` or ``vertical``.
+    """
+    if robot is None:
+        return {}
+    return {joint.name: joint.plane.value for joint in robot.joints}
+
+
+def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
+    """Joint names by plane.
+
+    Args:
+        robot: The robot, or None.
+        names: Joint names.
+
+    Returns:
+        Plane to names, in their order; all under ``chain`` without a robot description.
+    """
+    planes = planes_of(robot)
+    result: dict[str, list[str]] = {}
+    for name in names:
+        result.setdefault(planes.get(name, "chain"), []).append(name)
+    return result
+
+
+def _read(session: Session, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
+    """All in one pass if all are there; else one by one, leaving out what is empty."""
+    topics: dict[str, list[str]] = {}
+    for topic, field in wanted.values():
+        fields = topics.setdefault(topic, [])
+        if field not in fields:
+            fields.append(field)
+    try:
+        found = session.joint_columns(topics)
+        return {key: found[one] for key, one in wanted.items()}
+    except MissingChannelError:
+        some: dict[str, JointSignals] = {}
+        for key, (topic, field) in wanted.items():
+            try:
+                some[key] = session.joints(topic, field)
+            except MissingChannelError:
+                continue
+        return some
+
+
+def _check_voltage(session: Session, found: dict[str, JointSignals], warn: Warn) -> None:
+    """E_el needs the voltage at the motor: a bridge's duty times the supply, not the supply."""
+    if "current" not in found or "voltage" not in found:
+        warn(f"no {CURRENT_TOPIC} or no {VOLTAGE_TOPIC}: electrical energies are null")
+        found.pop("current", None)
+        return
+    kind = session.channels[VOLTAGE_TOPIC].metadata.get("of", "")
+    if kind == "supply":
+        warn(
+            f"{VOLTAGE_TOPIC} is the supply voltage, not the motor's: electrical energies are null"
+        )
+        del found["voltage"]
+    elif kind != "motor" and "scenario" not in session.metadata.get("undulog", {}):
+        warn(
+            f"{VOLTAGE_TOPIC} does not say whose voltage it is (channel metadata 'of'): taken as "
+            "the motor's; if it is the supply's, the electrical energies are too large"
+        )

@@ -1,0 +1,153 @@
+"""Choosing the stretch of a session that is analysed, and saying why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture import Session
+from capture.errors import DataError, LogError, UsageError
+
+from .gait import MIN_CYCLES
+from .reading import COMMAND_TOPIC, RESPONSE_TOPIC, Columns, Warn, settle_time_s
+from .series import clean
+from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
+
+GAIT_TOPIC = "/gait"
+_NS = 1e9
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user may choose.
+
+    Attributes:
+        start_s: Start of what is analysed, from the session's start [s]; None: chosen.
+        stop_s: Its end, not included [s]; None: chosen.
+        command_topic: JointState topic of the commands.
+        response_topic: JointState topic of the responses.
+    """
+
+    start_s: float | None = None
+    stop_s: float | None = None
+    command_topic: str = COMMAND_TOPIC
+    response_topic: str = RESPONSE_TOPIC
+
+
+def choose_stretch(session: Session, columns: Columns, options: Options, warn: Warn) -> Stretch:
+    """The stretch to analyse.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        options: What the user chose; a start of his own replaces the settling time.
+        warn: Takes one sentence where the choice needs one.
+
+    Returns:
+        The stretch.
+
+    Raises:
+        DataError: If there are no samples at all.
+        UsageError: If the user's limits leave nothing.
+    """
+    recorded = _recorded(session, columns)
+    chosen = recorded.intersect(
+        _absolute(session, options.start_s), _absolute(session, options.stop_s)
+    )
+    if chosen.duration_s <= 0:
+        first, last = ((t - session.start_ns) / _NS for t in (recorded.start_ns, recorded.stop_ns))
+        raise UsageError(
+            f"{session.path}: nothing between --start and --stop; it has joint samples from "
+            f"{first:.2f} to {last:.2f} s"
+        )
+    settle_s = settle_time_s(session) if options.start_s is None else 0.0
+    runs = _gait_runs(session, chosen, settle_s, warn)
+    if runs:
+        longest = max(runs, key=lambda run: run.duration_s)
+        if len(runs) > 1:
+            rest = sum(run.duration_s for run in runs) - longest.duration_s
+            warn(
+                f"the gait parameters change: the longest steady stretch is analysed, {rest:.1f} s "
+                f"in {len(runs) - 1} others are not (choose with --start and --stop)"
+            )
+        return longest
+    later = settled(chosen, session.start_ns, settle_s)
+    if later.duration_s <= 0:
+        warn(
+            f"the session ends within its settling time of {settle_s:g} s: all of it is analysed, "
+            "unsettled as it is"
+        )
+        later = chosen
+    return _in_motion(columns, later)
+
+
+def _recorded(session: Session, columns: Columns) -> Stretch:
+    """Where commands and responses overlap, or where the one that exists lies."""
+    kinds = (columns.command, columns.position)
+    spans = [covered([signal.t_ns for signal in kind.values()]) for kind in kinds]
+    known = [span for span in spans if span is not None]
+    if not known:
+        raise DataError(f"{session.path}: the joint topics hold no samples; nothing to analyse")
+    both = Stretch(max(s.start_ns for s in known), min(s.stop_ns for s in known))
+    if both.duration_s <= 0:
+        raise DataError(
+            f"{session.path}: commands and responses don't overlap in time; their clocks differ"
+        )
+    return both
+
+
+def _absolute(session: Session, time_s: float | None) -> int | None:
+    return None if time_s is None else session.start_ns + round(time_s * _NS)
+
+
+def _gait_runs(session: Session, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:
+    """Steady, settled runs of the logged gait with enough cycles; empty if none is known."""
+    if GAIT_TOPIC not in session.channels:
+        return []
+    try:
+        logged = session.joints(GAIT_TOPIC)
+    except (DataError, LogError) as error:
+        warn(f"{GAIT_TOPIC} can't be used to find steady stretches: {error}")
+        return []
+    omegas = [k for k, name in enumerate(logged.names) if name.endswith(".omega")]
+    if not omegas or len({t.size for t in logged.t_ns}) != 1 or not logged.t_ns[0].size:
+        warn(f"{GAIT_TOPIC} names no plane's omega: it can't be used to find steady stretches")
+        return []
+    t_ns, values = logged.t_ns[0], np.stack(logged.values, axis=-1)
+    for ignore in ((), ("offset",)):
+        found: list[Stretch] = []
+        for run in steady_runs(t_ns, logged.names, values, ignore):
+            part = settled(run, session.start_ns, settle_s)
+            part = part.intersect(chosen.start_ns, chosen.stop_ns)
+            row = int(np.searchsorted(t_ns, run.start_ns))
+            frequency = max(abs(float(values[row, k])) for k in omegas) / (2 * math.pi)
+            if long_enough(part.duration_s, frequency):
+                found.append(part)
+        if found:
+            if ignore:
+                warn("the gait's offset changes within the analysed stretch: the robot steers")
+            return found
+    warn(
+        f"no stretch of {MIN_CYCLES:g} cycles has steady gait parameters (after "
+        f"{settle_s:g} s of settling): the gait is analysed as if it were steady"
+    )
+    return []
+
+
+def _in_motion(columns: Columns, stretch: Stretch) -> Stretch:
+    """Without standing still at the ends."""
+    origin = stretch.start_ns
+    series = [
+        clean(name, signal.t_ns, signal.values, origin).between(0.0, stretch.duration_s)
+        for name, signal in columns.command.items()
+    ]
+    span = moving(series)
+    if span is None:
+        return stretch
+    start, stop = (origin + round(time_s * _NS) for time_s in span)
+    period = max((one.period_s for one in series if one.count > 1), default=0.0)
+    # Moving to the last sample: that sample's own interval belongs to it.
+    ends = stretch.stop_ns - stop <= 2 * round(period * _NS)
+    return stretch.intersect(start, None if ends else stop)
