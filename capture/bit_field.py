@@ -108,4 +108,5 @@ class BitField:
         Returns:
             ``scale * raw + offset``, shape (n,).
         """
-        return self.raw(data).astype(np.float64) * self.scale + self.offset
+        with np.errstate(invalid="ignore"):  # a NaN in the frame is a NaN in the log
+            return self.raw(data).astype(np.float64) * self.scale + self.offset

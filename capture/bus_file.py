@@ -20,7 +20,8 @@ _OF_SENSOR = {
     SensorKind.ACCELEROMETER: Quantity.ACCELERATION,
     SensorKind.COMPASS: Quantity.MAGNETIC_FIELD,
 }
-_OF_JOINT = tuple(quantity for quantity in Quantity if quantity not in _OF_SENSOR.values())
+JOINT_QUANTITIES = tuple(q for q in Quantity if q not in _OF_SENSOR.values())
+"""What can be known of a joint."""
 
 
 def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str, Message] | None:
@@ -166,7 +167,7 @@ def _quantities(
 ) -> tuple[Quantity, ...]:
     """What can be known of a target; nothing where there is no such target."""
     if any(joint.name == target for joint in joints):
-        return _OF_JOINT
+        return JOINT_QUANTITIES
     return tuple(_OF_SENSOR[sensor.kind] for sensor in sensors if sensor.name == target)
 
 

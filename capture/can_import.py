@@ -80,11 +80,11 @@ def import_can(
         ) as writer:
             work = _Import(writer, robot, log, chosen, report)
             for block in chain([first], blocks):
+                work.add(block)
+                bar.update(block.done)
                 if stop is not None and stop.requested:
                     report.complete = False
                     break
-                work.add(block)
-                bar.update(block.done)
             work.finish()
             if chosen not in log.buses:
                 raise ImportFormatError(
@@ -155,7 +155,7 @@ class _Import:
         report.end_ns = max(report.end_ns, int(t_ns.max()))
 
     def _raw_messages(self, name: str, frames: FrameArray) -> Iterator[Message]:
-        """Batches of raw frames; log times never go back, so that their order is kept."""
+        """Batches of raw frames; their log times increase, so that their order is kept."""
         topic = FRAME_TOPIC_PREFIX + name
         if name not in self._channels:
             self._channels[name] = self._writer.frames(topic)
@@ -163,7 +163,7 @@ class _Import:
         t_ns = np.maximum.accumulate(frames["t_host_ns"].astype(np.int64))
         ends = np.flatnonzero(np.diff(t_ns // _BATCH_NS)) + 1
         for batch in np.split(np.arange(len(frames)), ends):
-            latest_ns = max(self._latest_ns.get(name, 0), int(t_ns[batch[-1]]))
+            latest_ns = max(self._latest_ns.get(name, 0) + 1, int(t_ns[batch[-1]]))
             self._latest_ns[name] = latest_ns
             yield Message(topic, latest_ns, _writing(channel, latest_ns, frames[batch]))
 

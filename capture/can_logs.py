@@ -101,6 +101,8 @@ def _reader(path: Path) -> MessageReader:
     from can import LogReader
 
     try:
+        if log_suffix(path) == ".blf" and path.suffix != ".gz":
+            _check_blf(path)  # its reader would leave the file open
         return LogReader(path)
     except NotImplementedError as error:  # raised for MF4 where asammdf is not installed
         raise ImportFormatError(
@@ -108,6 +110,12 @@ def _reader(path: Path) -> MessageReader:
         ) from error
     except _READ_ERRORS as error:
         raise ImportFormatError(path, f"can't be read: {error}") from error
+
+
+def _check_blf(path: Path) -> None:
+    with path.open("rb") as stream:
+        if stream.read(4) != b"LOGG":
+            raise ValueError("not a BLF file")
 
 
 def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:

@@ -28,12 +28,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .bus_file import JOINT_QUANTITIES
 from .errors import Fault, FaultyFileError, UsageError
 from .robot import Quantity, Robot
 from .strict_table import Faults, Table, listed
 from .units import TIME_UNITS, unit_for, valid_units
 
-_NOT_OF_JOINTS = (Quantity.RANGE, Quantity.ACCELERATION, Quantity.MAGNETIC_FIELD)
 _DELIMITERS = (",", ";", "\t", " ")
 _OPTION_FORM = (
     "COLUMN=time:UNIT or COLUMN=JOINT.QUANTITY:UNIT[,wrap=PERIOD][,scale=FACTOR][,offset=VALUE]"
@@ -190,11 +190,8 @@ def _column(table: Table, joints: Iterable[str]) -> Column:
     name, joint = table.text("column"), table.text("joint")
     if joint and joint not in joints:
         table.fault("joint", listed(joints, joint))
-    quantity, unit = table.choice("quantity", Quantity), table.text("unit")
-    if quantity in _NOT_OF_JOINTS:
-        valid = [quantity for quantity in Quantity if quantity not in _NOT_OF_JOINTS]
-        table.fault("quantity", f"what a joint has: {', '.join(valid)}")
-    elif quantity is not None:
+    quantity, unit = table.choice("quantity", JOINT_QUANTITIES), table.text("unit")
+    if quantity is not None:
         try:
             unit_for(unit, quantity)
         except UsageError:

@@ -116,7 +116,7 @@ class DecodedTopics:
         if sensor.name not in self._sensor_writers:
             self._sensor_writers[sensor.name] = _open_sensor(self._writer, sensor)
         write = self._sensor_writers[sensor.name]
-        columns = ["xyz".find(sample.signal.axis) for sample in samples]  # -1 for a range
+        columns = ["xyz".index(sample.signal.axis or "x") for sample in samples]
         t_ns, values = _side_by_side(samples, columns, 3)
         return [
             Message(sensor.topic, t, lambda t=t, row=row: write(t, row))
@@ -302,4 +302,4 @@ def _open_sensor(writer: SessionWriter, sensor: Sensor) -> Callable[[int, FloatA
         field_of_view=sensor.field_of_view or 0.0,
         infrared=sensor.kind is SensorKind.IR,
     )
-    return lambda t_ns, row: distance.write(t_ns, float(row[-1]))
+    return lambda t_ns, row: distance.write(t_ns, float(row[0]))

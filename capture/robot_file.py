@@ -196,7 +196,7 @@ def _links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...]:
     if "links" not in top:
         entries = [({"name": f"link{i:02d}"}, "defaults.link") for i in range(1, joint_count + 2)]
     elif len(entries) != joint_count + 1:
-        top.fault("links", f"{joint_count + 1}, one more than joints", f"{len(entries)} tables")
+        top.fault("links", f"{joint_count + 1}, one more than joints", str(len(entries)))
     links: list[Link] = []
     for values, where in entries:
         table = Table(values, where, top.faults, common)

@@ -106,6 +106,7 @@ class Table:
 
     def __contains__(self, key: str) -> bool:
         """Whether the table itself has the key."""
+        self._asked[key] = None
         return key in self._values
 
     def key(self, key: str) -> str:
@@ -185,7 +186,7 @@ class Table:
             return ""
         return value
 
-    def choice(self, key: str, kinds: type[_Choice]) -> _Choice | None:
+    def choice(self, key: str, kinds: Iterable[_Choice]) -> _Choice | None:
         """One of a few words; None after a fault.
 
         Args:
@@ -196,11 +197,11 @@ class Table:
             The member.
         """
         value = self.look(key)[1]
-        words = [str(kind) for kind in kinds]
+        words = {str(kind): kind for kind in kinds}
         if not isinstance(value, str) or value not in words:
             self.fault(key, listed(words, value))
             return None
-        return kinds(value)
+        return words[value]
 
     def number(
         self,

@@ -1,0 +1,270 @@
+"""Decoding of frames, against cantools on every kind of signal."""
+
+import math
+
+import cantools
+import numpy as np
+import pytest
+from cantools.database.can import Message, Signal
+from cantools.database.conversion import BaseConversion
+from cantools.database.errors import DecodeError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture import load_robot
+from capture.bit_field import BitField
+from capture.bus import BusDecoder
+from capture.errors import DataError
+from capture.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    REMOTE_FLAG,
+    empty_frames,
+)
+from capture.robot_file import parse_robot
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+def reference(signal, data):
+    """Values as cantools decodes them, one message at a time."""
+    message = Message(1, "m", 8, [signal], strict=True)
+    return [float(message.decode(row.tobytes(), decode_choices=False)[signal.name]) for row in data]
+
+
+def layouts():
+    """Every place and length that a signal can have in eight bytes."""
+    for length in range(1, 65):
+        for position in range(65 - length):
+            yield "little_endian", position, length
+            # The top bit of a Motorola signal, counted from the top of byte 0, in DBC numbers.
+            yield "big_endian", 8 * (position // 8) + 7 - position % 8, length
+
+
+def test_integers_of_every_layout(rng):
+    data = rng.integers(0, 256, (3, 8), dtype=np.uint8)
+    data[0] = 255
+    for byte_order, start, length in layouts():
+        for signed in (False, True):
+            signal = Signal("s", start, length, byte_order, signed)
+            assert BitField.of(signal).values(data).tolist() == reference(signal, data), signal
+
+
+@pytest.mark.parametrize("length", [16, 32, 64])
+@pytest.mark.parametrize("byte_order", ["little_endian", "big_endian"])
+def test_floats_of_every_layout(byte_order, length, rng):
+    data = rng.integers(0, 256, (20, 8), dtype=np.uint8)
+    conversion = BaseConversion.factory(scale=0.5, offset=-3, is_float=True)
+    for order, start, size in layouts():
+        if (order, size) == (byte_order, length):
+            signal = Signal("s", start, length, byte_order, True, conversion=conversion)
+            values = BitField.of(signal).values(data)
+            np.testing.assert_array_equal(values, reference(signal, data))
+
+
+@given(
+    data=st.binary(min_size=8, max_size=8),
+    layout=st.sampled_from(list(layouts())),
+    signed=st.booleans(),
+    scale=st.floats(-1e6, 1e6).filter(lambda scale: scale != 0),
+    offset=st.floats(-1e6, 1e6),
+)
+def test_scaled_integers(data, layout, signed, scale, offset):
+    byte_order, start, length = layout
+    conversion = BaseConversion.factory(scale=scale, offset=offset)
+    signal = Signal("s", start, length, byte_order, signed, conversion=conversion)
+    row = np.frombuffer(data, dtype=np.uint8).reshape(1, 8)
+    expected = reference(signal, row)[0]
+    # cantools counts in exact integers where scale and offset are whole, we in doubles.
+    assert BitField.of(signal).values(row)[0] == pytest.approx(expected, rel=1e-15, abs=1e-9)
+
+
+MULTIPLEXED = """VERSION ""
+
+NS_ :
+	SG_MUL_VAL_
+
+BU_: a b
+
+BO_ 2147484672 mux: 8 a
+ SG_ outer M : 3|4@0+ (1,0) [0|0] "" b
+ SG_ inner m1M : 8|8@1+ (1,0) [0|0] "" b
+ SG_ one m2 : 16|16@1- (0.1,5) [0|0] "deg" b
+ SG_ two m2 : 39|12@0+ (1,-40) [0|0] "deg/s" b
+ SG_ three m0 : 8|32@1- (1,0) [0|0] "A" b
+ SG_ always : 56|8@1+ (0.5,0) [0|0] "V" b
+
+BO_ 5 plain: 4 a
+ SG_ four : 0|32@1- (1,0) [0|0] "N m" b
+
+SG_MUL_VAL_ 2147484672 inner outer 1-3;
+SG_MUL_VAL_ 2147484672 one inner 2-2, 5-7;
+SG_MUL_VAL_ 2147484672 two inner 2-9;
+SG_MUL_VAL_ 2147484672 three outer 0-0, 4-15;
+SIG_VALTYPE_ 5 four : 1;
+"""
+
+ROBOT = """
+name = "muxed"
+clock = "host"
+joints = [{ name = "joint01", plane = "horizontal" }]
+
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+
+[bus]
+databases = ["mux.dbc"]
+bitrate = 500_000
+signals = [
+  { message = "mux", signal = "one", direction = "rx", target = "joint01", quantity = "position", unit = "rad" },
+  { message = "mux", signal = "two", direction = "rx", target = "joint01", quantity = "velocity", unit = "rad/s", scale = 2.0, offset = 1.0 },
+  { message = "mux", signal = "three", direction = "rx", target = "joint01", quantity = "current", unit = "A" },
+  { message = "mux", signal = "always", direction = "rx", target = "joint01", quantity = "voltage", unit = "V" },
+  { message = "plain", signal = "four", direction = "rx", target = "joint01", quantity = "effort", unit = "N m" },
+]
+"""  # noqa: E501  TOML has inline tables on one line
+
+
+@pytest.fixture(scope="module")
+def muxed():
+    return parse_robot(ROBOT, "muxed.toml", {"mux.dbc": MULTIPLEXED})
+
+
+def some_frames(count, id_flags, dlc=8, way=DIR_RX):
+    frames = empty_frames(count)
+    frames["t_host_ns"] = np.arange(count) * 1000 + 7
+    frames["id_flags"], frames["dlc"], frames["dir"] = id_flags, dlc, way
+    return frames
+
+
+@settings(max_examples=50)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_nested_multiplexing(muxed, seed):
+    rng = np.random.default_rng(seed)
+    frames = some_frames(200, 1024 | EXTENDED_FLAG)
+    frames["data"] = rng.integers(0, 256, (200, 8))
+    frames["data"][:, 1] %= 11
+    samples, tally = BusDecoder(muxed).decode(frames)
+    database = cantools.database.load_string(MULTIPLEXED, "dbc")
+    expected = {}
+    for row, frame in enumerate(frames):
+        try:
+            decoded = database.decode_message("mux", frame["data"].tobytes())
+        except DecodeError:  # a multiplexer value without signals; cantools then gives up on all
+            raw = frame["data"]
+            decoded = {"always": raw[7] * 0.5}
+        for name, value in decoded.items():
+            expected.setdefault(name, {})[row] = value
+    found = {sample.signal.signal: sample for sample in samples}
+    assert set(found) == set(expected) - {"outer", "inner"}
+    for name, sample in found.items():
+        values = sample.values if name != "two" else (sample.values - 1) / 2
+        assert dict(zip(sample.rows.tolist(), values.tolist(), strict=True)) == expected[name]
+        assert sample.t_ns.tolist() == [row * 1000 + 7 for row in expected[name]]
+    assert (tally.frames, tally.decoded, tally.problems()) == (200, 200, [])
+
+
+def test_a_float_signal_of_a_database(muxed):
+    frames = some_frames(3, 5, dlc=4)
+    frames["data"][:, :4] = np.array([1.5, -2.25, 3e8], dtype="<f4").view(np.uint8).reshape(3, 4)
+    ((sample,), _) = BusDecoder(muxed).decode(frames)
+    assert (sample.values.tolist(), sample.unit) == ([1.5, -2.25, 3e8], "N m")
+
+
+def test_no_frame_goes_unaccounted_for(muxed):
+    frames = np.concatenate(
+        [
+            some_frames(2, 5, dlc=4),  # decoded
+            some_frames(3, 5, dlc=3),  # too short for its signal
+            some_frames(4, 5, way=DIR_TX),  # known, but nothing is mapped in that direction
+            some_frames(5, 5 | EXTENDED_FLAG),  # another identifier
+            some_frames(6, 0x7FF),
+            some_frames(7, 5 | REMOTE_FLAG),
+            some_frames(8, 0x80 | ERROR_FLAG),
+        ]
+    )
+    samples, tally = BusDecoder(muxed).decode(frames)
+    assert sum(len(sample.rows) for sample in samples) == 2
+    assert tally.problems() == [
+        "8 error frames",
+        "3 values missing from frames too short for them: plain.four (3)",
+    ]
+    assert tally.notes() == [
+        "7 remote frames, which carry no data",
+        "11 frames of identifiers that no database knows: 7FF (6), 00000005 (5)",
+        "4 frames of known identifiers with nothing that the map names: 005 (4)",
+    ]
+    shares = tally.decoded + tally.errors + tally.remote
+    shares += tally.unknown.total() + tally.silent.total() + tally.short.total()
+    assert shares == len(frames) == tally.frames
+
+
+def test_a_frame_too_short_for_its_multiplexer_counts_as_short(muxed):
+    samples, tally = BusDecoder(muxed).decode(some_frames(1, 1024 | EXTENDED_FLAG, dlc=0))
+    assert samples == ()
+    assert set(tally.short) == {"mux.one", "mux.two", "mux.three", "mux.always"}
+
+
+def test_the_direction_tells_a_request_from_its_reply():
+    decoder = BusDecoder(load_robot("arcsnake-joint"))
+    frames = some_frames(5, 0x14B)
+    frames["data"] = [
+        list(bytes.fromhex(text))
+        for text in (
+            "A40076023FCCFFFF",  # command, 630 deg/s, -13249 * 0.01 deg
+            "A417FEFF0000C7A1",  # its reply: 23 degC, -2 * 33/2048 A, 0 deg/s
+            "9200000000000000",  # asks for the position: no position of 0
+            "923ECCFFFFFFFFFF",  # its reply: -13250 * 0.01 deg
+            "9C1721007E00F355",  # motor state: 126 deg/s
+        )
+    ]
+    frames["dir"] = [DIR_TX, DIR_RX, DIR_TX, DIR_RX, DIR_RX]
+    samples, tally = decoder.decode(frames)
+    found = {sample.signal.quantity: (sample.rows.tolist(), sample.values) for sample in samples}
+    assert {quantity: rows for quantity, (rows, _) in found.items()} == {
+        "command": [0],
+        "position": [3],
+        "velocity": [1, 4],
+        "current": [1, 4],
+        "temperature": [1, 4],
+    }
+    assert found["command"][1] == pytest.approx(math.radians(-132.49), rel=1e-15)
+    assert found["position"][1] == pytest.approx(math.radians(-132.50), rel=1e-15)
+    assert found["velocity"][1] == pytest.approx([0, math.radians(126)], rel=1e-15)
+    assert found["current"][1].tolist() == [-2 * 33 / 2048, 33 * 33 / 2048]
+    assert found["temperature"][1].tolist() == [23, 23]
+    assert dict(tally.silent) == {"14B": 1}
+
+
+def test_without_directions_shared_identifiers_are_not_guessed():
+    frames = some_frames(2, 0x14B)
+    samples, tally = BusDecoder(load_robot("arcsnake-joint"), directions=False).decode(frames)
+    assert samples == ()
+    assert tally.problems() == [
+        (
+            "2 frames not decoded, since only their direction tells what they are and the log has "
+            "none: 14B (2)"
+        )
+    ]
+
+
+def test_without_directions_an_identifier_of_one_direction_is_decoded():
+    frames = some_frames(1, 0x101, dlc=2)
+    frames["data"][:, :2] = [0xE8, 0x03]
+    robot = load_robot("snake25")
+    assert BusDecoder(robot).decode(frames)[0] == ()
+    ((sample,), _) = BusDecoder(robot, directions=False).decode(frames)
+    assert sample.values == pytest.approx(math.radians(10), rel=1e-15)
+
+
+def test_a_robot_without_a_bus():
+    with pytest.raises(DataError, match="snake13 has no bus map"):
+        BusDecoder(load_robot("snake13"))

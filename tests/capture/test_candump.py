@@ -1,0 +1,124 @@
+"""The candump format, against its definition in can-utils and against python-can."""
+
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from capture.candump import candump_lines, read_candump
+from capture.errors import ImportFormatError
+from capture.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+
+
+def read(path):
+    with path.open() as stream:
+        log = read_candump(path, stream)
+        blocks = list(log.blocks)
+    frames = np.concatenate([block.frames for block in blocks])
+    return log, frames, np.concatenate([block.bus for block in blocks])
+
+
+def written(text, path, **options):
+    path.write_text(text)
+    log, frames, bus = read(path)
+    options.setdefault("directions", log.directions)
+    return "".join(candump_lines(frames, log.buses, bus, **options))
+
+
+HEX = st.binary(max_size=8).map(lambda data: data.hex().upper())
+CONTENT = st.one_of(
+    st.builds("{:03X}#{}".format, st.integers(0, 0x7FF), HEX),
+    st.builds("{:08X}#{}".format, st.integers(0, 0x1FFF_FFFF), HEX),
+    st.builds("{:08X}#{}".format, st.integers(0x2000_0000, 0x2000_01FF), HEX),
+    st.builds("{:03X}#R{}".format, st.integers(0, 0x7FF), st.sampled_from(["", *"12345678"])),
+    st.builds("{:03X}#{}_{}".format, st.just(5), st.just("00" * 8), st.sampled_from("9ABCDEF")),
+)
+TIME = st.builds("{}.{:06d}".format, st.integers(0, 4_102_444_800), st.integers(0, 999_999))
+LOG = st.lists(st.tuples(TIME, st.sampled_from(["can0", "vcan1"]), CONTENT), min_size=1)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(lines=LOG, ways=st.none() | st.lists(st.sampled_from("RT"), min_size=1))
+def test_what_is_read_is_written_the_same(lines, ways, tmp_path):
+    text = "".join(
+        f"({time}) {bus} {content}{'' if ways is None else ' ' + ways[i % len(ways)]}\n"
+        for i, (time, bus, content) in enumerate(lines)
+    )
+    assert written(text, tmp_path / "x.log") == text
+
+
+def test_frames_of_every_kind(tmp_path: Path):
+    path = tmp_path / "x.log"
+    path.write_text(
+        "(1717639553.000022) can0 14B#9B01 T\n"
+        "(1717639553.000023) can1 18FEF100#0102030405060708 R\n"
+        "(1717639553.000024) can0 7FF#R4 R\n"
+        "(1717639553.000025) can0 20000080#0000000000000100 R\n"
+        "(1717639553.000026123) can0 001#\n"
+    )
+    log, frames, bus = read(path)
+    assert log.buses == ["can0", "can1"]
+    assert bus.tolist() == [0, 1, 0, 0, 0]
+    assert frames["t_host_ns"].tolist() == [
+        *(1717639553_000022000 + 1000 * i for i in range(4)),
+        1717639553_000026123,
+    ]
+    assert not frames["t_device_ns"].any()
+    assert frames["id_flags"].tolist() == [
+        0x14B,
+        0x18FEF100 | EXTENDED_FLAG,
+        0x7FF | REMOTE_FLAG,
+        0x80 | ERROR_FLAG,
+        1,
+    ]
+    assert frames["dlc"].tolist() == [2, 8, 4, 8, 0]
+    assert frames["dir"].tolist() == [DIR_TX, DIR_RX, DIR_RX, DIR_RX, DIR_RX]
+    assert frames["data"][0].tolist() == [0x9B, 1, 0, 0, 0, 0, 0, 0]
+    assert log.problems == ["1 frames without a direction, unlike the first one"]
+
+
+def test_python_can_reads_what_is_written(tmp_path: Path):
+    text = "".join(
+        f"(1717639553.{i:06d}) can0 {i % 0x800:03X}#{i:016X} {'RT'[i % 2]}\n" for i in range(500)
+    )
+    (tmp_path / "y.log").write_text(written(text, tmp_path / "x.log"))
+    messages = list(can.CanutilsLogReader(tmp_path / "y.log"))
+    assert [round(m.timestamp * 1e6) - 1717639553_000000 for m in messages] == list(range(500))
+    assert [bytes(m.data) for m in messages] == [i.to_bytes(8, "big") for i in range(500)]
+    assert [m.is_rx for m in messages] == [i % 2 == 0 for i in range(500)]
+
+
+def test_can_fd_frames_are_counted(tmp_path: Path):
+    path = tmp_path / "x.log"
+    path.write_text("(1.000000) can0 001#00\n(1.000001) can0 001##1" + "00" * 64 + "\n")
+    log, frames, _ = read(path)
+    assert len(frames) == 1
+    assert log.problems == ["1 CAN FD frames left out: only classic frames are kept"]
+
+
+def test_a_cut_last_line_is_told(tmp_path: Path):
+    path = tmp_path / "x.log"
+    path.write_text("(1.000000) can0 001#00 R\n(1.000001) can0 001#0")
+    log, frames, _ = read(path)
+    assert len(frames) == 1
+    assert log.problems == ["the last line is cut short and left out: '(1.000001) can0 001#0'"]
+
+
+@pytest.mark.parametrize(
+    "line", ["(1.0) can0 1234#00", "nonsense", "(1.0) can0 123#0G", "(x) c 1#"]
+)
+def test_a_wrong_line_is_named(line, tmp_path: Path):
+    path = tmp_path / "x.log"
+    path.write_text(f"(1.000000) can0 001#00\n\n{line}\n(1.000000) can0 001#00\n")
+    with pytest.raises(ImportFormatError, match=r"x\.log: line 3 is no candump line: "):
+        read(path)
+
+
+def test_another_format_is_refused(tmp_path: Path):
+    path = tmp_path / "x.log"
+    path.write_text("Jan 1 kernel: hello\n")
+    with pytest.raises(ImportFormatError, match="is not a candump log; its first line is 'Jan 1"):
+        read(path)

@@ -1,0 +1,330 @@
+"""Robot descriptions: the shipped ones, and every kind of fault in others."""
+
+import math
+from pathlib import Path
+
+import cantools
+import pytest
+
+from capture import load_robot, robot_names
+from capture.errors import RobotFileError, UsageError
+from capture.robot import ClockDomain, Direction, Plane, Quantity, SensorKind, Servo
+from capture.robot_file import parse_robot
+
+MINIMAL = """
+name = "worm"
+clock = "host"
+joints = [{ name = "joint01", plane = "horizontal" }, { name = "joint02", plane = "vertical" }]
+
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+"""
+
+DBC = """VERSION ""
+
+BU_: a b
+
+BO_ 291 state: 8 a
+ SG_ angle : 0|16@1- (0.01,0) [0|0] "deg" b
+ SG_ speed : 16|16@1- (1,0) [0|0] "deg/s" b
+"""
+
+
+def faults_of(text, databases=None):
+    with pytest.raises(RobotFileError) as caught:
+        parse_robot(text, "worm.toml", databases or {})
+    return str(caught.value).splitlines()
+
+
+def test_shipped_robots_are_listed():
+    assert robot_names() == ("arcsnake-joint", "snake13", "snake25")
+
+
+def test_snake25_is_the_robot_of_the_paper():
+    robot = load_robot("snake25")
+    assert len(robot.links) == 26
+    assert robot.joint_names == tuple(f"joint{i:02d}" for i in range(1, 26))
+    planes = [joint.plane for joint in robot.joints]
+    assert planes == [Plane.HORIZONTAL if i % 2 == 0 else Plane.VERTICAL for i in range(25)]
+    assert [planes.count(plane) for plane in Plane] == [13, 12]
+    lower, upper = robot.limits()
+    assert lower == pytest.approx(-math.pi / 6, abs=0)
+    assert upper == pytest.approx(math.pi / 6, abs=0)
+    assert {(k.length, k.radius, k.mass, k.inertia) for k in robot.links} == {
+        (0.06, 0.025, 0.1, (4e-5, 5e-5, 5e-5))
+    }
+    assert {joint.servo for joint in robot.joints} == {Servo()}
+    assert robot.joints[0].servo.resistance_ohm == 4.0
+    kinds = [sensor.kind for sensor in robot.sensors]
+    assert [kinds.count(kind) for kind in SensorKind] == [15, 1, 1, 1]
+    assert {s.range_max for s in robot.sensors if s.kind is SensorKind.IR} == {1.5}
+    assert {s.name: s.axes for s in robot.sensors if s.axes} == {
+        "accelerometer": ("x", "y", "z"),
+        "compass": ("x", "y"),
+    }
+    assert all({"link", "position"} <= set(sensor.assumed) for sensor in robot.sensors)
+    assert [s.topic for s in robot.sensors] == [
+        *(f"/ir/{i:02d}" for i in range(1, 16)),
+        "/sonar",
+        "/imu",
+        "/compass",
+    ]
+    assert robot.assumed == ("links", "servo", "bus")
+
+
+def test_snake25_has_one_command_and_one_state_frame_a_servo():
+    robot = load_robot("snake25")
+    assert robot.bus is not None
+    for name in robot.joint_names:
+        own = [signal for signal in robot.bus.signals if signal.target == name]
+        assert {(s.message, s.direction) for s in own} == {
+            (f"{name}_command", Direction.TX),
+            (f"{name}_state", Direction.RX),
+        }
+        assert {s.quantity for s in own} >= {Quantity.COMMAND, Quantity.POSITION}
+    sensed = {(s.target, s.axis) for s in robot.bus.signals if not s.target.startswith("joint")}
+    assert len(sensed) == 15 + 1 + 3 + 2
+    database = cantools.database.load_string(robot.databases[0][1], "dbc", strict=True)
+    assert len({message.frame_id for message in database.messages}) == 25 + 25 + 4 + 2
+    assert not any(message.is_extended_frame for message in database.messages)
+
+
+def test_snake13_has_six_joints_a_plane():
+    robot = load_robot("snake13")
+    assert (len(robot.links), len(robot.joints)) == (13, 12)
+    assert [len(robot.joint_indices(plane)) for plane in Plane] == [6, 6]
+    assert robot.clock is ClockDomain.SIMULATED
+
+
+def test_arcsnake_databases_load_strictly_and_share_one_identifier():
+    robot = load_robot("arcsnake-joint")
+    assert robot.bus is not None
+    assert robot.bus.databases == ("rmd-x8-request.dbc", "rmd-x8-reply.dbc")
+    ids = []
+    for _, text in robot.databases:
+        database = cantools.database.load_string(text, "dbc", strict=True)
+        ids += [message.frame_id for message in database.messages]
+    assert ids == [0x14B, 0x14B]
+
+
+@pytest.mark.parametrize("name", ["arcsnake-joint", "snake13", "snake25"])
+def test_a_robot_is_whole_again_from_what_a_session_carries(name):
+    robot = load_robot(name)
+    assert parse_robot(robot.toml, "session.mcap", dict(robot.databases)) == robot
+
+
+def test_a_description_may_leave_out_what_has_a_default():
+    robot = parse_robot(MINIMAL, "worm.toml", {})
+    assert [link.name for link in robot.links] == ["link01", "link02", "link03"]
+    assert robot.joints[0].servo == Servo()
+    assert (robot.description, robot.sensors, robot.bus, robot.assumed) == ("", (), None, ())
+
+
+def test_entries_override_the_defaults():
+    text = MINIMAL.replace(
+        'plane = "vertical"',
+        'plane = "vertical", upper = 1.0, servo = { stall_torque = 0.25 }',
+    )
+    robot = parse_robot(text + "[defaults.servo]\nsupply_v = 12\n", "worm.toml", {})
+    assert (robot.joints[0].upper, robot.joints[1].upper) == (math.pi / 6, 1.0)
+    assert robot.joints[1].servo == Servo(supply_v=12.0, stall_torque=0.25)
+
+
+def test_all_faults_are_listed_at_once():
+    text = """
+name = "my robot"
+clok = "host"
+joints = [
+  { name = "joint01", plane = "horizontl", upper = -1.0 },
+  { name = "joint01", plane = "vertical", speed = 3 },
+]
+
+[defaults.link]
+length = 0.06
+radius = "thick"
+mass = -0.1
+inertia = [4e-5, 5e-5, 1e-4]
+
+[defaults.joint]
+max_velocity = true
+
+[defaults.sonar]
+range_max = 4.0
+
+[[sensors]]
+name = "ir01"
+kind = "ir"
+link = "link9"
+position = [0.0, 0.0]
+range_min = 2.0
+range_max = 1.5
+field_of_view = 0.1
+assumed = ["postion"]
+"""
+    assert faults_of(text) == [
+        "worm.toml: 16 faults in this robot description",
+        (
+            '  name: found "my robot"; valid: a name of letters, digits, _ and -, beginning with a '
+            "letter"
+        ),
+        "  clock: found nothing; valid: host, device, simulated",
+        (
+            '  joints[0].plane: found "horizontl"; valid: horizontal, vertical (did you mean '
+            "horizontal?)"
+        ),
+        "  defaults.joint.max_velocity: found true; valid: a finite number > 0",
+        "  joints[0].upper: found -1; valid: more than lower = -0.523599",
+        (
+            "  joints[1].speed: found an unknown key; valid: name, plane, lower, upper, "
+            "max_velocity, servo"
+        ),
+        '  defaults.link.radius: found "thick"; valid: a finite number > 0',
+        "  defaults.link.mass: found -0.1; valid: a finite number > 0",
+        (
+            "  defaults.link.inertia: found [4e-05, 5e-05, 0.0001]; valid: moments of which none "
+            "exceeds the sum of the other two"
+        ),
+        '  sensors[0].link: found "link9"; valid: link01, link02, link03 (did you mean link03?)',
+        "  sensors[0].position: found [0.0, 0.0]; valid: an array of 3 finite numbers",
+        "  sensors[0].range_max: found 1.5; valid: more than range_min = 2",
+        (
+            '  sensors[0].assumed[0]: found "postion"; valid: link, position, rpy, range_min, '
+            "range_max, field_of_view (did you mean position?)"
+        ),
+        "  defaults.sonar: found a table; valid: leave it out: no sensor is of kind sonar",
+        "  joints and sensors: found 2 times joint01; valid: every name once",
+        (
+            "  clok: found an unknown key; valid: defaults, name, description, clock, assumed, "
+            "joints, links, sensors, bus (did you mean clock?)"
+        ),
+    ]
+
+
+BUS = """
+[bus]
+databases = ["worm.dbc"]
+bitrate = 500_000
+signals = [
+  { message = "state", signal = "angle", direction = "rx", target = "joint01", quantity = "position", unit = "deg" },
+]
+"""  # noqa: E501  TOML has inline tables on one line
+
+
+def test_a_bus_map_is_read():
+    robot = parse_robot(MINIMAL + BUS, "worm.toml", {"worm.dbc": DBC, "other.dbc": "?"})
+    assert robot.bus is not None
+    (signal,) = robot.bus.signals
+    assert (signal.message, signal.signal, signal.target) == ("state", "angle", "joint01")
+    assert (signal.direction, signal.quantity) == (Direction.RX, Quantity.POSITION)
+    assert robot.databases == (("worm.dbc", DBC),)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        (
+            '"state"',
+            '"sate"',
+            '  bus.signals[0].message: found "sate"; valid: state (did you mean state?)',
+        ),
+        (
+            '"angle"',
+            '"angel"',
+            (
+                '  bus.signals[0].signal: found "angel"; valid: a signal of state: angle, speed '
+                "(did you mean angle?)"
+            ),
+        ),
+        ('"rx"', '"in"', '  bus.signals[0].direction: found "in"; valid: tx, rx'),
+        (
+            '"joint01"',
+            '"joint03"',
+            (
+                '  bus.signals[0].target: found "joint03"; valid: joint01, joint02, {joint} '
+                "(did you mean joint02?)"
+            ),
+        ),
+        (
+            '"position"',
+            '"range"',
+            (
+                '  bus.signals[0].quantity: found "range"; valid: what joint01 has: command, '
+                "position, velocity, effort, current, voltage, temperature"
+            ),
+        ),
+        (
+            '"deg"',
+            '"dgr"',
+            (
+                '  bus.signals[0].unit: found "dgr"; valid: for position: rad, mrad, deg, rev '
+                "(did you mean deg?)"
+            ),
+        ),
+        (
+            'unit = "deg"',
+            'unit = "deg", scale = 0',
+            "  bus.signals[0].scale: found 0; valid: a finite number other than 0",
+        ),
+        (
+            'unit = "deg"',
+            'unit = "deg", axis = "x"',
+            '  bus.signals[0].axis: found "x"; valid: leave it out: the target has no axes',
+        ),
+        (
+            '"worm.dbc"',
+            '"../worm.dbc"',
+            (
+                "  bus.databases: ../worm.dbc: found no such file; valid: the name of a DBC file "
+                "that lies beside the description"
+            ),
+        ),
+        ("500_000", "0", "  bus.bitrate: found 0; valid: a whole number >= 1"),
+    ],
+)
+def test_faults_of_a_bus_map(old, new, fault):
+    lines = faults_of(MINIMAL + BUS.replace(old, new), {"worm.dbc": DBC})
+    assert fault in lines
+
+
+def test_a_faulty_database_is_one_fault_and_not_one_a_signal():
+    lines = faults_of(MINIMAL + BUS, {"worm.dbc": DBC.replace("16|16", "60|16")})
+    assert lines == [
+        "worm.toml: 1 fault in this robot description",
+        (
+            "  bus.databases: worm.dbc: found The signal speed does not fit in message state.; "
+            "valid: a DBC without overlaps"
+        ),
+    ]
+
+
+def test_syntax_errors_name_the_place():
+    lines = faults_of('name = "worm\n')
+    assert len(lines) == 2
+    assert "line 1" in lines[1]
+
+
+def test_unequal_numbers_of_links_and_joints():
+    text = MINIMAL.replace("joints =", 'links = [{ name = "link01" }]\njoints =')
+    assert "  links: found 1; valid: 3, one more than joints" in faults_of(text)
+
+
+def test_a_robot_file_finds_its_databases_beside_it(tmp_path: Path):
+    (tmp_path / "worm.toml").write_text(MINIMAL + BUS)
+    (tmp_path / "worm.dbc").write_bytes(DBC.replace('"deg"', '"°"').encode("cp1252"))
+    robot = load_robot(tmp_path / "worm.toml")
+    assert "°" in robot.databases[0][1]
+
+
+def test_an_unknown_robot_is_wrong_usage():
+    with pytest.raises(UsageError, match=r"no robot 'snak25'.*did you mean snake25\?"):
+        load_robot("snak25")
+
+
+def test_a_file_that_is_not_text(tmp_path: Path):
+    path = tmp_path / "worm.toml"
+    path.write_bytes(b"name = '\xff'")
+    with pytest.raises(RobotFileError, match="not UTF-8"):
+        load_robot(path)
