@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from .errors import UsageError
@@ -34,29 +35,35 @@ def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str,
     Returns:
         Message name to message, None if a database could not be read.
     """
-    from cantools.database import load_string
-    from cantools.database.can import Database
     from cantools.database.errors import UnsupportedDatabaseFormatError
 
     messages: dict[str, Message] = {}
     readable = True
     for name, text in databases.items():
         try:
-            database = load_string(text, database_format="dbc", strict=True)
+            found = _messages(text)
         except UnsupportedDatabaseFormatError as error:
             faults.add(f"bus.databases: {name}", str(error.e_dbc), "a DBC without overlaps")
             readable = False
             continue
-        if isinstance(database, Database):
-            for message in database.messages:
-                if message.name in messages:
-                    faults.add(
-                        f"bus.databases: {name}",
-                        f"a second message {message.name}",
-                        "message names that are unique in all databases together",
-                    )
-                messages[message.name] = message
+        for message in found:
+            if message.name in messages:
+                faults.add(
+                    f"bus.databases: {name}",
+                    f"a second message {message.name}",
+                    "message names that are unique in all databases together",
+                )
+            messages[message.name] = message
     return messages if readable else None
+
+
+@lru_cache(maxsize=16)  # every session of a robot carries the same databases
+def _messages(text: str) -> tuple[Message, ...]:
+    from cantools.database import load_string
+    from cantools.database.can import Database
+
+    database = load_string(text, database_format="dbc", strict=True)
+    return tuple(database.messages) if isinstance(database, Database) else ()
 
 
 def read_bus(

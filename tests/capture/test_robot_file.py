@@ -328,3 +328,43 @@ def test_a_file_that_is_not_text(tmp_path: Path):
     path.write_bytes(b"name = '\xff'")
     with pytest.raises(RobotFileError, match="not UTF-8"):
         load_robot(path)
+
+
+def test_message_names_must_be_unique_in_all_databases_together():
+    text = MINIMAL + BUS.replace('["worm.dbc"]', '["worm.dbc", "again.dbc"]')
+    assert faults_of(text, {"worm.dbc": DBC, "again.dbc": DBC})[1:] == [
+        (
+            "  bus.databases: again.dbc: found a second message state; valid: message names that "
+            "are unique in all databases together"
+        )
+    ]
+
+
+def test_a_repeated_map_entry_is_a_fault():
+    entry = BUS.splitlines()[5]
+    lines = faults_of(MINIMAL + BUS.replace(entry, f"{entry}\n{entry}"), {"worm.dbc": DBC})
+    assert lines[1:] == [
+        (
+            "  bus.signals[1].signal: found a repeated entry; valid: one entry a signal, target "
+            "and quantity"
+        )
+    ]
+
+
+def test_vector_sensors_need_their_axes_on_the_bus():
+    sensor = """
+[[sensors]]
+name = "compass"
+kind = "compass"
+link = "link01"
+position = [0, 0, 0]
+axes = ["x", "y"]
+"""
+    entry = BUS.replace("joint01", "compass").replace("position", "magnetic_field")
+    entry = entry.replace('"deg"', '"uT"')
+    lines = faults_of(MINIMAL + sensor + entry, {"worm.dbc": DBC})
+    assert lines[1:] == ["  bus.signals[0].axis: found nothing; valid: x, y"]
+    good = entry.replace('"uT"', '"uT", axis = "y"')
+    robot = parse_robot(MINIMAL + sensor + good, "worm.toml", {"worm.dbc": DBC})
+    assert robot.bus is not None
+    assert robot.bus.signals[0].axis == "y"
