@@ -38,11 +38,13 @@ class Group:
     Attributes:
         layout: The layout.
         log_ns: Log times, one array a block.
+        order: Place of each message among all of the topic, in file order, one array a block.
         columns: Leaf path to values, one array of shape (n, count) a block.
     """
 
     layout: Layout
     log_ns: list[IntArray] = field(default_factory=list[IntArray])
+    order: list[IntArray] = field(default_factory=list[IntArray])
     columns: dict[str, list[NDArray[Any]]] = field(default_factory=dict[str, list[NDArray[Any]]])
 
     def times(self) -> IntArray:
@@ -164,7 +166,7 @@ def message_blocks(
             if not any(map(len, found)):
                 continue
             data, base = log_file.payload(block)
-            found = [offsets + base for offsets in found]
+            found = [np.sort(offsets) + base for offsets in found]  # file order
             _check(data, np.concatenate(found))
         except LogError as error:
             warn(f"{error}; its messages are missing")
@@ -194,6 +196,7 @@ class _GroupReader:
         self._type = request.message_type
         self._paths = None if request.paths is None else set(request.paths)
         self._by_length: dict[int, list[Group]] = {}
+        self._count = 0
         self.groups: list[Group] = []
         self.unread: list[Unread] = []
 
@@ -207,20 +210,22 @@ class _GroupReader:
             keep &= True if start is None else log_ns >= start
             keep &= True if stop is None else log_ns < stop
             offsets, log_ns = offsets[keep], log_ns[keep]
+        order = self._count + np.arange(len(offsets))
+        self._count += len(offsets)
         lengths = _gather(data, offsets + _LENGTH_AT, "<u8").astype(np.int64) - _FIXED_SIZE
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)
             records = _gather(data, offsets[rows] + _BODY_AT, f"V{max(length, 1)}")
             matrix = records.view(np.uint8).reshape(len(rows), -1)
-            self._add_matrix(matrix[:, :length], log_ns[rows])
+            self._add_matrix(matrix[:, :length], log_ns[rows], order[rows])
 
-    def _add_matrix(self, matrix: Matrix, log_ns: IntArray) -> None:
+    def _add_matrix(self, matrix: Matrix, log_ns: IntArray, order: IntArray) -> None:
         known = self._by_length.setdefault(matrix.shape[1], [])
         for group in known:
             fits = _fits(matrix, group.layout)
             if fits.any():
-                self._take(group, matrix[fits], log_ns[fits])
-                matrix, log_ns = matrix[~fits], log_ns[~fits]
+                self._take(group, matrix[fits], log_ns[fits], order[fits])
+                matrix, log_ns, order = matrix[~fits], log_ns[~fits], order[~fits]
             if not len(matrix):
                 return
         while len(matrix):
@@ -229,21 +234,21 @@ class _GroupReader:
                 group = Group(layout_of(self._type, example))
             except DataError as error:
                 self.unread.append(Unread(int(log_ns[0]), example, str(error)))
-                matrix, log_ns = matrix[1:], log_ns[1:]
+                matrix, log_ns, order = matrix[1:], log_ns[1:], order[1:]
                 continue
             # Text topics have a layout a message: don't hold every later message against each.
-            one_by_one = len(known) >= _MAX_LAYOUTS
             fits = np.zeros(len(matrix), dtype=bool)
             fits[0] = True
-            if not one_by_one:
+            if len(known) < _MAX_LAYOUTS:
                 fits = _fits(matrix, group.layout)
                 known.append(group)
             self.groups.append(group)
-            self._take(group, matrix[fits], log_ns[fits])
-            matrix, log_ns = matrix[~fits], log_ns[~fits]
+            self._take(group, matrix[fits], log_ns[fits], order[fits])
+            matrix, log_ns, order = matrix[~fits], log_ns[~fits], order[~fits]
 
-    def _take(self, group: Group, matrix: Matrix, log_ns: IntArray) -> None:
+    def _take(self, group: Group, matrix: Matrix, log_ns: IntArray, order: IntArray) -> None:
         group.log_ns.append(log_ns)
+        group.order.append(order)
         for path, leaf in group.layout.leaves.items():
             if self._paths is not None and path not in self._paths:
                 continue

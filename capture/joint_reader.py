@@ -17,13 +17,22 @@ from .signals import JointSignals
 from .topics import Topics, Window
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 """Field of a JointState to its unit, where the channel doesn't say otherwise."""
 
 _NS = 1_000_000_000
-_POLLED = {"/joint_states", "/joint_current", "/joint_voltage", "/joint_temperature"}
-"""Topics whose samples are taken joint by joint in the polling cycle."""
+_MEASURED = (
+    "/joint_states",
+    "/joint_velocity",
+    "/joint_effort",
+    "/joint_current",
+    "/joint_voltage",
+    "/joint_temperature",
+)
+OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
+    "/joint_commands": "/joint_command_offset"
+}
+"""Topic to the topic with its joints' times relative to the stamp: a bus goes joint by joint."""
 
 _SLACK_NS = 5 * _NS
 """How far a sampling time may lie from its log time before a window could miss it."""
@@ -49,7 +58,7 @@ class JointReader:
         self._topics = topics
         self._warn = warn
         self._shift_ns: int | None = None
-        self._offsets: JointSignals | None = None
+        self._offsets: dict[str, JointSignals] = {}
 
     def read(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window, chain: Sequence[str]
@@ -180,12 +189,13 @@ class JointReader:
     def _at_own_times(
         self, topic: str, names: Sequence[str], times: Sequence[IntArray]
     ) -> list[IntArray]:
-        if topic not in _POLLED or SAMPLE_OFFSET_TOPIC not in self._topics.channels:
+        offset_topic = OFFSET_TOPICS.get(topic)
+        if offset_topic not in self._topics.channels or offset_topic is None:
             return list(times)
-        if self._offsets is None:
-            key = (SAMPLE_OFFSET_TOPIC, "position")
-            self._offsets = self.read({key[0]: [key[1]]}, (None, None), ())[key]
-        offsets = self._offsets
+        if offset_topic not in self._offsets:
+            key = (offset_topic, "position")
+            self._offsets[offset_topic] = self.read({key[0]: [key[1]]}, (None, None), ())[key]
+        offsets = self._offsets[offset_topic]
         if all(not values.any() for values in offsets.values):
             return list(times)  # sampled together: keep the shared array
         own: list[IntArray] = []
@@ -194,7 +204,7 @@ class JointReader:
                 signal = offsets.signal(name)
                 own.append(own_times(t_ns, signal.t_ns, signal.values))
             else:
-                self._warn(f"{SAMPLE_OFFSET_TOPIC} has no {name}: its message stamps are used")
+                self._warn(f"{offset_topic} has no {name}: its message stamps are used")
                 own.append(t_ns)
         return own
 

@@ -7,6 +7,7 @@ whatever could not be read is said in ``warnings``.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Self
@@ -45,7 +46,6 @@ class Session:
         self._warnings = list(self._file.warnings)
         self._topics = Topics(self._file, self._warn)
         self._joints = JointReader(self.path, self._topics, self._warn)
-        self.robot: Robot | None = self._read_robot()
 
     @classmethod
     def open(cls, path: Path | str) -> Self:
@@ -122,6 +122,24 @@ class Session:
     def session_id(self) -> str:
         """The session's id, or the file's name for a log that has none."""
         return self._file.metadata.get("undulog", {}).get("session_id") or self.path.stem
+
+    @cached_property
+    def robot(self) -> Robot | None:
+        """The robot whose description is attached, or None."""
+        stored = self.attachments
+        if "robot.toml" not in stored:
+            return None
+        databases = {
+            name: data.decode("utf-8", "replace")
+            for name, data in stored.items()
+            if name.endswith(".dbc")
+        }
+        try:
+            text = stored["robot.toml"].decode()
+            return parse_robot(text, source=f"{self.path}:robot.toml", databases=databases)
+        except (RobotFileError, UnicodeDecodeError) as error:
+            self._warn(f"the attached robot description can't be used: {error}")
+            return None
 
     @property
     def verdict(self) -> str | None:
@@ -249,15 +267,16 @@ class Session:
             DataError: If the topic holds something else.
         """
         groups = self._groups(topic, ["data"], (None, None))
-        batches: list[tuple[int, FrameArray]] = []
+        batches: list[tuple[int, int, FrameArray]] = []
         for group in groups:
             data = group.values("data")
             if data.shape[1] % FRAME_DTYPE.itemsize or not group.layout.strings:
                 raise DataError(f"{self.path}: {topic} does not hold frames of 32 bytes")
-            for log_ns, row in zip(group.times().tolist(), data, strict=True):
-                batches.append((log_ns, frames_from_bytes(row.tobytes())))
-        batches.sort(key=lambda batch: batch[0])
-        return np.concatenate([empty_frames(0), *(frames for _, frames in batches)])
+            places = zip(group.times().tolist(), np.concatenate(group.order).tolist(), strict=True)
+            for (log_ns, order), row in zip(places, data, strict=True):
+                batches.append((log_ns, order, frames_from_bytes(row.tobytes())))
+        batches.sort(key=lambda batch: batch[:2])
+        return np.concatenate([empty_frames(0), *(frames for _, _, frames in batches)])
 
     # -- inside ----------------------------------------------------------------------------
 
@@ -274,22 +293,6 @@ class Session:
             why = found.unread[0].why
             self._warn(f"{topic}: {len(found.unread)} messages can't be read: {why}")
         return found.groups
-
-    def _read_robot(self) -> Robot | None:
-        stored = self.attachments
-        if "robot.toml" not in stored:
-            return None
-        databases = {
-            name: data.decode("utf-8", "replace")
-            for name, data in stored.items()
-            if name.endswith(".dbc")
-        }
-        try:
-            text = stored["robot.toml"].decode()
-            return parse_robot(text, source=f"{self.path}:robot.toml", databases=databases)
-        except (RobotFileError, UnicodeDecodeError) as error:
-            self._warn(f"the attached robot description can't be used: {error}")
-            return None
 
 
 def _frame(group: Group) -> pd.DataFrame:
