@@ -168,15 +168,13 @@ class Contact(NamedTuple):
     Attributes:
         velocity: Velocity of the contact points in the world [m/s], shape (3, n).
         tangent: World x and y of the tangential axes, shape (2, n).
-        penetration: Depth below the surface, 0 above it [m], shape (n,).
-        friction: Force along (tangential, normal) [N], shape (2, n).
+        depth: Of the contact points below the surface, negative above it [m], shape (n,).
         force: Force on the links in the world, at the contact points [N], shape (3, n).
     """
 
     velocity: FloatArray
     tangent: FloatArray
-    penetration: FloatArray
-    friction: FloatArray
+    depth: FloatArray
     force: FloatArray
 
 
@@ -214,6 +212,6 @@ def contact_law(ground: Ground | None, radius: FloatArray) -> ContactLaw:
         np.subtract(tx * along, ty * across, out=force[0])
         np.add(ty * along, tx * across, out=force[1])
         force[2] = normal
-        return Contact(at_point, tangent, np.maximum(depth, 0.0), friction, force)
+        return Contact(at_point, tangent, depth, force)
 
     return contact

@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from capture.arrays import FloatArray
-from capture.kinematics import rotation_from_quaternion
 from capture.robot import Robot
 
 from .body import BodyState
@@ -75,12 +75,12 @@ def joint_flows(steps: Sequence[Step], servos: Servos, dt: float) -> FloatArray:
     Returns:
         Energies [J], rows as :data:`JOINT_TERMS`, shape (9, m).
     """
-    rate = _middle([step.body.rate for step in steps])
-    speed = _middle([step.rotors.speed for step in steps])
-    acting = steps[:-1]
-    voltage = np.array([step.drive.voltage for step in acting])
-    viscous, coulomb, gear = np.array([step.drive.drag for step in acting]).swapaxes(0, 1)
-    mechanical = np.array([step.drive.torque for step in acting]) * rate
+    rates = np.array([step.body.rate for step in steps])
+    speeds = np.array([step.rotors.speed for step in steps])
+    rate, speed = _middle(rates), _middle(speeds)
+    acting = speeds[:-1]  # friction acts with the speed at the start of the step
+    mechanical = rate * np.array([step.drive.torque for step in steps[:-1]])
+    voltage = np.array([step.drive.voltage for step in steps[:-1]])
     current = servos.current(voltage, speed)
     electrical = voltage * current
     powers = (
@@ -90,9 +90,9 @@ def joint_flows(steps: Sequence[Step], servos: Servos, dt: float) -> FloatArray:
         electrical,
         np.maximum(electrical, 0.0),
         servos.resistance * current * current,
-        viscous * speed,
-        coulomb * speed,
-        gear * (speed - rate),
+        servos.viscous * acting * speed,
+        servos.friction(acting) * speed,
+        servos.gear_damping * (acting - rates[:-1]) * (speed - rate),
     )
     return dt * np.array(powers).sum(axis=1)
 
@@ -108,13 +108,15 @@ def ground_flows(steps: Sequence[Step], stiffness: float, dt: float) -> FloatArr
     Returns:
         Energies [J], as :data:`GROUND_TERMS`, shape (3,).
     """
-    velocity = _middle([step.contact.velocity for step in steps])
+    velocity = _middle(np.array([step.contact.velocity for step in steps]))
     acting = [step.contact for step in steps[:-1]]
-    slip = into_link_axes(np.array([c.tangent for c in acting]), velocity)
-    friction = -(np.array([c.friction for c in acting]) * slip).sum(axis=(0, 2))
-    spring = stiffness * np.array([c.penetration for c in acting])
-    damping = np.array([c.force[2] for c in acting]) - spring
-    return dt * np.array([friction[0], friction[1], -(damping * velocity[:, 2]).sum()])
+    tangent = np.array([contact.tangent for contact in acting])
+    force = np.array([contact.force for contact in acting])
+    along, across = (into_link_axes(tangent, force) * into_link_axes(tangent, velocity)).sum(
+        axis=(0, 2)
+    )
+    damping = force[:, 2] - stiffness * _pressed([contact.depth for contact in acting])
+    return -dt * np.array([along, across, (damping * velocity[:, 2]).sum()])
 
 
 class Ledger:
@@ -142,7 +144,7 @@ class Ledger:
         """
         self._servos = servos
         self._mass = np.array([link.mass for link in robot.links])
-        self._inertia = np.array([link.inertia for link in robot.links])
+        self._inertia = np.array([link.inertia for link in robot.links]).T
         self._gravity = gravity
         self._stiffness = stiffness
         self._dt = dt
@@ -174,17 +176,17 @@ class Ledger:
             Energies [J], as :data:`STORED_TERMS`, shape (5,).
         """
         body, rotors, servos = step.body, step.rotors, self._servos
-        rotation = rotation_from_quaternion(body.quaternion.T)
-        spin = np.einsum("nji,jn->ni", rotation, body.spin)  # in the links' own frames
-        twist = servos.gear_stiffness * (rotors.angle - body.angle) ** 2
+        spin = _into_link_frames(body.quaternion, body.spin)
+        twist = rotors.angle - body.angle
+        depth = _pressed(step.contact.depth)
         return np.array(
             [
-                0.5 * (self._mass * (body.velocity**2).sum(axis=0)).sum()
-                + 0.5 * (self._inertia * spin**2).sum(),
+                0.5
+                * (self._mass @ (body.velocity**2).sum(axis=0) + (self._inertia * spin**2).sum()),
                 -(self._gravity @ body.position) @ self._mass,
-                0.5 * self._stiffness * (step.contact.penetration**2).sum(),
-                0.5 * (servos.inertia * rotors.speed**2).sum(),
-                0.5 * twist.sum(),
+                0.5 * self._stiffness * (depth @ depth),
+                0.5 * servos.inertia @ rotors.speed**2,
+                0.5 * servos.gear_stiffness @ twist**2,
             ]
         )
 
@@ -208,7 +210,25 @@ class Ledger:
         return np.concatenate((joints, self._ground, stored, residuals))
 
 
-def _middle(values: Sequence[FloatArray]) -> FloatArray:
-    """Means of neighbours: k + 1 arrays to shape (k, ...)."""
-    series = np.array(values)
+def _middle(series: FloatArray) -> FloatArray:
+    """Means of neighbours in time, shape (k + 1, ...) to (k, ...)."""
     return 0.5 * (series[1:] + series[:-1])
+
+
+def _pressed(depth: ArrayLike) -> FloatArray:
+    """Compression of the ground: its depth where positive."""
+    return np.maximum(depth, 0.0)
+
+
+def _into_link_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+    """World vectors in the links' own frames, component first: v - 2w (u x v) + 2 u x (u x v)."""
+    u, w = quaternion[:3], quaternion[3]
+    turned = _cross(u, vector)
+    return vector - 2.0 * w * turned + 2.0 * _cross(u, turned)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return a[_NEXT] * b[_LAST] - a[_LAST] * b[_NEXT]
+
+
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]

@@ -75,7 +75,7 @@ class Scenario:
         servo_of: The same of single joints, by joint name.
         seed: Of the noise.
         epoch_s: Unix time at which the session starts [s].
-        physics_rate_hz: Steps a second, a multiple of :data:`CONTROL_RATE_HZ`.
+        physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
     """
 
     name: str

@@ -168,9 +168,9 @@ def _times(top: Table) -> dict[str, float]:
         top.fault("settle_s", f"at most duration_s = {duration_s:g}")
     rate, epoch_s = Scenario.physics_rate_hz, Scenario.epoch_s
     if "physics_rate_hz" in top:
-        rate = top.integer("physics_rate_hz", at_least=CONTROL_RATE_HZ)
-        if rate % CONTROL_RATE_HZ:
-            top.fault("physics_rate_hz", f"a multiple of {CONTROL_RATE_HZ}")
+        rate = top.integer("physics_rate_hz", at_least=2 * CONTROL_RATE_HZ)
+        if rate % (2 * CONTROL_RATE_HZ):  # whole steps in half a control period
+            top.fault("physics_rate_hz", f"a multiple of {2 * CONTROL_RATE_HZ}")
     if "epoch_s" in top:
         # Viewers misread stamps near zero, so not before 2001.
         epoch_s = top.integer("epoch_s", at_least=1_000_000_000)

@@ -1,7 +1,9 @@
 """The twin's samples, written to the log contract.
 
-All joints are sampled at the stamp, as no real servo bus can: ``/joint_sample_offset`` is zero,
-and says so, so that recordings of robot and twin are read alike. Time is simulated: nothing of
+All joints are sampled at the stamp, as no real servo bus can: ``/joint_sample_offset`` is there so
+that recordings of robot and twin are read alike, and it is zero. Position and velocity are those
+of the instant; effort, current and voltage are means over one control period around it, so that
+energies computed from the log are right (:mod:`sim.twin`). Time is simulated: nothing of
 the machine's clock enters the file, and the same scenario gives the same bytes.
 """
 
@@ -18,6 +20,7 @@ from capture.writer import SessionWriter
 
 from .ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario
+from .stability import warnings
 from .twin import Sample, Twin
 from .urdf import frame_origins, urdf
 
@@ -40,7 +43,8 @@ def session_facts(scenario: Scenario) -> Mapping[str, str]:
         "planned_duration_s": repr(scenario.duration_s),
         "settle_s": repr(scenario.settle_s),
         "physics_rate_hz": str(scenario.physics_rate_hz),
-        "joint_sampling": "all joints at the stamp",
+        "joint_sampling": "all joints at the stamp; effort, current and voltage are means over "
+        "one control period around it",
         "pybullet": version("pybullet"),
         "numpy": version("numpy"),
         "python": platform.python_version(),
@@ -87,6 +91,8 @@ class SessionLog:
         self._said: set[str] = set()
         self._t_ns = scenario.epoch_ns
         writer.string("/robot_description").write(self._t_ns, description)
+        for text in warnings(scenario):
+            self.say("warn", text)
         self.say("info", f"start of {scenario.name}, seed {scenario.seed}: {scenario.description}")
 
     def say(self, level: str, text: str) -> None:
@@ -107,7 +113,7 @@ class SessionLog:
             sample: The twin's sample.
         """
         t_ns = self._t_ns = self._scenario.epoch_ns + sample.tick * _TICK_NS
-        body, drive = sample.step.body, sample.step.drive
+        body, drive = sample.step.body, sample.drive
         truth = np.array([body.angle, body.rate, drive.torque])
         reported = truth + self._noise * self._random.standard_normal(truth.shape)
         self._commands.write(t_ns, sample.gait.command)

@@ -1,8 +1,9 @@
-"""Why a run blew up: which of its stiff parts the step was too long for.
+"""Is the physics step short enough for the stiff parts of a scenario?
 
 Each part is taken alone, as a spring or damper between two free masses stepped by the
 semi-implicit Euler rule, which is stable for omega dt < 2 (spring) and c dt / m < 2 (damper). The
-coupled robot has other bounds, so this ranks suspects; it proves nothing.
+coupled robot has other bounds, so this ranks suspects; it proves nothing. Too small a smoothing of
+friction does not blow up, since friction is bounded: it makes the robot tremble.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ def stability_numbers(scenario: Scenario) -> dict[str, float]:
         mass = min(link.mass for link in robot.links)
         mu = max(ground.mu_normal, ground.mu_tangential)
         g = math.hypot(*scenario.world.gravity)
+        # A sideways force at the contact point, r below the centre, also rolls the link.
+        roll = max(1 + part.mass * part.radius**2 / part.inertia[0] for part in robot.links)
         shares["world.ground.stiffness"] = ground.stiffness * dt**2 / mass / 4
         shares["world.ground.damping"] = ground.damping * dt / mass / 2
-        shares["world.ground.slip_speed"] = mu * g * dt / ground.slip_speed / 2
+        shares["world.ground.slip_speed"] = mu * g * roll * dt / ground.slip_speed / 2
     # Links turn about a joint with the inertia about their ends.
     link = min(min(part.inertia) + part.mass * part.length**2 / 4 for part in robot.links)
     for joint in robot.joints:
@@ -49,6 +52,22 @@ def stability_numbers(scenario: Scenario) -> dict[str, float]:
     return shares
 
 
+def warnings(scenario: Scenario) -> tuple[str, ...]:
+    """What is too stiff for the step.
+
+    Args:
+        scenario: The scenario.
+
+    Returns:
+        One sentence for each parameter beyond its stability range.
+    """
+    return tuple(
+        f"{_verdict(name, share, scenario)}: expect vibration or failure"
+        for name, share in stability_numbers(scenario).items()
+        if share > 1.0
+    )
+
+
 def likely_cause(scenario: Scenario) -> str:
     """Name the stiffest part.
 
@@ -58,10 +77,14 @@ def likely_cause(scenario: Scenario) -> str:
     Returns:
         A clause for an error message.
     """
-    name, share = max(stability_numbers(scenario).items(), key=lambda item: item[1])
+    shares = stability_numbers(scenario)
+    shares.pop("world.ground.slip_speed", None)  # friction is bounded
+    name, share = max(shares.items(), key=lambda item: item[1])
     if share < 0.5:
         return "no parameter is too stiff for the step: look at the gait and the start"
-    return (
-        f"likely cause: {name} is too stiff for steps of {1e3 / scenario.physics_rate_hz:g} ms "
-        f"(it uses {share:.2g} of its stability range); soften it or raise physics_rate_hz"
-    )
+    return f"likely cause: {_verdict(name, share, scenario)}; soften it or raise physics_rate_hz"
+
+
+def _verdict(name: str, share: float, scenario: Scenario) -> str:
+    step_ms = 1e3 / scenario.physics_rate_hz
+    return f"{name} is too stiff for steps of {step_ms:g} ms ({share:.2g} of its stability range)"

@@ -1,0 +1,111 @@
+"""The ground's law against closed forms and what friction may never do."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture.kinematics import rotation_from_quaternion
+from sim.contact import FrictionLaw, Ground, contact_law, friction_force, normal_force, tangents
+
+MU = np.array([[0.05], [0.5]])
+EPS = 0.01
+speeds = st.floats(-5, 5, allow_subnormal=False)
+angles = st.floats(-math.pi, math.pi)
+
+
+def test_normal_force_is_equation_7():
+    # F_n = -k p_z - d v_z at p_z = -1 mm, v_z = -0.02 m/s
+    force = normal_force(np.array([1e-3]), np.array([0.02]), 2000.0, 20.0)
+    assert force == pytest.approx([2000.0 * 1e-3 + 20.0 * 0.02])
+
+
+def test_normal_force_never_pulls_and_ends_at_the_surface():
+    depth = np.array([1e-3, 1e-3, 0.0, -1e-3])
+    rate = np.array([-0.2, 0.0, 5.0, 5.0])  # the first leaves fast enough to be pulled back
+    assert normal_force(depth, rate, 2000.0, 20.0).tolist() == [0.0, 2.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("law", FrictionLaw)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_along_one_axis_every_law_is_smoothed_coulomb(law, axis):
+    v = np.array([-2.0, -0.01, 0.0, 0.003, 1.0])
+    slip = np.zeros((2, 5))
+    slip[axis] = v
+    force = friction_force(slip, np.full(5, 3.0), MU, EPS, law)
+    np.testing.assert_allclose(force[axis], -MU[axis] * 3.0 * v / np.hypot(v, EPS), rtol=1e-14)
+    assert not force[1 - axis].any()
+
+
+@given(vt=speeds, vn=speeds, law=st.sampled_from(FrictionLaw))
+def test_friction_dissipates_and_stays_inside_its_bound(vt, vn, law):
+    slip = np.array([[vt], [vn]])
+    force = friction_force(slip, np.ones(1), MU, EPS, law)
+    assert float((force * slip).sum()) <= 0.0
+    share = np.abs(force / MU)[:, 0]
+    bound = share.max() if law is FrictionLaw.BOX else math.hypot(*share)
+    assert bound <= 1.0 + 1e-12
+
+
+@given(vt=speeds.filter(lambda v: abs(v) > 1), vn=speeds.filter(lambda v: abs(v) > 1))
+def test_the_ellipse_dissipates_most(vt, vn):
+    # Maximum dissipation: no force on the ellipse opposes this slip with more power.
+    slip = np.array([[vt], [vn]])
+    force = friction_force(slip, np.ones(1), MU, 1e-9, FrictionLaw.ELLIPSE)
+    around = np.linspace(0, 2 * np.pi, 3601)
+    others = MU * np.array([np.cos(around), np.sin(around)])
+    assert -(force * slip).sum() >= -(others * slip).sum(axis=0).min() - 1e-9
+
+
+@settings(max_examples=50)
+@given(roll=angles, pitch=st.floats(-1.5, 1.5), yaw=angles)
+def test_tangents_are_the_x_axes_laid_on_the_ground(roll, pitch, yaw):
+    half = np.array([roll, pitch, yaw]) / 2
+    (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
+    q = [sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy]
+    q += [cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy]
+    quaternion = np.array(q)
+    x_axis = rotation_from_quaternion(quaternion)[:2, 0]
+    expected = x_axis / np.linalg.norm(x_axis)
+    np.testing.assert_allclose(tangents(quaternion[:, None])[:, 0], expected, atol=1e-12)
+
+
+def test_a_vertical_link_has_no_tangent_and_no_fault():
+    upright = np.array([[0.5], [0.5], [0.5], [-0.5]])
+    assert not rotation_from_quaternion(upright[:, 0])[:2, 0].any()
+    assert not tangents(upright).any()
+
+
+@settings(max_examples=50)
+@given(turn=angles, yaw=angles, law=st.sampled_from(FrictionLaw), seed=st.integers(0, 99))
+def test_turning_everything_turns_the_forces(turn, yaw, law, seed):
+    random = np.random.default_rng(seed)
+    velocity, spin = random.normal(size=(2, 3, 1))
+    act = contact_law(Ground(law=law), np.array([0.025]))
+
+    def at(heading, by):
+        c, s = math.cos(by), math.sin(by)
+        matrix = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        quaternion = np.array([[0.0], [0.0], [math.sin(heading / 2)], [math.cos(heading / 2)]])
+        position = np.array([[0.0], [0.0], [0.024]])
+        return matrix, act(position, quaternion, matrix @ velocity, matrix @ spin).force
+
+    matrix, turned = at(yaw + turn, turn)
+    np.testing.assert_allclose(turned, matrix @ at(yaw, 0.0)[1], atol=1e-12)
+
+
+def test_a_spinning_link_slips_at_its_lowest_point():
+    # Rolling about x without moving: the contact point, r below, moves at omega x r = +y.
+    act = contact_law(Ground(), np.array([0.025]))
+    zero, level = np.zeros((3, 1)), np.array([[0.0], [0.0], [0.0], [1.0]])
+    found = act(np.array([[0.0], [0.0], [0.024]]), level, zero, np.array([[4.0], [0.0], [0.0]]))
+    assert found.velocity[:, 0] == pytest.approx([0.0, 4.0 * 0.025, 0.0])
+    assert found.force[1, 0] < 0.0
+
+
+def test_without_ground_there_is_no_force():
+    act = contact_law(None, np.array([0.025]))
+    level = np.array([[0.0], [0.0], [0.0], [1.0]])
+    assert not act(np.zeros((3, 1)), level, np.ones((3, 1)), np.ones((3, 1))).force.any()

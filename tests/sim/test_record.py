@@ -1,0 +1,311 @@
+"""Recordings of the twin: to the contract, the same bytes again, and whole however they end."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from capture import Session
+from capture.errors import OutputExistsError, SimulationError, UsageError
+from capture.interruption import StopRequest
+from capture.kinematics import link_poses, rotation_from_quaternion
+from sim import Ground, Noise, World, load_scenario, parse_scenario
+from sim.ledger import TERMS
+from sim.record import record
+from sim.twin import Twin
+from sim.urdf import urdf
+
+HUNDREDTH_NS = 10_000_000
+UNDULOG = (sys.executable, "-m", "undulog")
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return dataclasses.replace(
+        load_scenario("weak-servo-pi3").changed(duration_s=0.6), settle_s=0.3
+    )
+
+
+@pytest.fixture(scope="module")
+def recording(scenario, tmp_path_factory):
+    return record(scenario, tmp_path_factory.mktemp("record") / "run.mcap")
+
+
+@pytest.fixture
+def session(recording):
+    with Session.open(recording.path) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def truth(scenario):
+    with Twin(scenario) as twin:
+        return list(twin.samples())
+
+
+def columns(session, topic, field="position"):
+    return np.array(session.joints(topic, field).values).T
+
+
+def test_the_session_explains_itself(session, scenario, recording):
+    assert session.session_id == recording.session_id == scenario.session_id
+    assert session.robot == load_scenario("flat").robot  # the robot's file, as it is
+    assert parse_scenario(session.attachments["scenario.toml"].decode(), "x.toml") == scenario
+    assert session.attachments["robot.urdf"].decode() == urdf(scenario.robot)
+    facts = session.metadata["undulog"]
+    assert facts["settle_s"] == "0.3"
+    assert facts["seed"] == "1"
+    assert facts["clock.twin"] == "simulated"
+    assert facts["joint_sampling"].startswith("all joints at the stamp")
+    assert session.verdict == "good"
+    assert session.warnings == []
+
+
+def test_the_channels_are_those_of_the_contract(session):
+    units = {topic: channel.metadata.get("unit") for topic, channel in session.channels.items()}
+    assert units == {
+        "/joint_commands": "rad",
+        "/joint_states": "rad",
+        "/joint_sample_offset": "s",
+        "/joint_current": "A",
+        "/joint_voltage": "V",
+        "/gait": "rad, omega in rad/s",
+        "/gait/mode": None,
+        "/energy_ledger": "J",
+        "/odom": None,
+        "/tf": None,
+        "/robot_description": None,
+        "/rosout": None,
+    }
+    counts = {topic: channel.count for topic, channel in session.channels.items()}
+    assert counts["/joint_states"] == counts["/gait"] == counts["/odom"] == 61
+    assert counts["/tf"] == 13  # 20 Hz
+
+
+def test_joints_come_back_exactly(session, truth, scenario):
+    states = session.joints("/joint_states", "position")
+    assert states.names == scenario.robot.joint_names
+    expected = scenario.epoch_ns + HUNDREDTH_NS * np.arange(61)
+    assert all(np.array_equal(t, expected) for t in states.t_ns)
+    steps = [sample.step for sample in truth]
+    drives = [sample.drive for sample in truth]
+    for topic, field, values in (
+        ("/joint_commands", "position", [sample.gait.command for sample in truth]),
+        ("/joint_states", "position", [step.body.angle for step in steps]),
+        ("/joint_states", "velocity", [step.body.rate for step in steps]),
+        ("/joint_states", "effort", [drive.torque for drive in drives]),
+        ("/joint_current", "position", [drive.current for drive in drives]),
+        ("/joint_voltage", "position", [drive.voltage for drive in drives]),
+        ("/joint_sample_offset", "position", np.zeros((61, 25))),
+    ):
+        np.testing.assert_array_equal(columns(session, topic, field), values)
+
+
+def test_gait_and_ledger_come_back_by_name(session, truth):
+    gait = session.joints("/gait", "position")
+    assert gait.names == tuple(f"horizontal.{n}" for n in ("A", "omega", "lag", "offset", "phase"))
+    assert gait.signal("horizontal.lag").values[0] == pytest.approx(-np.pi / 3)
+    assert gait.signal("horizontal.phase").values[-1] == pytest.approx(2 * np.pi * 0.5 * 0.6)
+    ledger = session.joints("/energy_ledger", "position")
+    assert ledger.names == TERMS
+    assert [values[-1] for values in ledger.values] == truth[-1].energy.tolist()
+
+
+def test_odometry_and_transforms_agree_with_the_kinematics(session, scenario):
+    odometry = session.table("/odom")
+    angles = columns(session, "/joint_states")
+    last = odometry.iloc[-1]
+    position = last[[f"pose.pose.position.{a}" for a in "xyz"]].to_numpy(dtype=float)
+    quaternion = last[[f"pose.pose.orientation.{a}" for a in "xyzw"]].to_numpy(dtype=float)
+    turn = rotation_from_quaternion(quaternion)
+    centres, turns = link_poses(scenario.robot, position, turn, angles[-1])
+    _, message = list(session.messages("/tf"))[-1]
+    for i, frame in enumerate(message.transforms):
+        assert frame.child_frame_id == scenario.robot.links[i].name
+        # URDF has the frame of a rear link at the joint in front of it.
+        origin = centres[i] + (turns[i][:, 0] * 0.03 if i else 0.0)
+        at = frame.transform.translation
+        assert (at.x, at.y, at.z) == pytest.approx(tuple(origin), abs=2.0**-14)
+
+
+def test_odometry_twist_is_in_the_heads_frame(tmp_path, make_scenario, make_robot):
+    world = World(velocity=(0.0, 0.5, 0.0), heading=np.pi / 2)
+    path = tmp_path / "a.mcap"
+    record(make_scenario(make_robot(3), amplitude=0.0, duration_s=0.1, world=world), path)
+    with Session.open(path) as session:
+        first = session.table("/odom").iloc[0]
+    assert first["twist.twist.linear.x"] == pytest.approx(0.5)
+    assert first["twist.twist.linear.y"] == pytest.approx(0.0, abs=1e-15)
+
+
+def test_events_tell_the_story(session):
+    said = [message.msg for _, message in session.messages("/rosout")]
+    assert said[0].startswith("start of weak-servo-pi3, seed 1: ")
+    assert said[1:] == ["settled: 0.3 s have passed", "end at 0.6 s"]
+
+
+def test_clamps_limits_and_stiff_parts_are_said_once(tmp_path, make_scenario, make_robot):
+    stiff = World(ground=Ground(slip_speed=0.001))
+    path = tmp_path / "a.mcap"
+    scenario = make_scenario(
+        make_robot(9, limit=0.1), amplitude=0.4, frequency_hz=2.0, ramp_s=0.0, world=stiff
+    )
+    record(scenario, path)
+    with Session.open(path) as session:
+        said = [message.msg for _, message in session.messages("/rosout") if message.level == 30]
+    assert len(said) == len(set(said))
+    assert "horizontal.A clamped to the joint limits" in said
+    assert any("passed its limits -0.1 to 0.1 rad" in text for text in said)
+    assert any("world.ground.slip_speed is too stiff" in text for text in said)
+
+
+def test_noise_comes_from_the_seed_and_touches_only_reports(tmp_path, scenario, truth):
+    noisy = dataclasses.replace(scenario, noise=Noise(position=0.01))
+    found = {}
+    for seed in (1, 2):
+        path = tmp_path / f"{seed}.mcap"
+        record(noisy.changed(seed=seed), path)
+        with Session.open(path) as session:
+            found[seed] = columns(session, "/joint_states")
+            velocity = columns(session, "/joint_states", "velocity")
+            energy = columns(session, "/energy_ledger")
+    angles = np.array([sample.step.body.angle for sample in truth])
+    assert np.std(found[1] - angles) == pytest.approx(0.01, rel=0.05)
+    assert np.abs(np.corrcoef((found[1] - angles).ravel(), (found[2] - angles).ravel())[0, 1]) < 0.1
+    np.testing.assert_array_equal(velocity, [sample.step.body.rate for sample in truth])
+    np.testing.assert_array_equal(energy, [sample.energy for sample in truth])
+
+
+def undulog(*words, cwd, **options):
+    return subprocess.run(
+        [*UNDULOG, *words],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+        **options,
+    )
+
+
+def test_two_processes_write_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        # Another hash seed and another time zone must not matter either.
+        environment = os.environ | {"PYTHONHASHSEED": str(ord(name)), "TZ": f"XYZ{ord(name) % 10}"}
+        done = undulog(
+            *("sim", "run", "flat", "-o", f"{name}.mcap", "--duration", "0.5", "--seed", "3"),
+            cwd=tmp_path,
+            env=environment,
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        time.sleep(0.01)
+    first, second = ((tmp_path / f"{name}.mcap").read_bytes() for name in "ab")
+    assert len(first) > 10_000
+    assert first == second
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_killed_run_leaves_a_whole_session(tmp_path, number):
+    path = tmp_path / "killed.mcap"
+    process = subprocess.Popen(
+        [*UNDULOG, "sim", "run", "flat", "-o", str(path), "--duration", "3600"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while not (path.exists() and path.stat().st_size > 0):
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(1.0)
+    process.send_signal(number)
+    told, complained = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert complained == ""
+    assert told.startswith("stopped at ")
+    with Session.open(path) as session:
+        assert session.warnings == []
+        assert session.verdict == "degraded"
+        states = session.joints("/joint_states", "position")
+        said = [message.msg for _, message in session.messages("/rosout")]
+        assert len(states.values[0]) == session.channels["/energy_ledger"].count > 1
+        assert said[-1] == told.split(";")[0]
+    assert f"stopped at {(len(states.values[0]) - 1) / 100:g} s of 3600 s" == said[-1]
+
+
+def test_a_stop_request_ends_between_two_samples(tmp_path, scenario):
+    stop = StopRequest()
+
+    def ask(sample):
+        if sample.tick == 7:
+            stop.signal = signal.SIGTERM
+
+    found = record(scenario, tmp_path / "a.mcap", stop=stop, on_sample=ask)
+    assert (found.sample_count, found.duration_s, found.complete) == (8, 0.07, False)
+
+
+def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, make_scenario, make_robot):
+    path = tmp_path / "a.mcap"
+    scenario = make_scenario(
+        make_robot(5), ramp_s=0.0, world=World(ground=Ground(stiffness=1e7)), duration_s=2.0
+    )
+    with pytest.raises(SimulationError) as caught:
+        record(scenario, path)
+    with Session.open(path) as session:
+        assert session.verdict == "bad"
+        assert [message.msg for _, message in session.messages("/rosout")][-1] == str(caught.value)
+        assert session.channels["/joint_states"].count >= 1
+
+
+def test_nothing_is_overwritten_unasked(tmp_path, scenario):
+    path = tmp_path / "a.mcap"
+    path.write_text("mine")
+    with pytest.raises(OutputExistsError):
+        record(scenario, path)
+    assert path.read_text() == "mine"
+    assert record(scenario.changed(duration_s=0.05), path, force=True).complete
+
+
+def test_the_command_line_reports(tmp_path, capsys):
+    import undulog as front
+
+    path = tmp_path / "a.mcap"
+    words = ["sim", "run", "flat", "-o", str(path), "--duration", "0.2"]
+    assert front.run([*words, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["complete"] is True
+    assert report["samples"] == 21
+    assert report["settle_s"] == 0.2
+    assert set(report["energy_j"]) == set(TERMS)
+    assert front.run(words) == 2
+    assert "give --force" in capsys.readouterr().err
+    assert front.run([*words, "--force"]) == 0
+    assert capsys.readouterr().out.startswith(f"{path}: 0.2 s of flat\n")
+    assert front.run(["sim", "run", "flt", "-o", "b.mcap"]) == 2
+    assert "did you mean flat?" in capsys.readouterr().err
+    assert front.run(["sim", "run", "flat", "-o", "b.mcap", "--duration", "0"]) == 2
+
+
+def test_the_command_line_lists_the_scenarios(capsys):
+    import undulog as front
+
+    assert front.run(["sim", "list"]) == 0
+    text = capsys.readouterr().out
+    assert front.run(["sim", "list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert {"flat", "weak-servo-pi3"} <= {entry["name"] for entry in listed}
+    for entry in listed:
+        assert entry["name"] in text
+        assert entry["description"] in text
+
+
+def test_wrong_use_is_told_apart_from_failed_work(tmp_path):
+    with pytest.raises(UsageError):
+        load_scenario(tmp_path / "none.toml")

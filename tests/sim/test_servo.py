@@ -1,0 +1,79 @@
+"""The servo against the closed forms of a DC motor, and its passivity."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture.robot import Servo
+from sim.servo import Rotors, Servos
+
+
+def rotors(*speeds):
+    return Rotors(np.zeros(len(speeds)), np.array(speeds, dtype=float))
+
+
+def test_at_standstill_full_voltage_gives_the_stall_torque():
+    servos = Servos([Servo(stall_torque=0.25), Servo(stall_torque=1.5, torque_constant=0.7)])
+    still = np.zeros(2)
+    drive = servos.drive(np.full(2, 10.0), still, still, rotors(0, 0))
+    assert drive.voltage.tolist() == [6.0, 6.0]
+    assert servos.torque_constant * drive.current == pytest.approx([0.25, 1.5])
+
+
+def test_duty_is_proportional_then_saturated():
+    servos = Servos([Servo(proportional_gain=8.0)] * 3)
+    still = np.zeros(3)
+    drive = servos.drive(np.array([0.05, 0.2, -0.2]), still, still, rotors(0, 0, 0))
+    assert drive.voltage == pytest.approx([8 * 0.05 * 6, 6.0, -6.0])
+
+
+def test_a_free_rotor_speeds_up_as_a_first_order_lag():
+    # Jm om' = Kt u V / R - (b + Kt^2/R) om, no gear, no Coulomb friction.
+    servo = Servo(gear_stiffness=0.0, gear_damping=0.0, coulomb_friction=0.0)
+    servos, dt = Servos([servo]), 1e-5
+    drag = servo.viscous_friction + servo.torque_constant**2 / servo.resistance_ohm
+    final = servo.stall_torque / drag
+    state, zero, found = rotors(0.0), np.zeros(1), []
+    for _ in range(2000):
+        drive = servos.drive(np.array([1e3]), zero, zero, state)
+        state = servos.advance(state, drive, dt)
+        found.append(state.speed[0])
+    t = dt * np.arange(1, 2001)
+    expected = final * (1 - np.exp(-t * drag / servo.rotor_inertia))
+    np.testing.assert_allclose(found, expected, atol=1e-3 * final)
+
+
+def test_a_held_joint_winds_up_the_gear_to_the_motor_torque():
+    # Joint locked at 0, command 0.1: at rest k_g th = Kt Kp V 0.1 / R.
+    servo = Servo()
+    servos, state, zero = Servos([servo]), rotors(0.0), np.zeros(1)
+    for _ in range(3000):
+        drive = servos.drive(np.array([0.1]), zero, zero, state)
+        state = servos.advance(state, drive, 1e-3)
+    torque = servo.torque_constant * 8.0 * 0.1 * 6.0 / servo.resistance_ohm
+    assert drive.torque == pytest.approx([torque], rel=1e-9)
+    assert state.angle == pytest.approx([torque / servo.gear_stiffness], rel=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_no_more_energy_leaves_the_gear_than_enters_the_motor(seed):
+    # Passivity, Ke = Kt: whatever is commanded and however the joint is moved.
+    random = np.random.default_rng(seed)
+    servos, dt, m = Servos([Servo(stall_torque=0.25)] * 4), 1e-3, 4
+    state, angle = rotors(*np.zeros(m)), np.zeros(m)
+    entered, left = np.zeros(m), np.zeros(m)
+    for k in range(400):
+        if k % 40 == 0:
+            reference, rate = random.normal(size=(2, m))
+        drive = servos.drive(reference, angle, rate, state)
+        after = servos.advance(state, drive, dt)
+        middle = (state.speed + after.speed) / 2
+        entered += dt * drive.voltage * servos.current(drive.voltage, middle)
+        left += dt * drive.torque * rate
+        angle, state = angle + dt * rate, after
+    # What may be stored at most is stored: the rest must have been lost, never gained.
+    stored = servos.inertia * state.speed**2 / 2
+    stored += servos.gear_stiffness * (state.angle - angle) ** 2 / 2
+    assert (entered - left - stored > -1e-3 * np.abs(left)).all()
