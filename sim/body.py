@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 import sys
 from collections.abc import Generator, Sequence
-from itertools import chain
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -51,9 +50,9 @@ _AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
 _NO_SHAPE = -1
 _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
-_link_fields = itemgetter(0, 1, 6, 7)  # centre, orientation, velocity, angular velocity
-_joint_fields = itemgetter(0, 1)  # angle, rate
-_flatten = chain.from_iterable
+# Packing is the fastest way from the engine's nested tuples to an array, by a factor of two.
+_pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular velocity
+_pack_joint = struct.Struct("2d").pack  # angle, rate
 
 
 class BodyState(NamedTuple):
@@ -145,7 +144,6 @@ class Body:
                 physicsClientId=self._client,
             )
         self._joints = list(range(len(joints)))
-        self._count = len(links)
         pybullet.setJointMotorControlArray(
             self._body,
             self._joints,
@@ -170,19 +168,16 @@ class Body:
             Positions and velocities of links and joints.
         """
         client = self._client
-        head = (
-            *pybullet.getBasePositionAndOrientation(self._body, client),
-            *pybullet.getBaseVelocity(self._body, client),
-        )
-        n = self._count
+        position, turn = pybullet.getBasePositionAndOrientation(self._body, client)
+        velocity, spin = pybullet.getBaseVelocity(self._body, client)
         # Without the forward kinematics the poses would be one step old, here and in push().
         links = pybullet.getLinkStates(self._body, self._joints, 1, 1, client)
-        flat = _flatten(_flatten(chain((head,), map(_link_fields, links))))
-        fields = np.ascontiguousarray(np.fromiter(flat, np.float64, 13 * n).reshape(n, 13).T)
+        rows = [_pack_link(*link[0], *link[1], *link[6], *link[7]) for link in links]
+        rows.insert(0, _pack_link(*position, *turn, *velocity, *spin))
+        fields = _components(rows)
         joints = pybullet.getJointStates(self._body, self._joints, client)
-        flat = _flatten(map(_joint_fields, joints))
-        angles = np.ascontiguousarray(np.fromiter(flat, np.float64, 2 * n - 2).reshape(n - 1, 2).T)
-        return BodyState(fields[:3], fields[3:7], fields[7:10], fields[10:], angles[0], angles[1])
+        angle, rate = _components([_pack_joint(*joint[:2]) for joint in joints])
+        return BodyState(fields[:3], fields[3:7], fields[7:10], fields[10:], angle, rate)
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
         """Apply forces to the links during the next step.
@@ -211,3 +206,9 @@ class Body:
             physicsClientId=self._client,
         )
         pybullet.stepSimulation(self._client)
+
+
+def _components(rows: list[bytes]) -> FloatArray:
+    """Packed rows of k numbers as an array of shape (k, number of rows)."""
+    table = np.frombuffer(b"".join(rows)).reshape(len(rows), -1)
+    return np.ascontiguousarray(table.T)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from capture.console import emit_json, progress, refuse_existing
+from capture.errors import UsageError
 from capture.interruption import interruptible
 
 if TYPE_CHECKING:
@@ -63,6 +64,10 @@ def run(
     from .record import record
     from .scenario_file import load_scenario
 
+    if output.suffix != ".mcap":
+        raise UsageError(
+            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+        )
     chosen = load_scenario(scenario).changed(duration_s=duration, seed=seed)
     refuse_existing(output, force=force)
     start = time.monotonic()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from capture import Session
-from capture.errors import OutputExistsError, SimulationError, UsageError
+from capture.errors import OutputExistsError, SimulationError
 from capture.interruption import StopRequest
 from capture.kinematics import link_poses, rotation_from_quaternion
 from sim import Ground, Noise, World, load_scenario, parse_scenario
@@ -291,6 +291,8 @@ def test_the_command_line_reports(tmp_path, capsys):
     assert front.run(["sim", "run", "flt", "-o", "b.mcap"]) == 2
     assert "did you mean flat?" in capsys.readouterr().err
     assert front.run(["sim", "run", "flat", "-o", "b.mcap", "--duration", "0"]) == 2
+    assert front.run(["sim", "run", "flat", "-o", "b.csv"]) == 2
+    assert "name it b.mcap" in capsys.readouterr().err
 
 
 def test_the_command_line_lists_the_scenarios(capsys):
@@ -304,8 +306,3 @@ def test_the_command_line_lists_the_scenarios(capsys):
     for entry in listed:
         assert entry["name"] in text
         assert entry["description"] in text
-
-
-def test_wrong_use_is_told_apart_from_failed_work(tmp_path):
-    with pytest.raises(UsageError):
-        load_scenario(tmp_path / "none.toml")
