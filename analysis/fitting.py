@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from capture.arrays import BoolArray
+
 from .gait import (
     MIN_CYCLES,
     MIN_EXPLAINED,
@@ -85,16 +87,16 @@ def fit_gait(
         return _responses_only(responses, rhythm)
     usable = [one for one in commands.values() if _usable(one, rhythm.omega)]
     first = fit_at(usable, rhythm.omega, allowed_model(usable, rhythm.omega))
-    follows, astray = driven(first.fundamental, first.explained)
+    follows, astray = driven(first)
     names = [one.name for one in usable]
     amplitudes = dict(zip(names, np.abs(first.fundamental).tolist(), strict=True))
-    _warn_undriven(commands, [n for n, f in zip(names, follows, strict=True) if f], warn)
-    lost = [name for name, stray in zip(names, astray, strict=True) if stray]
-    if lost:
-        warn(
-            f"the commands of {', '.join(lost)} do not follow the common rhythm of "
-            f"{rhythm.omega / (2 * np.pi):.4g} Hz: their gain and lag are null"
-        )
+    _warn_undriven(
+        names=names,
+        held=~follows & ~astray,
+        astray=astray,
+        unusable=[name for name in commands if name not in names],
+        warn=warn,
+    )
     chosen = [one for one, follow in zip(usable, follows, strict=True) if follow]
     moved = tuple(one.name for one in chosen)
     answered = tuple(n for n in moved if n in responses and _usable(responses[n], rhythm.omega))
@@ -154,13 +156,22 @@ def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> No
     return Noise(noise.level[index], noise.dof[index], noise.covariance[index])
 
 
-def _warn_undriven(commands: Mapping[str, Series], follows: list[str], warn: Warn) -> None:
-    still = [
-        name for name, one in commands.items() if name not in follows and np.ptp(one.values) == 0
-    ]
-    if still:
-        count = f"{len(still)} joints are" if len(still) > 1 else "1 joint is"
-        warn(f"{count} held by a constant command, gain and lag null: {', '.join(still)}")
+def _warn_undriven(
+    *, names: list[str], held: BoolArray, astray: BoolArray, unusable: list[str], warn: Warn
+) -> None:
+    """Say once why joints have no gain and lag."""
+    reasons = (
+        ([n for n, chosen in zip(names, held, strict=True) if chosen], "held still by the command"),
+        (
+            [n for n, chosen in zip(names, astray, strict=True) if chosen],
+            "commanded something else than the common rhythm",
+        ),
+        (unusable, "commanded too seldom or too briefly"),
+    )
+    for joints, why in reasons:
+        if joints:
+            count = f"{len(joints)} joints are" if len(joints) > 1 else "1 joint is"
+            warn(f"{count} {why}, gain and lag are null: {', '.join(joints)}")
 
 
 def _no_gait(known: list[Series], rhythm: Rhythm | None, kind: str, duration_s: float) -> str:

@@ -72,8 +72,9 @@ def _longest_hold(series: Series) -> float:
     if series.count < 2:
         return 0.0
     changes = np.flatnonzero(np.diff(series.values) != 0) + 1
-    edges = np.concatenate(([0], changes, [series.count - 1]))
-    return float(np.max(np.diff(series.t_s[edges])))
+    first = np.concatenate(([0], changes))
+    last = np.concatenate((changes, [series.count])) - 1
+    return float(np.max(series.t_s[last] - series.t_s[first]))
 
 
 def _is_stale(series: Series) -> bool:
@@ -90,4 +91,4 @@ def _is_stale(series: Series) -> bool:
     travel = np.abs(series.values[4:] - series.values[:-4])
     fast = (travel > 0.5 * travel.max()) & (travel > 8 * resolution)
     repeats = (step == 0)[1:-2]
-    return bool(np.any(fast) and np.mean(repeats[fast]) > STALE_SHARE)
+    return bool(np.count_nonzero(repeats & fast) > STALE_SHARE * np.count_nonzero(fast))

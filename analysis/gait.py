@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray
+from capture.arrays import BoolArray, ComplexArray
 from capture.errors import DataError
 
-from .harmonic import HarmonicModel, fit_shared
+from .harmonic import HarmonicFit, HarmonicModel, fit_shared
 from .series import Series
 
 MIN_CYCLES = 3.0
@@ -27,7 +27,7 @@ NYQUIST_SHARE = 0.45
 """Highest harmonic as a share of the sampling rate; half would be the limit."""
 
 DRIVEN_SHARE = 0.01
-"""A joint whose command moves less than this share of the largest is not driven."""
+"""A joint whose command moves less than this share of the liveliest is held still."""
 
 _SCOUTS = 4
 """Channels that the first search looks at: the livelier ones."""
@@ -93,20 +93,20 @@ def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> Har
     return HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)), trend=trend)
 
 
-def driven(amplitudes: ComplexArray, explained: FloatArray) -> tuple[BoolArray, BoolArray]:
+def driven(fit: HarmonicFit) -> tuple[BoolArray, BoolArray]:
     """Which joints the gait drives.
 
     Args:
-        amplitudes: Fundamentals of the commands, shape (m,).
-        explained: Share of each command's variance that the rhythm explains, shape (m,).
+        fit: Of the m commands at the gait's frequency.
 
     Returns:
-        Driven joints, and joints that are commanded something else than the common rhythm,
-        each of shape (m,).
+        Joints that are driven, and joints that are commanded something else than the common
+        rhythm, each of shape (m,); the others are held still.
     """
-    size = np.abs(amplitudes)
+    # Amplitude of a sine of the same variance.
+    size = np.sqrt(2 * fit.total / fit.count)
     lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
-    follows = explained >= MIN_EXPLAINED
+    follows = fit.explained >= MIN_EXPLAINED
     return lively & follows, lively & ~follows
 
 

@@ -1,0 +1,163 @@
+"""Is there a gait, where is it steady, and when has it settled?"""
+
+import numpy as np
+import pytest
+
+from analysis.fitting import fit_gait
+from analysis.gait import driven, find_rhythm, phase_step, wave_name
+from analysis.harmonic import fit_at, fit_shared
+from analysis.series import Series
+from analysis.settling import worst_drift
+from analysis.windows import Stretch, covered, settled, steady_runs, whole_cycles
+
+
+def channels(make, count=4, duration=10.0, rate=100.0):
+    t = np.arange(round(duration * rate)) / rate
+    return [Series(f"j{i}", t, make(t, i)) for i in range(count)]
+
+
+@pytest.mark.parametrize("frequency", [0.31, 0.5, 1.7, 9.3])
+def test_a_rhythm_is_found_wherever_it_is(frequency):
+    omega = 2 * np.pi * frequency
+    rhythm = find_rhythm(channels(lambda t, i: np.sin(omega * t - i)), 10.0)
+    assert rhythm.omega == pytest.approx(omega, rel=1e-9)
+    assert rhythm.explained > 1 - 1e-9
+
+
+def test_what_the_thresholds_stand_for():
+    rng = np.random.default_rng(1)
+    noisy = channels(lambda t, i: np.sin(4 * t - i) + rng.normal(0, 0.35, t.size))
+    assert 0.78 < find_rhythm(noisy, 10.0).explained < 0.84
+    square = channels(lambda t, i: np.sign(np.sin(6 * t - i)))
+    assert find_rhythm(square, 10.0).explained == pytest.approx(0.90, abs=0.01)
+    # Three cycles and harmonics fitted to a ramp: (6 / pi^2)(1/9 + 1/36 + 1/81).
+    t = np.arange(3000) / 300
+    ramp = fit_shared([Series("ramp", t, t)], 2 * np.pi * 0.3)
+    assert find_rhythm([Series("ramp", t, t)], 10.0) is None or ramp.explained[0] < 0.2
+
+
+def test_what_is_no_gait():
+    rng = np.random.default_rng(2)
+    for make in (
+        lambda t, i: 0.1 * t,
+        lambda t, i: 0.1 * t**2,
+        lambda t, i: np.cumsum(rng.normal(0, 0.01, t.size)),
+        lambda t, i: rng.normal(0, 0.3, t.size),
+        lambda t, i: np.sin(0.8 * t**2),
+        lambda t, i: np.where(t > 4, 0.3, 0.0),
+        lambda t, i: np.zeros_like(t),
+        lambda t, i: np.sin(2 * np.pi * 0.2 * t),
+    ):
+        said = []
+        named = {one.name: one for one in channels(make)}
+        assert fit_gait(named, named, 10.0, said.append) is None
+        assert said[0].startswith("no gait")
+
+
+def test_a_strong_second_harmonic_is_not_taken_for_the_gait():
+    rhythm = find_rhythm(
+        channels(lambda t, i: 0.6 * np.sin(5 * t - i) + np.sin(2 * (5 * t - i))), 10.0
+    )
+    assert rhythm.omega == pytest.approx(5.0, rel=1e-9)
+
+
+def test_driven_joints():
+    rng = np.random.default_rng(1)
+    sizes = [0.4, 0.35, 0.001, 0.0, 0.2]
+    makes = channels(lambda t, i: sizes[i] * np.sin(3 * t - i), count=4)
+    makes += channels(lambda t, i: 0.2 * rng.normal(size=t.size), count=1)
+    follows, astray = driven(fit_at(makes, 3.0))
+    assert follows.tolist() == [True, True, False, False, False]
+    assert astray.tolist() == [False, False, False, False, True]
+
+
+def test_direction_of_the_wave():
+    # Eq. 2 with a negative lag: crests move towards the high indices, the tail.
+    step = phase_step(0.4 * np.exp(-1j * np.pi / 3 * np.arange(12)))
+    assert step == pytest.approx(-np.pi / 3)
+    assert wave_name(step) == "head-to-tail"
+    assert wave_name(-step) == "tail-to-head"
+    assert wave_name(0.0) == wave_name(np.pi) == "standing"
+
+
+def test_planes_with_different_frequencies_are_not_averaged():
+    t = np.arange(1000) / 100
+    named = {f"h{i}": Series(f"h{i}", t, 0.4 * np.sin(3 * t - i)) for i in range(5)}
+    named |= {f"v{i}": Series(f"v{i}", t, 0.1 * np.sin(4.3 * t - i)) for i in range(2)}
+    said = []
+    fit = fit_gait(named, named, 10.0, said.append)
+    assert fit.driven == tuple(f"h{i}" for i in range(5))
+    assert any("2 joints are commanded something else" in text for text in said)
+
+
+def test_steady_runs_of_the_logged_gait():
+    names = ("horizontal.A", "horizontal.omega", "horizontal.phase", "horizontal.offset")
+    t_ns = np.arange(100) * 10_000_000
+    values = np.tile([0.4, 3.0, 0.0, 0.0], (100, 1))
+    values[:, 2] = np.arange(100)  # the phase runs on
+    values[:20, 0] = np.linspace(0, 0.4, 20)  # amplitude ramp
+    values[60:, 1] = 4.0
+    values[80:, 3] = 0.1
+    runs = steady_runs(t_ns, names, values)
+    assert runs[-3:] == [
+        Stretch(190_000_000, 600_000_000),
+        Stretch(600_000_000, 800_000_000),
+        Stretch(800_000_000, 1_000_000_000),
+    ]
+    assert steady_runs(t_ns, names, values, ("offset",))[-1] == Stretch(600_000_000, 10**9)
+    assert steady_runs(t_ns[:0], names, values[:0]) == []
+
+
+def test_settling_time_counts_from_the_start_or_from_the_change():
+    second = 10**9
+    ramped = settled(Stretch(2 * second, 16 * second), 0, 8.0)
+    assert ramped == Stretch(8 * second, 16 * second)
+    changed = settled(Stretch(20 * second, 40 * second), 0, 8.0)
+    assert changed == Stretch(28 * second, 40 * second)
+    assert settled(Stretch(0, 5 * second), 0, 8.0).duration_s == 0
+
+
+def test_covered_counts_the_last_samples_own_interval():
+    assert covered([np.arange(5) * 10, np.arange(3) * 10 + 2]) == Stretch(0, 50)
+    assert covered([np.empty(0, dtype=np.int64)]) is None
+
+
+def test_whole_cycles_are_those_at_the_end():
+    assert whole_cycles(0.0, 9.0, 0.5) == (1.0, 9.0, 4)
+    assert whole_cycles(0.0, 7.99999, 0.5) == (0.0, 7.99999, 4)
+    assert whole_cycles(0.0, 1.0, 0.5)[2] == 0
+
+
+def test_a_decaying_mode_is_reported_as_drift():
+    """A bending mode at 0.551 Hz with tau = 7.5 s, from the start of a gait of 0.5 Hz."""
+    rng = np.random.default_rng(3)
+    omega = np.pi
+
+    def joints(mode, count=8, duration=12.0):
+        return channels(
+            lambda t, i: (
+                0.4 * np.sin(omega * t - i)
+                + mode * np.exp(-t / 7.5) * np.sin(3.46 * t - 0.4 * i)
+                + rng.normal(0, 1e-3, t.size)
+            ),
+            count,
+            duration,
+        )
+
+    for duration in (8.0, 12.0, 20.0):
+        for mode in (0.02, 0.002):
+            series = joints(mode, duration=duration)
+            assert worst_drift(series, fit_shared(series, omega), list(range(8))) is not None
+    false_alarms = 0
+    for _ in range(200):
+        series = joints(0.0)
+        false_alarms += worst_drift(series, fit_shared(series, omega), list(range(8))) is not None
+    assert false_alarms <= 5
+
+
+def test_the_size_of_a_drift():
+    t = np.arange(1200) / 100
+    growing = [Series("q", t, (0.4 + 0.002 * t) * np.sin(np.pi * t - 1))]
+    drift = worst_drift(growing, fit_shared(growing, np.pi), [0])
+    assert drift.log_gain == pytest.approx(0.004 / 0.412, rel=0.02)
+    assert abs(drift.phase_rad) < 1e-3
