@@ -22,7 +22,7 @@ import numpy as np
 from capture.arrays import FloatArray
 
 _TINY = 1e-300
-"""Keeps the direction of a vertical link at zero instead of 0/0."""
+"""Makes 0/0 a zero."""
 
 
 class FrictionLaw(StrEnum):
@@ -85,7 +85,8 @@ def normal_force(
 def _ellipse(slip: FloatArray, mu: FloatArray, slip_speed: float) -> FloatArray:
     weighted = mu * slip
     squares = weighted * weighted
-    return -mu * weighted / np.sqrt(squares[0] + squares[1] + (mu * slip_speed) ** 2)
+    floor = (mu * slip_speed) ** 2 + _TINY  # a coefficient may be 0
+    return -mu * weighted / np.sqrt(squares[0] + squares[1] + floor)
 
 
 def _box(slip: FloatArray, mu: FloatArray, slip_speed: float) -> FloatArray:

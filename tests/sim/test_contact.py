@@ -39,6 +39,15 @@ def test_along_one_axis_every_law_is_smoothed_coulomb(law, axis):
     assert not force[1 - axis].any()
 
 
+@pytest.mark.parametrize("law", FrictionLaw)
+def test_without_coefficients_there_is_no_friction(law):
+    slip = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert not friction_force(slip, np.ones(3), np.zeros((2, 1)), EPS, law).any()
+    slippery = friction_force(slip, np.ones(3), np.array([[0.0], [0.5]]), EPS, law)
+    assert slippery[1, 2] == pytest.approx(-0.5, rel=1e-3)
+    assert not slippery[0].any()
+
+
 @given(vt=speeds, vn=speeds, law=st.sampled_from(FrictionLaw))
 def test_friction_dissipates_and_stays_inside_its_bound(vt, vn, law):
     slip = np.array([[vt], [vn]])
