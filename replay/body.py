@@ -1,0 +1,161 @@
+"""The body in space: capsules where the links were, and a wireframe where they should have been.
+
+Capsules are Rerun's: a cylinder along z from the entity's origin, with a half ball on each end.
+Positions and quaternions are rounded to 2^-11 (0.5 mm, 0.06 degrees), which halves the file.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.components import FillMode
+
+from capture.arrays import FloatArray
+from capture.kinematics import quaternion_from_rotation
+from capture.palette import joint_colors
+from capture.robot import Robot
+
+from .colors import power_colors, power_limit
+from .joints import GREY
+from .motion import Motion
+from .sampling import decimate
+from .timeline import Clock
+
+MEASURED = "/world/snake/measured"
+COMMANDED = "/world/snake/commanded"
+
+COMMANDED_RATE_HZ = 25.0
+ROUNDING = 2.0**-11
+
+
+def segment_power(joint_power_w: FloatArray) -> FloatArray:
+    """Share of the joints' power that each link shows: half of that of the joint at either end.
+
+    Args:
+        joint_power_w: Mechanical power of the joints [W], shape (..., m).
+
+    Returns:
+        [W], shape (..., m + 1); the sum over the links is the sum over the joints.
+    """
+    half = joint_power_w / 2.0
+    shares = np.zeros((*half.shape[:-1], half.shape[-1] + 1))
+    shares[..., :-1] += half
+    shares[..., 1:] += half
+    return shares
+
+
+def capsule_shape(robot: Robot) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Cylinder lengths and radii that draw the links.
+
+    A cylinder is one radius shorter than its link, so that neighbouring balls overlap without
+    lying in each other and the segments stay countable.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Lengths of the cylinders and radii [m], each of shape (number of links,).
+    """
+    length = [max(link.length - link.radius, 0.1 * link.length) for link in robot.links]
+    radius = [link.radius for link in robot.links]
+    return np.array(length, dtype=np.float32), np.array(radius, dtype=np.float32)
+
+
+def capsule_poses(
+    robot: Robot, centre: FloatArray, rotation: FloatArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where the links' capsules start and how they are turned.
+
+    Args:
+        robot: The robot, m joints.
+        centre: Link centres [m], shape (n, m + 1, 3).
+        rotation: Link orientations, shape (n, m + 1, 3, 3).
+
+    Returns:
+        Capsule origins [m], shape (n, m + 1, 3), and quaternions x, y, z, w that turn z to the
+        link's forward axis, shape (n, m + 1, 4), rounded to 2^-11; NaN where a pose is.
+    """
+    length, _ = capsule_shape(robot)
+    origin = centre - 0.5 * length[:, None] * rotation[..., 0]
+    # The capsule's x, y and z axes are the link's -z, y and x.
+    frame = np.stack([-rotation[..., 2], rotation[..., 1], rotation[..., 0]], axis=-1)
+    return _rounded(origin), _rounded(quaternion_from_rotation(frame))
+
+
+def capsule_columns(
+    robot: Robot,
+    poses: tuple[NDArray[np.float32], NDArray[np.float32]],
+    colors: NDArray[np.uint8],
+) -> rr.ComponentColumnList:
+    """Rows of capsules, without those whose pose isn't known.
+
+    Args:
+        robot: The robot, m joints.
+        poses: As :func:`capsule_poses` gives them, n rows.
+        colors: Shape (n, m + 1, 4) or one that broadcasts to it.
+
+    Returns:
+        Columns of n rows with at most m + 1 capsules each.
+    """
+    origin, quaternion = poses
+    known = np.isfinite(np.concatenate([origin, quaternion], axis=-1)).all(axis=-1)
+    length, radius = capsule_shape(robot)
+    return rr.Capsules3D.columns(
+        lengths=np.broadcast_to(length, known.shape)[known],
+        radii=np.broadcast_to(radius, known.shape)[known],
+        translations=origin[known],
+        quaternions=quaternion[known],
+        colors=np.broadcast_to(colors, (*known.shape, 4))[known],
+    ).partition(np.count_nonzero(known, axis=1))
+
+
+def log_body(rec: rr.RecordingStream, clock: Clock, motion: Motion) -> float | None:
+    """Draw the measured body, coloured by power per segment.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        motion: What moved.
+
+    Returns:
+        Power at which a segment's colour is full [W], or None where no power is known and the
+        links wear the colours of their place along the body.
+    """
+    power = None if motion.power_w is None else segment_power(motion.power_w)
+    limit = None if power is None else power_limit(power)
+    rec.log(MEASURED, rr.Capsules3D.from_fields(fill_mode=FillMode.Solid), static=True)
+    for rows, times in clock.rows(motion.t_ns):
+        if power is None or limit is None:
+            colors = joint_colors(len(motion.robot.links))
+        else:
+            colors = power_colors(power[rows], limit)
+        poses = capsule_poses(motion.robot, *motion.links(rows))
+        rec.send_columns(MEASURED, times, capsule_columns(motion.robot, poses, colors))
+    return limit
+
+
+def log_ghost(rec: rr.RecordingStream, clock: Clock, motion: Motion) -> None:
+    """Draw the commanded shape on the measured head, as a grey wireframe.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        motion: What moved; without commands nothing is drawn.
+    """
+    if motion.commands is None:
+        return
+    chosen = decimate(motion.t_ns, COMMANDED_RATE_HZ)
+    look = rr.Capsules3D.from_fields(
+        fill_mode=FillMode.MajorWireframe, line_radii=rr.Radius.ui_points(0.5)
+    )
+    rec.log(COMMANDED, look, static=True)
+    grey = np.array(GREY, dtype=np.uint8)
+    for part, times in clock.rows(motion.t_ns[chosen]):
+        rows = chosen[part]
+        poses = capsule_poses(motion.robot, *motion.links(rows, motion.commands[rows]))
+        rec.send_columns(COMMANDED, times, capsule_columns(motion.robot, poses, grey))
+
+
+def _rounded(values: FloatArray) -> NDArray[np.float32]:
+    return (np.round(values / ROUNDING) * ROUNDING).astype(np.float32)

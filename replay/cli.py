@@ -1,0 +1,114 @@
+"""The verb ``view``."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from capture.console import emit_json, progress, refuse_existing
+from capture.errors import UndulogError, UsageError
+
+if TYPE_CHECKING:
+    from analysis.result import Analysis
+    from capture import Session
+
+    from .rrd import Recording
+
+
+def view(
+    file: Path,
+    /,
+    *,
+    save: Path | None = None,
+    web: bool = False,
+    force: bool = False,
+    json: bool = False,
+) -> None:
+    """See a session in Rerun: the body in space, its joints, power and response.
+
+    Opens the viewer and waits until its window is closed. The recording that it shows is a cache:
+    it can be made again from the session at any time.
+
+    Example: `undulog view run.mcap --save run.rrd`
+
+    Args:
+        file: The session, `.mcap`.
+        save: Write the recording to this `.rrd` file instead of opening the viewer.
+        web: Serve the viewer to a browser on this machine (127.0.0.1 only) until interrupted.
+        force: Replace the recording if it is there.
+        json: Print one JSON object: what was written and what is missing. Needs `--save`.
+    """
+    if save is not None and web:
+        raise UsageError("--save writes a file and --web serves one; give one of them")
+    if json and save is None:
+        raise UsageError("--json reports what --save wrote; give --save X.rrd as well")
+    if save is not None:
+        if save.suffix.lower() != ".rrd":
+            raise UsageError(f"{save}: a Rerun recording; end its name in .rrd")
+        refuse_existing(save, force=force)
+        recording, duration_s = _convert(file, save)
+        _report(recording, duration_s, json=json)
+        return
+
+    from . import viewer
+
+    if not web:
+        viewer.require_display()
+    with tempfile.TemporaryDirectory(prefix="undulog-view-") as folder:
+        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd")
+        for warning in recording.warnings:
+            print(f"note: {warning}")
+        if web:
+            viewer.serve(recording.path, lambda address: print(address, flush=True))
+        else:
+            viewer.show(recording.path)
+
+
+def _convert(file: Path, output: Path) -> tuple[Recording, float]:
+    from capture import Session
+
+    from .rrd import write_recording
+
+    with Session.open(file) as session, progress("view", total=2) as bar:
+        bar.update(0, note="analysis")
+        analysis, why_not = _analysis(session)
+        bar.update(1, note="recording")
+        notes = () if why_not is None else (why_not,)
+        recording = write_recording(session, output, analysis=analysis, notes=notes)
+        return recording, session.duration_s
+
+
+def _analysis(session: Session) -> tuple[Analysis | None, str | None]:
+    """The session's analysis, or why there is none; a session without a gait can be seen too."""
+    from analysis.analyse import analyse_session
+
+    try:
+        return analyse_session(session), None
+    except UndulogError as error:
+        return None, f"no response bars: {error}"
+
+
+def _report(recording: Recording, duration_s: float, *, json: bool) -> None:
+    size = recording.path.stat().st_size
+    if json:
+        emit_json(_facts(recording, duration_s, size))
+        return
+    print(
+        f"{recording.path}: {duration_s:.1f} s, {size / 1e6:.1f} MB; open it with: rerun "
+        f"{recording.path}"
+    )
+    for warning in recording.warnings:
+        print(f"note: {warning}")
+
+
+def _facts(recording: Recording, duration_s: float, size: int) -> dict[str, Any]:
+    return {
+        "path": str(recording.path),
+        "bytes": size,
+        "recording_id": recording.recording_id,
+        "duration_s": duration_s,
+        "body": recording.content.start is not None,
+        "joints": [name for series in recording.content.measured for name in series.names],
+        "warnings": list(recording.warnings),
+    }

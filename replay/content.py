@@ -1,0 +1,74 @@
+"""What a recording holds: decides which views there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from capture.robot import Robot
+
+from .joints import Places, Series
+from .response import Chart
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A quantity of all joints that is shown as logged.
+
+    Attributes:
+        title: What it is, with unit.
+        series: Where it was written.
+        of_joints: Whether its lines are the robot's joints, known by their colours; other lines
+            need a legend.
+    """
+
+    title: str
+    series: tuple[Series, ...]
+    of_joints: bool
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the camera finds the robot.
+
+    Attributes:
+        position: The head's first known position [m].
+        heading: Direction of the head there, about z [rad].
+    """
+
+    position: tuple[float, float, float]
+    heading: float
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a recording holds.
+
+    Attributes:
+        robot: The robot, or None.
+        start: Where the robot starts, or None where no body is drawn.
+        power_limit_w: Power at which a segment's colour is full [W]; None if coloured by place.
+        places: Joints that stand for the body, or None without joints.
+        commanded: Commanded angles.
+        measured: Measured angles.
+        errors: Tracking errors.
+        has_power: Whether the body's total power was written.
+        joint_power: Mechanical power of the joints.
+        charts: Response bars.
+        modes: How often a gait mode began; 0 where none was logged.
+        has_events: Whether events were written.
+        signals: Further quantities of the joints.
+    """
+
+    robot: Robot | None
+    start: Start | None
+    power_limit_w: float | None
+    places: Places | None
+    commanded: tuple[Series, ...]
+    measured: tuple[Series, ...]
+    errors: tuple[Series, ...]
+    has_power: bool
+    joint_power: tuple[Series, ...]
+    charts: tuple[Chart, ...]
+    modes: int
+    has_events: bool
+    signals: tuple[Signal, ...]

@@ -1,0 +1,151 @@
+"""What moved: head pose, joint angles and power at the times at which the body is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture import Session
+from capture.arrays import FloatArray, IntArray
+from capture.kinematics import link_poses, rotation_from_quaternion
+from capture.robot import Robot
+
+from .sampling import decimate, hold, interpolate, mark_gaps, ordered
+from .tracks import Track, resampled
+
+BODY_RATE_HZ = 50.0
+
+_POSITION = [f"pose.pose.position.{axis}" for axis in "xyz"]
+_ORIENTATION = [f"pose.pose.orientation.{axis}" for axis in "xyzw"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The body at its drawing times.
+
+    Attributes:
+        robot: The robot, m joints.
+        t_ns: Drawing times [ns], shape (n,).
+        head_position: Centre of the head link [m], shape (n, 3).
+        head_quaternion: Its orientation x, y, z, w, shape (n, 4).
+        angles: Measured joint angles [rad], shape (n, m).
+        commands: Commanded joint angles [rad], shape (n, m), or None where none were logged.
+        power_w: Mechanical power of the joints [W], shape (n, m), or None where none is known.
+    """
+
+    robot: Robot
+    t_ns: IntArray
+    head_position: FloatArray
+    head_quaternion: FloatArray
+    angles: FloatArray
+    commands: FloatArray | None
+    power_w: FloatArray | None
+
+    def links(
+        self, rows: slice | IntArray, angles: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Where the links are.
+
+        Args:
+            rows: Which drawing times, k of them.
+            angles: Joint angles to use instead of the measured ones [rad], shape (k, m).
+
+        Returns:
+            Link centres [m], shape (k, m + 1, 3), and rotations, shape (k, m + 1, 3, 3); NaN
+            from the first link whose pose isn't known to the tail.
+        """
+        return link_poses(
+            self.robot,
+            self.head_position[rows],
+            rotation_from_quaternion(self.head_quaternion[rows]),
+            self.angles[rows] if angles is None else angles,
+        )
+
+
+@dataclass(frozen=True)
+class HeadPath:
+    """Where the head was.
+
+    Attributes:
+        t_ns: Times [ns], shape (n,).
+        position: Centre of the head link [m], shape (n, 3).
+        quaternion: Orientation x, y, z, w, shape (n, 4).
+        tracked: False where no odometry was logged and the head is held at the origin.
+    """
+
+    t_ns: IntArray
+    position: FloatArray
+    quaternion: FloatArray
+    tracked: bool
+
+
+def read_head(
+    session: Session, robot: Robot, positions: tuple[Track, ...], warnings: list[str]
+) -> HeadPath:
+    """The head's pose from ``/odom``, or held at the origin.
+
+    Args:
+        session: The session.
+        robot: The robot.
+        positions: Measured joint angles, whose times serve where there is no odometry.
+        warnings: Grows by a sentence where something had to be assumed.
+
+    Returns:
+        The path at its own sampling times.
+    """
+    odometry = session.channels.get("/odom")
+    if odometry is None or not odometry.count:
+        warnings.append("no /odom in the session: the head is held at the origin")
+        t_ns = positions[0].t_ns
+        still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (t_ns.size, 1))
+        return HeadPath(t_ns, still[:, :3], still[:, 3:], tracked=False)
+    table = session.table("/odom")
+    child, head = str(table["child_frame_id"].iloc[0]), robot.links[0].name
+    if child != head:
+        warnings.append(f"/odom is of {child or 'no frame'}; it is taken as the head link {head}")
+    t_ns, pose = ordered(
+        table.index.to_numpy(dtype=np.int64),
+        table[_POSITION + _ORIENTATION].to_numpy(dtype=np.float64),
+    )
+    norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        quaternion = pose[:, 3:] / norm  # NaN where the tracker wrote zeros: no pose
+    return HeadPath(t_ns, pose[:, :3], quaternion, tracked=True)
+
+
+def assemble(
+    robot: Robot,
+    head: HeadPath,
+    *,
+    positions: tuple[Track, ...],
+    commands: tuple[Track, ...],
+    power: tuple[Track, ...],
+    end_ns: int,
+) -> Motion:
+    """Bring head, joints and power to common drawing times.
+
+    Args:
+        robot: The robot, m joints.
+        head: The head's path.
+        positions: Measured angles [rad].
+        commands: Commanded angles [rad]; none where none were logged.
+        power: Mechanical power of the joints [W]; none where it isn't known.
+        end_ns: The session's end [ns].
+
+    Returns:
+        The body at most 50 times a second, on the head's own sampling times; NaN in gaps.
+    """
+    chosen = decimate(head.t_ns, BODY_RATE_HZ)
+    pose = np.concatenate([head.position, head.quaternion], axis=1)[chosen]
+    t_ns, pose = mark_gaps(head.t_ns[chosen], pose, end_ns)
+    names = robot.joint_names
+    return Motion(
+        robot=robot,
+        t_ns=t_ns,
+        head_position=pose[:, :3],
+        head_quaternion=pose[:, 3:],
+        angles=resampled(positions, names, t_ns, interpolate),
+        commands=resampled(commands, names, t_ns, hold) if commands else None,
+        power_w=resampled(power, names, t_ns, interpolate) if power else None,
+    )

@@ -1,0 +1,121 @@
+"""Power: what the joints give to the body, and what the motors take from the battery."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from .sampling import interpolate, mark_gaps
+from .timeline import Clock
+from .tracks import Columns, Track
+
+MECHANICAL = "/power/mechanical"
+ELECTRICAL = "/power/electrical"
+TOTAL = "/power/total"
+
+_WARM = (255, 84, 48, 255)
+_PLAIN = (214, 214, 220, 255)
+
+
+def mechanical_power(columns: Columns) -> tuple[Track, ...]:
+    """Power at the joints, tau q', at the sampling times of the efforts.
+
+    Args:
+        columns: The session's columns.
+
+    Returns:
+        A track [W] for each joint with effort and velocity; positive where the joint drives.
+    """
+    return products(
+        columns.get(("/joint_states", "effort"), ()), columns.get(("/joint_states", "velocity"), ())
+    )
+
+
+def electrical_power(columns: Columns) -> tuple[Track, ...]:
+    """Power of the motors, u i, at the sampling times of the currents.
+
+    Args:
+        columns: The session's columns.
+
+    Returns:
+        A track [W] for each joint with current and voltage.
+    """
+    return products(
+        columns.get(("/joint_current", "position"), ()),
+        columns.get(("/joint_voltage", "position"), ()),
+    )
+
+
+def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ...]:
+    """Product of two quantities of each joint.
+
+    Args:
+        first: Gives the sampling times.
+        second: Taken at those times.
+
+    Returns:
+        A track for each joint that has both; NaN where either is missing.
+    """
+    other = {track.name: track for track in second}
+    return tuple(
+        Track(
+            track.name,
+            track.t_ns,
+            track.values
+            * interpolate(other[track.name].t_ns, other[track.name].values, track.t_ns),
+        )
+        for track in first
+        if track.name in other
+    )
+
+
+def total(tracks: Sequence[Track]) -> Track | None:
+    """Sum over the joints, at the first joint's sampling times.
+
+    Args:
+        tracks: The joints' power [W].
+
+    Returns:
+        The sum [W], NaN where any joint's power is missing; None without joints.
+    """
+    if not tracks:
+        return None
+    t_ns = tracks[0].t_ns
+    parts = [interpolate(track.t_ns, track.values, t_ns) for track in tracks]
+    return Track("total", t_ns, np.sum(parts, axis=0))
+
+
+def log_total(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    *,
+    mechanical: Sequence[Track],
+    electrical: Sequence[Track],
+) -> bool:
+    """Write the whole body's mechanical and electrical power.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        mechanical: Power at the joints [W]; may be empty.
+        electrical: Power of the motors [W]; may be empty.
+
+    Returns:
+        Whether there was any.
+    """
+    kinds: list[tuple[str, Sequence[Track], tuple[int, int, int, int]]] = [
+        ("electrical", electrical, _PLAIN),
+        ("mechanical", mechanical, _WARM),
+    ]
+    for kind, tracks, color in kinds:
+        whole = total(tracks)
+        if whole is None:
+            continue
+        entity = f"{TOTAL}/{kind}"
+        rec.log(entity, rr.SeriesLines(names=kind, colors=color, widths=1.5), static=True)
+        t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
+        for rows, times in clock.rows(t_ns):
+            rec.send_columns(entity, times, rr.Scalars.columns(scalars=values[rows, 0]))
+    return bool(mechanical or electrical)

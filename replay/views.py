@@ -1,0 +1,231 @@
+"""The views: the body, and plots of a stretch about the time cursor.
+
+A plot of a whole hour is slow and shows nothing, so every plot has a window. Only what the session
+holds gets a view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+from rerun.encodings import EntityPathLike
+
+from capture.robot import Plane, Robot
+
+from . import body, facts, gait, joints, power, trail
+from .content import Content, Start
+from .joints import Series
+from .response import SEGMENTS
+from .timeline import GAIT_CYCLE, SESSION_TIME
+
+BEFORE_CURSOR_S = 4.0
+AFTER_CURSOR_S = 2.0
+
+
+@dataclass(frozen=True)
+class Views:
+    """All views of a recording.
+
+    Attributes:
+        scene: The body in space, or None.
+        mode: The gait's mode, or None.
+        words: Facts and events.
+        angles: Joint angles.
+        effort: Power and whatever else the joints report.
+        bars: Response of each joint.
+    """
+
+    scene: rrb.Spatial3DView | None
+    mode: rrb.StateTimelineView | None
+    words: tuple[rrb.View, ...]
+    angles: tuple[rrb.View, ...]
+    effort: tuple[rrb.View, ...]
+    bars: tuple[rrb.View, ...]
+
+    @property
+    def all(self) -> tuple[rrb.View, ...]:
+        """Every view, in reading order."""
+        single = tuple(view for view in (self.scene, self.mode) if view is not None)
+        return (*single, *self.words, *self.angles, *self.effort, *self.bars)
+
+
+def build_views(content: Content) -> Views:
+    """The views of what a recording holds.
+
+    Args:
+        content: What it holds.
+
+    Returns:
+        The views.
+    """
+    words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
+    if content.has_events:
+        words.append(rrb.TextLogView(name="Events", contents=[gait.EVENTS]))
+    mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
+    return Views(
+        scene=None if content.start is None else _body_view(content, content.start),
+        mode=mode if content.modes else None,
+        words=tuple(words),
+        angles=tuple(_angle_views(content)),
+        effort=tuple(_effort_views(content)),
+        bars=tuple(_bar_views(content)),
+    )
+
+
+def body_title(content: Content) -> str:
+    """Name of the body's view, which is also the legend of its colours.
+
+    Args:
+        content: What the recording holds.
+
+    Returns:
+        A short title.
+    """
+    if content.power_limit_w is None:
+        return "Body, blue head to amber tail"
+    limit = content.power_limit_w
+    value, unit = (limit * 1e3, "mW") if limit < 1.0 else (limit, "W")
+    return f"Body: vermilion drives, cyan is driven, full at ±{value:.3g} {unit} a segment"
+
+
+def _body_view(content: Content, start: Start) -> rrb.Spatial3DView:
+    robot = content.robot
+    span = sum(link.length for link in robot.links) if robot is not None else 1.0
+    # From behind its right shoulder and above, where the wave shows along the whole body.
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=_beside(start, (-0.42 * span, -0.56 * span, 0.68 * span)),
+        look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
+        eye_up=(0.0, 0.0, 1.0),
+        tracking_entity=body.MEASURED,
+    )
+    tail_time = rrb.VisibleTimeRange(
+        SESSION_TIME,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-trail.TRAIL_SECONDS),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    return rrb.Spatial3DView(
+        name=body_title(content),
+        origin="/world",
+        eye_controls=eye,
+        background=rrb.Background(color=(16, 18, 22, 255)),
+        line_grid=rrb.LineGrid3D(
+            visible=True,
+            spacing=_grid_spacing(span),
+            stroke_width=1.0,
+            color=(255, 255, 255, 12),
+        ),
+        overrides={trail.TRAIL: rrb.VisibleTimeRanges([tail_time])},
+    )
+
+
+def _beside(start: Start, offset: tuple[float, float, float]) -> tuple[float, float, float]:
+    """A point given forward, left and up of the head at the start [m]."""
+    cos, sin = math.cos(start.heading), math.sin(start.heading)
+    x, y, z = start.position
+    forward, left, up = offset
+    return (x + cos * forward - sin * left, y + sin * forward + cos * left, z + up)
+
+
+def _grid_spacing(span: float) -> float:
+    """A length that can be read off: at most a fifth of the body [m]."""
+    steps = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
+    return next((step for step in steps if step <= 0.2 * span), 0.01)
+
+
+def _effort_views(content: Content) -> list[rrb.View]:
+    found: list[rrb.View] = []
+    if content.has_power:
+        found.append(_plot("Power [W]", [f"{power.TOTAL}/**"]))
+    if content.joint_power:
+        found.append(_joint_plot("Joint power [W]", content.joint_power, None))
+    found += [
+        _joint_plot(signal.title, signal.series, None, legend=not signal.of_joints)
+        for signal in content.signals
+    ]
+    return found
+
+
+def _bar_views(content: Content) -> list[rrb.View]:
+    return [
+        rrb.BarChartView(
+            name=chart.title,
+            contents=[f"{SEGMENTS}/{chart.key}/**"],
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        for chart in content.charts
+    ]
+
+
+def _angle_views(content: Content) -> list[rrb.View]:
+    views: list[rrb.View] = []
+    if content.places is not None:
+        views.append(_plot("Head, middle, tail [°]", [f"{joints.PLACES}/**"]))
+    for plane in Plane:
+        names = _names(content.robot, plane)
+        if names & {name for series in content.measured for name in series.names}:
+            views.append(_joint_plot(f"{plane.capitalize()} [°]", content.measured, names))
+    if content.robot is None and content.measured:
+        views.append(_joint_plot("Measured [°]", content.measured, None))
+    if content.errors:
+        plane = None if content.places is None else content.places.plane
+        names = None if plane is None else _names(content.robot, plane)
+        views.append(_joint_plot("Error [°]", content.errors, names))
+    if not views and content.commanded:
+        views.append(_joint_plot("Commanded [°]", content.commanded, None))
+    return views
+
+
+def _names(robot: Robot | None, plane: Plane) -> set[str]:
+    if robot is None:
+        return set()
+    return {joint.name for joint in robot.joints if joint.plane is plane}
+
+
+def _joint_plot(
+    title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
+) -> rrb.TimeSeriesView:
+    """A line a joint; ``names`` chooses the lines that are visible at first."""
+    overrides: dict[EntityPathLike, rrb.Visualizer] = {
+        one.entity: rr.SeriesLines.from_fields(
+            visible_series=[names is None or name in names for name in one.names]
+        ).visualizer(
+            mappings=[
+                VisualizerComponentMapping(
+                    "Scalars:scalars",
+                    ComponentSourceKind.SourceComponent,
+                    source_component=one.component,
+                )
+            ]
+        )
+        for one in series
+    }
+    return _plot(title, [one.entity for one in series], overrides=overrides, legend=legend)
+
+
+def _plot(
+    title: str,
+    contents: list[str],
+    *,
+    overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
+    legend: bool = True,
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=contents,
+        overrides=overrides,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        time_ranges=[
+            rrb.VisibleTimeRange(
+                timeline,
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-BEFORE_CURSOR_S),
+                end=rrb.TimeRangeBoundary.cursor_relative(seconds=AFTER_CURSOR_S),
+            )
+            for timeline in (SESSION_TIME, GAIT_CYCLE)
+        ],
+    )

@@ -1,0 +1,380 @@
+"""A small session with known columns, recordings read back, and a headless viewer."""
+
+import ctypes.util
+import io
+import math
+import os
+import socket
+import subprocess
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.result import (
+    Analysis,
+    Coupling,
+    Estimate,
+    GaitFacts,
+    JointResult,
+    Provenance,
+    SessionFacts,
+    Window,
+)
+from capture import Session, SessionWriter, load_robot
+from capture.robot import Plane
+
+EPOCH_NS = 1_735_689_600_000_000_000
+REQUIRE = "UNDULOG_REQUIRE_DISPLAY_TESTS"
+
+
+@pytest.fixture(scope="session")
+def snake25():
+    """The 25-joint robot."""
+    return load_robot("snake25")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was written: times since the start [s], arrays of shape (n, m)."""
+
+    t: np.ndarray
+    command: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+    head: np.ndarray
+    phase: np.ndarray
+
+    @property
+    def t_ns(self):
+        """Unix times [ns]."""
+        return EPOCH_NS + np.round(self.t * 1e9).astype(np.int64)
+
+
+@pytest.fixture(scope="session")
+def truth(snake25):
+    """Three seconds at 100 Hz: a serpentine wave on the yaw joints, 1.5 cycles, head moving."""
+    t = np.arange(300) / 100.0
+    yaw = snake25.joint_indices(Plane.HORIZONTAL)
+    phase = 2 * np.pi * 0.5 * t
+    k = np.arange(len(yaw))
+    command = np.zeros((len(t), 25))
+    command[:, yaw] = 0.4 * np.sin(phase[:, None] - k * np.pi / 3)
+    position, velocity, effort = (np.zeros_like(command) for _ in range(3))
+    late = phase[:, None] - k * np.pi / 3 - np.radians(7 + 0.5 * k)
+    position[:, yaw] = 0.38 * np.sin(late)
+    velocity[:, yaw] = 0.38 * np.pi * np.cos(late)
+    effort[:, yaw] = 0.1 * np.cos(late + 1.2)
+    head = np.stack([0.2 * t, 0.05 * np.sin(phase), np.full_like(t, 0.025)], axis=1)
+    return Truth(t, command, position, velocity, effort, head, phase)
+
+
+@pytest.fixture(scope="session")
+def write(snake25, truth):
+    """A function that writes the session, all of it or without some parts."""
+
+    def write_session(
+        path,
+        *,
+        robot=True,
+        odometry=True,
+        gait=True,
+        effort=True,
+        position=None,
+        keep=None,
+        session_id="made-for-tests",
+    ):
+        position = truth.position if position is None else position
+        keep = np.ones(len(truth.t), dtype=bool) if keep is None else keep
+        names = snake25.joint_names
+        with SessionWriter(
+            path,
+            session_id=session_id,
+            epoch_ns=EPOCH_NS,
+            robot=snake25 if robot else None,
+            clock={"robot": "simulated"},
+        ) as w:
+            commands = w.joint_state("/joint_commands", names, unit="rad")
+            states = w.joint_state(
+                "/joint_states", names, unit="rad", velocity=effort, effort=effort
+            )
+            current = w.joint_state("/joint_current", names, unit="A")
+            voltage = w.joint_state("/joint_voltage", names, unit="V")
+            if odometry:
+                odom = w.odometry("/odom", frame="world", child="link01")
+            if gait:
+                facts = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
+                mode = w.string("/gait/mode")
+                log = w.log("/rosout")
+                mode.write(EPOCH_NS, "walk")
+                log.write(EPOCH_NS + 5, "info", "drive", "start")
+                mode.write(EPOCH_NS + 1_000_000_000, "avoid")
+                log.write(EPOCH_NS + 1_000_000_000, "error", "drive", "wall ahead")
+            for i in np.flatnonzero(keep):
+                t_ns = int(truth.t_ns[i])
+                commands.write(t_ns, truth.command[i])
+                states.write(
+                    t_ns,
+                    position[i],
+                    *([truth.velocity[i], truth.effort[i]] if effort else []),
+                )
+                current.write(t_ns, truth.effort[i])
+                voltage.write(t_ns, np.full(25, 6.0))
+                if odometry:
+                    odom.write(
+                        t_ns,
+                        truth.head[i],
+                        np.array([0.0, 0.0, 0.0, 1.0]),
+                        np.zeros(3),
+                        np.zeros(3),
+                    )
+                if gait:
+                    facts.write(t_ns, np.array([0.4, truth.phase[i]]))
+            w.set_verdict("good")
+        return path
+
+    return write_session
+
+
+@pytest.fixture(scope="session")
+def session_file(write, tmp_path_factory):
+    """The whole session."""
+    return write(tmp_path_factory.mktemp("session") / "made.mcap")
+
+
+@pytest.fixture(scope="session")
+def analysis(snake25):
+    """An analysis with made-up but distinct numbers a joint."""
+    joints = []
+    for i, joint in enumerate(snake25.joints):
+        driven = joint.plane is Plane.HORIZONTAL
+        gain, lag = 0.95 + 0.004 * i, math.radians(7.0 + 0.3 * i)
+        joints.append(
+            JointResult(
+                name=joint.name,
+                plane=str(joint.plane),
+                command_amplitude_rad=0.4 if driven else 0.0,
+                gain=Estimate(gain, (gain - 0.01, gain + 0.01)) if driven else Estimate(),
+                lag_rad=Estimate(lag, (lag - 0.02, lag + 0.02)) if driven else Estimate(),
+                energy_net_j=0.01 * i - 0.02,
+                energy_plus_j=0.3,
+                energy_abs_j=0.3,
+                energy_el_j=None,
+                energy_el_clipped_j=None,
+                coverage=1.0,
+                samples=300,
+            )
+        )
+    return Analysis(
+        session=SessionFacts("made-for-tests", "made.mcap", "snake25", EPOCH_NS, 3.0, "good"),
+        gait=GaitFacts(
+            Estimate(0.5, (0.49, 0.51)),
+            (Window(0.0, 2.0, 1.0),),
+            "head-to-tail",
+            {"horizontal": -math.pi / 3},
+        ),
+        joints=tuple(joints),
+        body=None,
+        heterogeneity={},
+        coupling=Coupling(identifiable=False, why="one gait"),
+        warnings=(),
+        provenance=Provenance("", {}, {}, {}),
+    )
+
+
+class Recorded:
+    """A recording read back with Rerun's own reader."""
+
+    def __init__(self, path):
+        from rerun.chunk import RrdReader
+
+        self._reader = RrdReader(path)
+        self._chunks = self._reader.stream().to_chunks()
+
+    @property
+    def stores(self):
+        """(application, recording id) of each recording in the file."""
+        return [(s.application_id, s.recording_id) for s in self._reader.recordings()]
+
+    @property
+    def entities(self):
+        """Paths of all entities."""
+        return {chunk.entity_path for chunk in self._chunks}
+
+    def static(self, entity, component):
+        """Value of a static component, a list."""
+        for chunk in self._chunks:
+            if chunk.entity_path == entity and chunk.is_static:
+                batch = chunk.to_record_batch()
+                if component in batch.schema.names:
+                    return batch.column(component).to_pylist()[0]
+        raise KeyError(f"{entity} has no static {component}")
+
+    def column(self, entity, component):
+        """Rows of a component in file order: a list of lists."""
+        rows = []
+        for batch in self._temporal(entity):
+            rows += batch.column(component).to_pylist()
+        return rows
+
+    def times(self, entity, timeline="session_time"):
+        """Times of an entity's rows [ns]; rows that are not on the timeline are missing."""
+        times = [
+            batch.column(timeline).cast("int64").to_numpy()
+            for batch in self._temporal(entity)
+            if timeline in batch.schema.names
+        ]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *times])
+
+    def _temporal(self, entity):
+        return [
+            chunk.to_record_batch()
+            for chunk in self._chunks
+            if chunk.entity_path == entity and not chunk.is_static
+        ]
+
+
+@pytest.fixture(scope="session")
+def read_back():
+    """Opens a recording with Rerun's own reader."""
+    return Recorded
+
+
+@pytest.fixture(scope="session")
+def recording(session_file, analysis, tmp_path_factory):
+    """The whole session as a recording: (what was said, what is in the file)."""
+    from replay.rrd import write_recording
+
+    path = tmp_path_factory.mktemp("recording") / "made.rrd"
+    with Session.open(session_file) as session:
+        written = write_recording(session, path, analysis=analysis)
+    return written, Recorded(path)
+
+
+@pytest.fixture(scope="session")
+def rerun_command():
+    """Runs Rerun's own command line; returns its standard output."""
+    from replay.viewer import viewer_binary
+
+    def run(*arguments):
+        done = subprocess.run(
+            [viewer_binary(), *map(str, arguments)],
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+class HeadlessViewer:
+    """One viewer without a window, 1440 x 900, reachable from this machine only."""
+
+    def __init__(self, log):
+        from rerun.experimental import ViewerClient
+
+        from replay.viewer import viewer_binary
+
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        self._process = subprocess.Popen(
+            [
+                viewer_binary(),
+                "--headless",
+                "--window-size",
+                "1440x900",
+                "--bind",
+                "127.0.0.1",
+                "--port",
+                str(port),
+            ],
+            stdout=log,
+            stderr=log,
+            env={**os.environ, "RERUN_APP_ONLY": "true"},
+        )
+        address = f"rerun+http://127.0.0.1:{port}/proxy"
+        deadline = time.monotonic() + 60
+        while True:
+            try:
+                self._client = ViewerClient.connect(address)
+                self._client.get_state()
+            except (ConnectionError, RuntimeError, TimeoutError) as error:
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    self.close()
+                    raise RuntimeError("the headless viewer did not start") from error
+                time.sleep(0.2)
+            else:
+                return
+
+    def open(self, path, seconds):
+        """Show a recording at a time."""
+        self._client.open(str(path))
+        while self._client.get_state().loading:
+            time.sleep(0.05)
+        self._client.set_time("session_time", duration=seconds, play_state="paused")
+        self.views = {view.name: view for view in self._client.get_state().views}
+
+    def reports(self):
+        """What the views complain of."""
+        self._settled(None)
+        return [report for view in self._client.get_state().views for report in view.reports]
+
+    def picture(self, name=None):
+        """RGB of a view, or of the whole window, once two shots agree."""
+        from PIL import Image
+
+        data = self._settled(None if name is None else self.views[name].view_id)
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+    def _settled(self, view_id):
+        last = b""
+        for _ in range(60):
+            shot = self._client.take_screenshot(view_id)
+            if shot == last:
+                return shot
+            last = shot
+            time.sleep(0.2)
+        raise AssertionError("the picture did not come to rest")
+
+    def close(self):
+        """End this viewer and nothing else."""
+        if self._process.poll() is None:
+            self._process.terminate()
+        self._process.wait()
+
+
+@pytest.fixture(scope="session")
+def vulkan(display_tests_required):
+    """Skips where there is no Vulkan driver, fails where one is required."""
+    folders = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
+    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    drivers = [file for folder in folders for file in folder.glob("*.json")]
+    if ctypes.util.find_library("vulkan") and (drivers or named):
+        return
+    missing = "no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)"
+    if display_tests_required:
+        pytest.fail(f"{missing}, and {REQUIRE} is set")
+    pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")
+
+
+@pytest.fixture(scope="module")
+def show(vulkan, tmp_path_factory):
+    """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
+    path = tmp_path_factory.mktemp("viewer") / "viewer.log"
+    with ExitStack() as stack:
+        log = stack.enter_context(path.open("wb"))
+
+        def start(recording, seconds):
+            viewer = HeadlessViewer(log)
+            stack.callback(viewer.close)
+            viewer.open(recording, seconds)
+            return viewer
+
+        yield start

@@ -1,0 +1,92 @@
+"""Capsules against SciPy's rotations and hand-made postures."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.kinematics import link_poses
+from replay.body import ROUNDING, capsule_columns, capsule_poses, capsule_shape, segment_power
+from replay.markers import above_joints
+from replay.motion import HeadPath, assemble
+from replay.tracks import Track
+
+
+@pytest.fixture(scope="module")
+def postures(snake25):
+    """Forty random postures: head positions, quaternions, angles, link poses."""
+    rng = np.random.default_rng(3)
+    turn = Rotation.random(40, rng=rng)
+    position = rng.normal(size=(40, 3))
+    angles = rng.uniform(-0.5, 0.5, size=(40, 25))
+    return position, turn, angles, link_poses(snake25, position, turn.as_matrix(), angles)
+
+
+def test_capsules_run_from_behind_the_centre_to_before_it(snake25, postures):
+    centre, rotation = postures[3]
+    origin, quaternion = capsule_poses(snake25, centre, rotation)
+    length, _ = capsule_shape(snake25)
+    drawn = Rotation.from_quat(quaternion.reshape(-1, 4).astype(float))
+    along = drawn.apply([0.0, 0.0, 1.0]).reshape(origin.shape)
+    # An error of half a rounding step in each of three or four components.
+    np.testing.assert_allclose(along, rotation[..., 0], atol=2 * ROUNDING)
+    np.testing.assert_allclose(
+        origin + 0.5 * length[:, None] * along, centre, atol=ROUNDING / 2 + length[0] * ROUNDING
+    )
+
+
+def test_poses_are_multiples_of_the_rounding(snake25, postures):
+    for values in capsule_poses(snake25, *postures[3]):
+        assert values.dtype == np.float32
+        np.testing.assert_array_equal(values / ROUNDING, np.round(values / ROUNDING))
+
+
+def test_a_straight_snake_lies_behind_its_head(snake25):
+    centre, rotation = link_poses(snake25, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 25)))
+    origin, _ = capsule_poses(snake25, centre, rotation)
+    length, radius = capsule_shape(snake25)
+    np.testing.assert_allclose(
+        origin[0, :, 0], -0.06 * np.arange(26) - length / 2, atol=ROUNDING / 2
+    )
+    np.testing.assert_allclose(length + radius, [link.length for link in snake25.links])
+
+
+def test_links_whose_pose_is_unknown_are_left_out(snake25):
+    angles = np.zeros((3, 25))
+    angles[1, 9] = np.nan
+    head = np.zeros((3, 3))
+    head[2] = np.nan
+    poses = capsule_poses(snake25, *link_poses(snake25, head, np.eye(3)[None], angles))
+    columns = capsule_columns(snake25, poses, np.array([1, 2, 3, 255], dtype=np.uint8))
+    counts = {tuple(len(row) for row in c.as_arrow_array().to_pylist()) for c in columns}
+    assert counts == {(26, 10, 0)}
+
+
+def test_power_of_the_links_is_power_of_the_joints():
+    rng = np.random.default_rng(4)
+    power = rng.normal(size=(7, 25))
+    shares = segment_power(power)
+    assert shares.shape == (7, 26)
+    np.testing.assert_allclose(shares.sum(axis=1), power.sum(axis=1))
+    np.testing.assert_allclose(segment_power(np.array([0.0, 4.0, 0.0])), [0.0, 2.0, 2.0, 0.0])
+
+
+def test_markers_float_four_radii_over_their_joints(snake25):
+    centre, rotation = link_poses(snake25, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 25)))
+    found = above_joints(snake25, ("joint01", "joint25"), centre, rotation)
+    np.testing.assert_allclose(found[0], [[-0.03, 0.0, 0.1], [-0.03 - 24 * 0.06, 0.0, 0.1]])
+
+
+def test_the_body_is_drawn_on_the_heads_own_times(snake25):
+    t_ns = 3 + np.arange(100, dtype=np.int64) * 10_000_000
+    head = HeadPath(t_ns, np.zeros((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1)), tracked=True)
+    slow = t_ns[::4] + 1_000_000
+    positions = tuple(Track(n, slow, 1e-9 * slow) for n in snake25.joint_names)
+    motion = assemble(
+        snake25, head, positions=positions, commands=(), power=(), end_ns=int(t_ns[-1])
+    )
+    np.testing.assert_array_equal(motion.t_ns, t_ns[::2])
+    inside = (motion.t_ns >= slow[0]) & (motion.t_ns <= slow[-1])
+    np.testing.assert_allclose(motion.angles[inside, 7], 1e-9 * motion.t_ns[inside])
+    assert np.isnan(motion.angles[~inside]).all()
+    assert motion.commands is None
+    assert motion.power_w is None
