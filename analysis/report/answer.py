@@ -44,18 +44,6 @@ class Answer:
     detail: str
 
 
-def is_driven(joint: JointResult) -> bool:
-    """Whether a joint was given a periodic command.
-
-    Args:
-        joint: Its result.
-
-    Returns:
-        True if it has a gain, or a command with an amplitude.
-    """
-    return joint.gain.value is not None or bool(joint.command_amplitude_rad)
-
-
 def answer(analysis: Analysis) -> Answer:
     """Answer from the numbers of one session.
 
@@ -80,7 +68,7 @@ def answer(analysis: Analysis) -> Answer:
         )
     if len(known) == 1:
         joint = known[0]
-        lag = formats.estimate(formats.degrees(joint.lag_rad), unit="°")
+        lag = formats.estimate(formats.degrees(joint.lag_rad), "°", most=2)
         return Answer(
             Verdict.SINGLE,
             f"One joint was driven: its gain is {formats.estimate(joint.gain)}, "
@@ -127,32 +115,34 @@ def answer_to_all(answers: Sequence[Answer]) -> Answer:
     )
 
 
-def find(indices: dict[str, Index], *words: str) -> Index | None:
-    """The first index whose name holds all these words and that has a value.
+def find(indices: dict[str, Index], stem: str) -> dict[str, Index]:
+    """The indices of one kind that have a value, by plane.
 
     Args:
-        indices: Name to index.
-        words: Parts of the name, e.g. ``boundary``, ``lag``.
+        indices: Name to index; where both planes are driven, names end in the plane.
+        stem: Name without the plane, e.g. ``gain_cv``.
 
     Returns:
-        The index, or None.
+        ``horizontal``, ``vertical`` or an empty string, to the index.
     """
-    for name, index in indices.items():
-        if index.value is not None and all(word in name for word in words):
-            return index
-    return None
+    planes = {stem: "", f"{stem}_horizontal": "horizontal", f"{stem}_vertical": "vertical"}
+    return {
+        planes[name]: index
+        for name, index in indices.items()
+        if name in planes and index.value is not None
+    }
 
 
 def _verdict(analysis: Analysis) -> Verdict:
     indices = analysis.heterogeneity
-    equal = [find(indices, "equivalence", quantity) for quantity in ("gain", "lag")]
-    if all(index is not None and _small(index.p) for index in equal):
+    equal = [find(indices, f"equivalence_{quantity}") for quantity in ("gain", "lag")]
+    if all(equal) and all(_small(index.p) for kind in equal for index in kind.values()):
         # Different for certain they may be, but by less than the margins: that has the last word.
         return Verdict.ALIKE
-    contrasts = [find(indices, "boundary", quantity) for quantity in ("gain", "lag")]
-    if any(index is not None and _leaves_out_zero(index) for index in contrasts):
+    contrasts = [find(indices, f"boundary_contrast_{quantity}") for quantity in ("gain", "lag")]
+    if any(_leaves_out_zero(index) for kind in contrasts for index in kind.values()):
         return Verdict.UNLIKE
-    tests = [i.p for name, i in indices.items() if "common_response" in name and i.p is not None]
+    tests = [i.p for i in find(indices, "common_response").values() if i.p is not None]
     return Verdict.UNLIKE if tests and _small(min(tests) * len(tests)) else Verdict.OPEN
 
 
@@ -165,28 +155,35 @@ def _leaves_out_zero(index: Index) -> bool:
 
 
 def _numbers(analysis: Analysis) -> str:
-    """The contrast and the spread, each with its interval."""
+    """Contrast and spread with their intervals, plane by plane."""
     indices = analysis.heterogeneity
-    parts: list[str] = []
-    contrast = find(indices, "boundary", "lag")
-    if contrast is not None and contrast.value is not None:
-        size = formats.estimate(formats.degrees(_size(contrast)), unit="°")
-        joints = _joints_word(analysis)
-        parts.append(
-            f"the middle {joints} lag {size} more than the ends"
-            if contrast.value < 0
-            else f"the {joints} at the ends lag {size} more than the middle"
-        )
-    else:
-        spread = find(indices, "lag", "sd")
-        if spread is not None:
-            size = formats.degrees(Estimate(spread.value, spread.ci95))
-            parts.append(f"lag spreads by {formats.estimate(size, unit='°')}")
-    spread = find(indices, "gain", "cv")
-    if spread is not None:
-        size = formats.scaled(Estimate(spread.value, spread.ci95), 100.0)
-        parts.append(f"gain spreads by {formats.estimate(size, unit=' %')}")
-    return " and ".join(parts)
+    contrasts = find(indices, "boundary_contrast_lag")
+    spreads = find(indices, "lag_sd")
+    gains = find(indices, "gain_cv")
+    told: list[str] = []
+    for plane in dict.fromkeys([*contrasts, *spreads, *gains]):
+        joints = _joints_word(analysis, plane)
+        parts: list[str] = []
+        if plane in contrasts:
+            parts.append(_contrast(contrasts[plane], joints))
+        elif plane in spreads:
+            spread = Estimate(spreads[plane].value, spreads[plane].ci95)
+            lag = formats.estimate(formats.degrees(spread), "°", most=2)
+            parts.append(f"the lag of the {joints} spreads by {lag}")
+        if plane in gains:
+            spread = formats.scaled(Estimate(gains[plane].value, gains[plane].ci95), 100.0)
+            whose = "" if parts else f" of the {joints}"
+            parts.append(f"gain{whose} spreads by {formats.estimate(spread, ' %', most=2)}")
+        told.append(" and ".join(parts))
+    return "; ".join(told)
+
+
+def _contrast(index: Index, joints: str) -> str:
+    """Who is late: the index is ends minus middle."""
+    size = formats.estimate(formats.degrees(_size(index)), "°", most=2)
+    if (index.value or 0.0) < 0:
+        return f"the middle {joints} lag {size} more than the ends"
+    return f"the {joints} at the ends lag {size} more than the middle"
 
 
 def _margins(analysis: Analysis) -> str:
@@ -203,16 +200,15 @@ def _size(index: Index) -> Estimate:
     return Estimate(-index.value, ci95)
 
 
-def _joints_word(analysis: Analysis) -> str:
-    planes = {j.plane for j in analysis.joints if j.gain.value is not None}
-    return {"horizontal": "yaw joints", "vertical": "pitch joints"}.get(
-        str(planes.pop()) if len(planes) == 1 else "", "joints"
-    )
+def _joints_word(analysis: Analysis, plane: str) -> str:
+    """What to call the joints that an index is about."""
+    planes = {plane} if plane else {j.plane for j in analysis.joints if j.gain.value is not None}
+    words = {"horizontal": "yaw joints", "vertical": "pitch joints"}
+    return words.get(str(next(iter(planes))), "joints") if len(planes) == 1 else "joints"
 
 
 def _extremes(analysis: Analysis, known: Sequence[JointResult]) -> str:
-    rhythm = analysis.gait.frequency_hz
-    frequency = formats.estimate(rhythm, formats.decimals_for([rhythm], most=4), " Hz")
+    frequency = formats.estimate(analysis.gait.frequency_hz, " Hz", most=4)
     text = f"{len(known)} of {len(analysis.joints)} joints respond to a gait of {frequency}"
     lags = [j for j in known if j.lag_rad.value is not None]
     if lags:
@@ -233,6 +229,8 @@ def _caveat(analysis: Analysis) -> str:
 
 
 def _why_not(analysis: Analysis) -> str:
-    if analysis.warnings:
-        return formats.plain(analysis.warnings[0])
-    return "The result gives no reason."
+    """The warning that speaks of the gait, or the first."""
+    if not analysis.warnings:
+        return "The result gives no reason."
+    about = [warning for warning in analysis.warnings if "gait" in warning.lower()]
+    return formats.sentence((about or analysis.warnings)[0])

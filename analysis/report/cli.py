@@ -5,17 +5,24 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from capture.console import emit_json, progress, refuse_existing
 from capture.errors import UsageError
 
+if TYPE_CHECKING:
+    from ..result import Analysis
+
 
 def report(
     *files: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    start: float | None = None,
+    stop: float | None = None,
+    command_topic: str = "/joint_commands",
+    response_topic: str = "/joint_states",
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -26,6 +33,10 @@ def report(
     Args:
         files: Sessions (MCAP); several share one page.
         output: The page, a name that ends in .html.
+        start: Start of what is analysed, from the session's start [s]; chosen if not given.
+        stop: Its end [s].
+        command_topic: JointState topic of the commands.
+        response_topic: JointState topic of the responses.
         force: Replace the page if it exists.
         json: Print one JSON object: the page and the answer to each session.
     """
@@ -35,20 +46,25 @@ def report(
         )
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: the report is an HTML page; end its name in .html")
+    if start is not None and stop is not None and stop <= start:
+        raise UsageError(f"--stop {stop:g} is not after --start {start:g}")
     refuse_existing(output, force=force)
     from capture import Session
 
-    from ..analyse import analyse
+    from ..analyse import analyse_session
+    from ..stretch import Options
     from . import render
     from .answer import answer
 
+    options = Options(start, stop, command_topic, response_topic)
+    analyses: list[Analysis] = []
+    sessions: list[Session] = []
+
     with ExitStack() as stack, progress("report", total=len(files) + 1) as bar:
-        sessions: list[Session] = []
-        analyses = []
         for k, file in enumerate(files):
             bar.update(k, note=file.name)
             session = stack.enter_context(Session.open(file))
-            analyses.append(analyse(session))
+            analyses.append(analyse_session(session, options))
             sessions.append(session)
         bar.update(len(files), note="page")
         page = render(analyses, sessions)
@@ -60,22 +76,29 @@ def report(
                 "page": str(output),
                 "bytes": output.stat().st_size,
                 "answers": [
-                    {"session": a.session.id, "verdict": told.verdict, "sentence": told.sentence}
+                    {
+                        "session": a.session.id,
+                        "path": a.session.path,
+                        "verdict": told.verdict,
+                        "sentence": told.sentence,
+                    }
                     for a, told in zip(analyses, answers, strict=True)
                 ],
             }
         )
         return
-    for analysis, told in zip(analyses, answers, strict=True):
-        print(told.sentence if len(answers) == 1 else f"{analysis.session.id}: {told.sentence}")
-    print(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
+    for file, told in zip(files, answers, strict=True):
+        print(told.sentence if len(answers) == 1 else f"{file.name}: {told.sentence}")
+    warnings = sum(len(analysis.warnings) for analysis in analyses)
+    said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
+    print(f"{output}: {output.stat().st_size / 1e3:.0f} kB{said}")
 
 
 def _write(path: Path, page: str) -> None:
     """Write beside and rename, so that nobody ever opens half a page."""
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         part.write_text(page, encoding="utf-8")
-        os.replace(part, path)  # noqa: PTH105  Path.replace would do the same
+        part.replace(path)
     finally:
         part.unlink(missing_ok=True)

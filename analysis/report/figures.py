@@ -20,6 +20,7 @@ from capture.arrays import FloatArray
 from capture.palette import joint_hex
 
 from ..result import BodyPoint, BodyResult, Estimate, JointResult
+from .driven import is_driven
 from .formats import degrees, estimate, number, scaled, short
 from .svg import (
     GRID,
@@ -142,7 +143,7 @@ def _estimates(
             gid=gid,
             zorder=3,
         )
-        tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, unit=unit)}")
+        tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, unit)}")
     _mean_lines(axes, joints, of, _circular_mean_deg if what == "lag" else fmean)
     if not drawn:
         _empty(axes, f"no {what}: see the warnings")
@@ -196,7 +197,7 @@ def _energies(
         drawn = True
         axes.plot([place, place], [0.0, net], color=color, linewidth=1.6, zorder=2)
         gid = f"energy-{i}"
-        driven = joint.gain.value is not None
+        driven = is_driven(joint)
         axes.plot(
             [place],
             [net],
@@ -261,11 +262,11 @@ def _legend(figure: Figure, joints: Sequence[JointResult]) -> None:
     middle = joint_hex(3)[1]
     solid = {"markersize": _MARKER_SIZE, "markeredgecolor": INK, "markeredgewidth": 0.5}
     for plane, word in _PLANE_WORDS.items():
-        if any(j.plane == plane and j.gain.value is not None for j in joints):
+        if any(j.plane == plane and is_driven(j) for j in joints):
             handles.append(
                 key([], [], color=middle, marker=marker(plane), label=f"{word}, 95 %", **solid)
             )
-    passive = {j.plane for j in joints if j.gain.value is None and j.energy_net_j is not None}
+    passive = {j.plane for j in joints if not is_driven(j) and j.energy_net_j is not None}
     hollow = {"markersize": _MARKER_SIZE, "markeredgewidth": 1.2, "markerfacecolor": PAPER}
     for plane, word in _PLANE_WORDS.items():
         if plane in passive:
@@ -417,8 +418,8 @@ def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style
 
 
 def _point_in_words(point: BodyPoint) -> str:
-    amplitude = estimate(scaled(point.amplitude_m, 1000.0), unit=" mm")
-    phase = estimate(degrees(point.phase_rad), unit="°")
+    amplitude = estimate(scaled(point.amplitude_m, 1000.0), " mm")
+    phase = estimate(degrees(point.phase_rad), "°")
     return f"{point.place}: amplitude {amplitude}, phase {phase}"
 
 

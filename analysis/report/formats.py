@@ -53,20 +53,20 @@ def interval(ci95: Interval | None, decimals: int) -> str:
     return f"[{number(low, decimals)}, {number(high, decimals)}]"
 
 
-def estimate(quantity: Estimate, decimals: int | None = None, unit: str = "") -> str:
+def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
     """A value with its unit and its interval, for a sentence.
 
     Args:
         quantity: The estimate, already in ``unit``.
-        decimals: Digits after the point; chosen from the interval if None.
         unit: Written behind the value, with its own space where it wants one, e.g. ``" Hz"``.
+        most: Digits after the point at most; as many as the interval deserves.
 
     Returns:
         For example ``6.2° [5.9, 6.5]``; an en dash where the value is missing.
     """
     if quantity.value is None:
         return MISSING
-    digits = decimals_for([quantity]) if decimals is None else decimals
+    digits = decimals_for([quantity], most=most)
     text = number(quantity.value, digits) + unit
     return text if quantity.ci95 is None else f"{text} {interval(quantity.ci95, digits)}"
 
@@ -208,6 +208,19 @@ def short(text: str, most: int = 40) -> str:
     if len(known) <= most:
         return known
     return known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
+
+
+def sentence(text: str) -> str:
+    """Text with a capital at its beginning and one stop at its end.
+
+    Args:
+        text: From a log or a result.
+
+    Returns:
+        Plain text.
+    """
+    known = plain(text).strip()
+    return known[:1].upper() + known[1:].rstrip(".") + "."
 
 
 def _forbidden(code: int) -> bool:

@@ -15,16 +15,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from capture import Session
+from capture.errors import UsageError
 from capture.palette import joint_hex
 
 from ..result import Analysis, BodyPoint, Estimate, Index, JointResult
 from . import formats
-from .answer import Answer, answer, answer_to_all, is_driven
+from .answer import Answer, answer, answer_to_all
+from .driven import is_driven
 from .figures import Drawing, body_motion, coupling_matrix, segments
 from .signals import command_response, read_traces
 
 LARGEST_BYTES = 3_000_000
-"""A page above this drops its signal plots: it must open on a phone."""
+"""A page must open on a phone."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class SessionView:
         key: Prefix of every identifier of this session in the page.
         analysis: The numbers.
         answer: The answer in one sentence.
+        notices: The first few warnings, cut to a line or two.
         facts: Key figures.
         colors: One colour a joint.
         response: Columns of the table of responses.
@@ -80,6 +83,7 @@ class SessionView:
     key: str
     analysis: Analysis
     answer: Answer
+    notices: tuple[str, ...]
     facts: tuple[Fact, ...]
     colors: tuple[str, ...]
     response: tuple[Column, ...]
@@ -96,6 +100,8 @@ def render(
 ) -> str:
     """Write the report on one or several sessions.
 
+    A page that would be larger than ``LARGEST_BYTES`` goes without signal plots, and says so.
+
     Args:
         analyses: The results, one a session.
         sessions: The open sessions in the same order, for the signal plots; None where a session
@@ -106,6 +112,7 @@ def render(
 
     Raises:
         ValueError: If there is no analysis, or not one session an analysis.
+        UsageError: If the page would be too large without signal plots, too.
     """
     results = [analyses] if isinstance(analyses, Analysis) else list(analyses)
     if sessions is None:
@@ -118,11 +125,19 @@ def render(
         raise ValueError(f"{len(results)} analyses and {len(opened)} sessions: one each, please")
     page = _page(results, opened)
     if len(page.encode()) > LARGEST_BYTES:
-        page = _page(results, [None] * len(results))
+        page = _page(results, [None] * len(results), left_out=True)
+    size = len(page.encode())
+    if size > LARGEST_BYTES:
+        raise UsageError(
+            f"{len(results)} sessions make a page of {size / 1e6:.1f} MB, more than "
+            f"{LARGEST_BYTES / 1e6:g} MB: put fewer on a page"
+        )
     return page
 
 
-def _page(results: Sequence[Analysis], sessions: Sequence[Session | None]) -> str:
+def _page(
+    results: Sequence[Analysis], sessions: Sequence[Session | None], *, left_out: bool = False
+) -> str:
     views = [
         view(result, session, f"s{k + 1}")
         for k, (result, session) in enumerate(zip(results, sessions, strict=True))
@@ -139,12 +154,16 @@ def _page(results: Sequence[Analysis], sessions: Sequence[Session | None]) -> st
         "number": formats.number,
         "utc": formats.utc,
         "plain": formats.plain,
+        "filename": _filename,
         "p_value": formats.p_value,
         "degrees": formats.degrees,
         "scaled": formats.scaled,
         "softer": _softer,
         "points": _point_rows,
         "index": _index_row,
+        "driven": is_driven,
+        "sentence": formats.sentence,
+        "again": _commands_to_make_it_again,
     }
     environment.filters.update(filters)
     style = files("analysis.report").joinpath("templates/style.css").read_text(encoding="utf-8")
@@ -153,6 +172,7 @@ def _page(results: Sequence[Analysis], sessions: Sequence[Session | None]) -> st
         headline=views[0].answer if len(views) == 1 else answer_to_all([v.answer for v in views]),
         style=Markup(style),  # noqa: S704  our own file
         body_gradient=", ".join(joint_hex(9)),
+        left_out=left_out,
         MISSING=formats.MISSING,
     )
 
@@ -172,10 +192,13 @@ def view(analysis: Analysis, session: Session | None, key: str) -> SessionView:
     traces = read_traces(session, analysis) if session is not None else ()
     body, matrix = analysis.body, analysis.coupling.matrix
     driven = [joint.name for joint in joints if is_driven(joint)]
+    told = answer(analysis)
+    others = [w for w in map(formats.sentence, analysis.warnings) if w not in told.detail]
     return SessionView(
         key=key,
         analysis=analysis,
-        answer=answer(analysis),
+        answer=told,
+        notices=tuple(_cut(warning) for warning in others[:3]),
         facts=tuple(_facts(analysis)),
         colors=joint_hex(len(joints)) if joints else (),
         response=_response_columns(joints),
@@ -205,13 +228,13 @@ def _response_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
             "gain [1]",
             "amplitude of the response over that of the command",
             gain,
-            formats.decimals_for(gain),
+            formats.decimals_for(gain, most=4),
         ),
         Column(
             "lag [°]",
             "response behind command, positive is late",
             lag,
-            formats.decimals_for(lag),
+            formats.decimals_for(lag, most=3),
         ),
     )
 
@@ -236,12 +259,14 @@ def _facts(analysis: Analysis) -> list[Fact]:
     """Key figures; what is unknown is an en dash."""
     gait, joints = analysis.gait, analysis.joints
     driven = [joint for joint in joints if is_driven(joint)]
-    digits = formats.decimals_for([gait.frequency_hz], most=4)
-    frequency = formats.estimate(gait.frequency_hz, digits, " Hz")
+    frequency = formats.estimate(gait.frequency_hz, " Hz", most=4)
     facts = [
         Fact("Gait frequency", frequency, _analysed(analysis)),
         Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),
-        Fact("Joints with a command", f"{len(driven)} of {len(joints)}"),
+        Fact(
+            "Joints in the gait",
+            f"{len(driven)} of {len(joints)}" if driven else formats.MISSING,
+        ),
     ]
     gains = [(j.gain.value, j.name) for j in joints if j.gain.value is not None]
     lags = [(math.degrees(v), j.name) for j in joints if (v := j.lag_rad.value) is not None]
@@ -259,7 +284,8 @@ def _facts(analysis: Analysis) -> list[Fact]:
     )
     if joints:
         least = min(joints, key=lambda j: j.coverage)
-        facts.append(Fact("Lowest coverage", _percent(least.coverage), formats.plain(least.name)))
+        where = formats.plain(least.name) if least.coverage < 0.9995 else "every joint"
+        facts.append(Fact("Lowest coverage", _percent(least.coverage), where))
     points = analysis.body.observed if analysis.body is not None else ()
     sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
     facts.append(
@@ -293,7 +319,7 @@ def _analysed(analysis: Analysis) -> str:
     cycles = math.fsum(window.cycles for window in windows)
     spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in windows[:3])
     more = f" and {len(windows) - 3} more" if len(windows) > 3 else ""
-    return f"{cycles:.1f} cycles, {spans}{more}"
+    return f"{cycles:.0f} cycles, {spans}{more}" if cycles else f"{spans}{more}"
 
 
 def _lag_per_joint(analysis: Analysis) -> str:
@@ -312,6 +338,27 @@ def _softer(sentence: str) -> Markup:
         parts += [rest[:start], '<span class="ci">', rest[start : stop + 1], "</span>"]
         rest = rest[stop + 1 :]
     return Markup("".join([*parts, rest]))  # noqa: S704  escaped above
+
+
+def _filename(path: str) -> str:
+    """Last part of a path of any system."""
+    return formats.plain(path.replace("\\", "/").rstrip("/").rpartition("/")[2] or path)
+
+
+def _cut(text: str, most: int = 130) -> str:
+    """The beginning of a long sentence, up to a whole word."""
+    if len(text) <= most:
+        return text
+    return text[:most].rpartition(" ")[0] + " \N{HORIZONTAL ELLIPSIS}"
+
+
+def _commands_to_make_it_again(analysis: Analysis) -> str:
+    """The numbers again, and this page again: both verbs take the same options."""
+    command = formats.plain(analysis.provenance.command)
+    numbers = "undulog analyse "
+    if not command.startswith(numbers):
+        return command
+    return f"{command}\nundulog report {command.removeprefix(numbers)} -o report.html"
 
 
 def _point_rows(analysis: Analysis) -> list[tuple[str, BodyPoint]]:
@@ -335,4 +382,4 @@ def _index_row(index: Index) -> tuple[Estimate, str, int]:
         quantity, unit = formats.degrees(quantity), "°"
     elif unit == "1":
         unit = ""
-    return quantity, unit, formats.decimals_for([quantity])
+    return quantity, unit, formats.decimals_for([quantity], least=0)

@@ -13,6 +13,7 @@ from capture.errors import DataError, MissingChannelError
 from capture.palette import joint_hex
 
 from ..result import Analysis, JointResult
+from .driven import is_driven
 from .figures import WIDTH_IN, Drawing, key, legend
 from .formats import degrees, estimate, short
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
@@ -57,7 +58,7 @@ def chosen_joints(joints: Sequence[JointResult]) -> list[int]:
     Returns:
         Up to three indices, ascending; all joints count where none is driven.
     """
-    driven = [i for i, joint in enumerate(joints) if joint.gain.value is not None]
+    driven = [i for i, joint in enumerate(joints) if is_driven(joint)]
     planes = [joints[i].plane for i in driven]
     if driven:
         most = max(dict.fromkeys(planes), key=planes.count)
@@ -86,23 +87,19 @@ def stretch_s(analysis: Analysis) -> tuple[float, float]:
     return max(first, stop - length), stop
 
 
-def read_traces(
-    session: Session,
-    analysis: Analysis,
-    commands: str = "/joint_commands",
-    states: str = "/joint_states",
-) -> tuple[Trace, ...]:
+def read_traces(session: Session, analysis: Analysis) -> tuple[Trace, ...]:
     """Read what :func:`command_response` draws.
 
     Args:
         session: Open.
-        analysis: Of that session.
-        commands: Topic of the commands.
-        states: Topic of the responses.
+        analysis: Of that session; its options say which topics were analysed.
 
     Returns:
         One trace a chosen joint; empty where a topic or all samples are missing.
     """
+    options = analysis.provenance.options
+    commands = str(options.get("command_topic") or "/joint_commands")
+    states = str(options.get("response_topic") or "/joint_states")
     start_s, stop_s = stretch_s(analysis)
     start_ns = analysis.session.start_ns
     bounds = {
@@ -192,5 +189,5 @@ def _panel_title(joint: JointResult) -> str:
     name = short(joint.name)
     if joint.gain.value is None:
         return name
-    lag = estimate(degrees(joint.lag_rad), unit="°")
+    lag = estimate(degrees(joint.lag_rad), "°")
     return f"{name}: gain {estimate(joint.gain)}, lag {lag}"

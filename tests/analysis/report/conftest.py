@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from analysis.result import (
@@ -17,7 +18,10 @@ from analysis.result import (
     SessionFacts,
     Window,
 )
+from capture import SessionWriter
 
+RATE_HZ = 100
+EPOCH_NS = 1_767_225_600_000_000_000
 HOSTILE = "<script>alert('x')</script>$\\frac{a}{b$\x00&\"蛇"
 
 
@@ -198,3 +202,25 @@ def still():
 def single():
     """One driven joint whose plane is unknown."""
     return make_single()
+
+
+@pytest.fixture(scope="session")
+def recorded(snake, tmp_path_factory):
+    """A session of the snake: commands and responses follow the analysis to the letter."""
+    path = tmp_path_factory.mktemp("session") / "weak.mcap"
+    names = [joint.name for joint in snake.joints]
+    amplitude = np.array([joint.command_amplitude_rad or 0.0 for joint in snake.joints])
+    gain = np.array([joint.gain.value or 0.0 for joint in snake.joints])
+    lag = np.array([joint.lag_rad.value or 0.0 for joint in snake.joints])
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", names, unit="rad")
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        for k in range(16 * RATE_HZ + 1):
+            phase = 2 * np.pi * 0.5 * k / RATE_HZ - np.pi / 6 * np.arange(25)
+            position = amplitude * gain * np.sin(phase - lag)
+            if k == 1400:
+                position[0] = np.nan
+            t_ns = EPOCH_NS + k * (1_000_000_000 // RATE_HZ)
+            commands.write(t_ns, amplitude * np.sin(phase))
+            states.write(t_ns, position)
+    return path

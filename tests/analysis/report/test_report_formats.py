@@ -36,9 +36,9 @@ def test_decimals_follow_the_particle_data_group(half, decimals):
 
 
 def test_an_estimate_prints_value_unit_and_interval():
-    assert formats.estimate(Estimate(6.2, (5.9, 6.5)), unit="°") == "6.20° [5.90, 6.50]"
-    assert formats.estimate(Estimate(6.2), 1, "°") == "6.2°"
-    assert formats.estimate(Estimate(), unit="°") == "–"
+    assert formats.estimate(Estimate(6.2, (5.9, 6.5)), "°") == "6.20° [5.90, 6.50]"
+    assert formats.estimate(Estimate(6.2), "°", most=1) == "6.2°"
+    assert formats.estimate(Estimate(), "°") == "–"
 
 
 def test_degrees_turn_value_and_interval():

@@ -7,31 +7,10 @@ import pytest
 
 from analysis.report import render, signals
 from capture import Session, SessionWriter
+from capture.errors import UsageError
 
 RATE_HZ = 100
 EPOCH_NS = 1_767_225_600_000_000_000
-
-
-@pytest.fixture(scope="module")
-def recorded(snake, tmp_path_factory):
-    """A session of the snake: commands and responses follow the analysis to the letter."""
-    path = tmp_path_factory.mktemp("session") / "weak.mcap"
-    names = [joint.name for joint in snake.joints]
-    amplitude = np.array([joint.command_amplitude_rad or 0.0 for joint in snake.joints])
-    gain = np.array([joint.gain.value or 0.0 for joint in snake.joints])
-    lag = np.array([joint.lag_rad.value or 0.0 for joint in snake.joints])
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(16 * RATE_HZ + 1):
-            phase = 2 * np.pi * 0.5 * k / RATE_HZ - np.pi / 6 * np.arange(25)
-            position = amplitude * gain * np.sin(phase - lag)
-            if k == 1400:
-                position[0] = np.nan
-            t_ns = EPOCH_NS + k * (1_000_000_000 // RATE_HZ)
-            commands.write(t_ns, amplitude * np.sin(phase))
-            states.write(t_ns, position)
-    return path
 
 
 def test_head_middle_and_tail_of_the_driven_plane(snake, still, single):
@@ -70,6 +49,18 @@ def test_the_figure_is_on_the_page(snake, recorded):
         page = render(snake, session)
     assert "Command and response of joint01, joint13, joint25" in page
     assert len(page.encode()) < 300_000
+
+
+def test_a_page_that_grows_too_large_goes_without_signals_and_says_so(snake, recorded, monkeypatch):
+    with Session.open(recorded) as session:
+        full = render(snake, session)
+        monkeypatch.setattr("analysis.report.page.LARGEST_BYTES", len(full.encode()) - 1)
+        lean = render(snake, session)
+        assert "Command and response are not drawn" in lean
+        assert "Command and response are not drawn" not in full
+        monkeypatch.setattr("analysis.report.page.LARGEST_BYTES", 1000)
+        with pytest.raises(UsageError, match=r"1 sessions make a page of 0\.2 MB"):
+            render(snake, session)
 
 
 def test_without_topics_the_page_has_no_such_figure(snake, tmp_path):
