@@ -5,10 +5,10 @@ PYTHON ?= $(firstword $(shell command -v python3.11 python3 python 2>/dev/null))
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
-PACKAGES := capture sim analysis replay
+DEMO   := out/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow check format bench docs lock clean
+.PHONY: help demo test slow check format bench docs pictures lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,8 +21,24 @@ $(READY): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
+define undulog
+@echo '$$ undulog $(1)'
+@$(BIN)/undulog $(1)
+@echo
+
+endef
+
 demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and replay
-	@$(BIN)/python bench/demo.py out/demo
+	@mkdir -p $(DEMO)
+	$(call undulog,sim run weak-servo-pi3 --duration 20 -o $(DEMO)/session.mcap --force)
+	$(call undulog,analyse $(DEMO)/session.mcap -o $(DEMO)/result.json --force)
+	$(call undulog,report $(DEMO)/session.mcap -o $(DEMO)/report.html --force)
+	$(call undulog,view $(DEMO)/session.mcap --save $(DEMO)/replay.rrd --force)
+	@echo 'Where to look next:'
+	@echo '  $(DEMO)/report.html                          the answer on one page, in any browser'
+	@echo '  $(BIN)/rerun $(DEMO)/replay.rrd         the motion'
+	@echo '  $(BIN)/undulog log info $(DEMO)/session.mcap    what was recorded'
+	@echo '  $(BIN)/undulog sim list                       what else can be simulated'
 
 test: $(READY)  ## all tests but the slow ones
 	$(BIN)/python -m pytest -m "not slow"
@@ -45,6 +61,9 @@ bench: $(READY)  ## speed, as ratios against named peers
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
+
+pictures: demo  ## the pictures of README and manual, from the demo's own session
+	$(BIN)/python docs/pictures.py $(DEMO) docs/images
 
 lock: $(READY)  ## renew requirements.lock (needs uv on the path)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \

@@ -1,0 +1,66 @@
+"""Every command and snippet of the README does what it says."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+COMMANDS = [
+    line.removeprefix("$ ").partition("   #")[0].partition("  #")[0].strip()
+    for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith("$ ")
+]
+SNIPPETS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+# An ArcSnake-like exchange: request and reply share an identifier, direction tells them apart.
+TRACE = "".join(
+    f"(1700000000.{k:02d}0000) can0 14B#A400000000{k:02X}0000 T\n"
+    f"(1700000000.{k:02d}0500) can0 14B#92{k:02X}000000000000 R\n"
+    for k in range(50)
+)
+
+
+def test_the_readme_shows_a_picture_before_anything_else() -> None:
+    picture = README.index("![")
+    assert picture < README.index("```")
+    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
+        assert (ROOT / path).is_file(), f"{path} is missing: make pictures"
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("make ")])
+def test_make_targets_exist_and_are_run_by_the_integration(command: str) -> None:
+    done = subprocess.run(
+        [*shlex.split(command), "-n"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert command in (ROOT / ".ci" / "run").read_text()
+
+
+def test_the_verbs_in_order_then_the_snippets(tmp_path: Path) -> None:
+    (tmp_path / "trace.log").write_text(TRACE)
+    verbs = [command for command in COMMANDS if not command.startswith("make ")]
+    assert len(verbs) >= 8
+    for command in verbs:
+        program, *words = shlex.split(command)
+        assert program == "undulog"
+        run([sys.executable, "-m", "undulog", *words], tmp_path)
+    assert (tmp_path / "back.log").read_text() == TRACE
+    assert SNIPPETS
+    for snippet in SNIPPETS:
+        assert "joint01" in run([sys.executable, "-c", snippet], tmp_path)
+
+
+def run(command: list[str], folder: Path) -> str:
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return done.stdout
