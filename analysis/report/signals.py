@@ -13,8 +13,8 @@ from capture.errors import DataError, MissingChannelError
 from capture.palette import joint_hex
 
 from ..result import Analysis, JointResult
+from .drawn import WIDTH_IN, Drawing, key, legend
 from .driven import is_driven
-from .figures import WIDTH_IN, Drawing, key, legend
 from .formats import degrees, estimate, short
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
 

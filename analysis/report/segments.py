@@ -1,78 +1,22 @@
-"""The figures that need only results: segments head to tail, and head, middle and tail.
-
-Every figure is a pure function of results. A joint keeps its colour, horizontal joints are
-circles and vertical ones squares, references and nulls are dashed grey, estimates carry their
-95 % interval, the segment axis runs head to tail from left to right.
-"""
+"""Gain, lag and energy of every joint, head to tail."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from statistics import fmean
-from typing import Any
 
 import numpy as np
-from matplotlib import lines
-from matplotlib.ticker import MaxNLocator
 
-from capture.arrays import FloatArray
 from capture.palette import joint_hex
 
-from ..result import BodyPoint, BodyResult, Estimate, JointResult
+from ..result import Estimate, JointResult
+from .drawn import WIDTH_IN, Drawing, key, legend, marker
 from .driven import is_driven
-from .formats import degrees, estimate, number, scaled, short
-from .svg import (
-    GRID,
-    INK,
-    MUTED,
-    PAPER,
-    REFERENCE,
-    Axes,
-    Figure,
-    Handle,
-    drawing,
-    inline_svg,
-    new_figure,
-)
-
-WIDTH_IN = 8.0
-"""Width of every figure [inch]; the page scales it."""
-
-MARKERS: dict[str | None, str] = {"horizontal": "o", "vertical": "s", None: "^"}
-"""Marker by plane; a triangle where no robot description says."""
+from .formats import degrees, estimate, number
+from .svg import INK, MUTED, PAPER, REFERENCE, Axes, Figure, Handle, drawing, inline_svg, new_figure
 
 _MARKER_SIZE = 5.2
 _PLANE_WORDS = {"horizontal": "horizontal", "vertical": "vertical", None: "plane unknown"}
-
-
-key: Any = lines.Line2D
-"""A line or marker of a legend, drawn nowhere else."""
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure ready for the page.
-
-    Attributes:
-        svg: The ``<svg>`` element.
-        caption: One or two sentences, plain text.
-    """
-
-    svg: str
-    caption: str
-
-
-def marker(plane: str | None) -> str:
-    """Matplotlib marker of a joint of this plane.
-
-    Args:
-        plane: ``horizontal``, ``vertical`` or None.
-
-    Returns:
-        Circle, square, or triangle for anything else.
-    """
-    return MARKERS.get(plane, "^")
 
 
 def segments(joints: Sequence[JointResult], prefix: str) -> Drawing:
@@ -291,24 +235,6 @@ def _legend(figure: Figure, joints: Sequence[JointResult]) -> None:
         legend(figure, handles)
 
 
-def legend(figure: Figure, handles: Sequence[Handle]) -> None:
-    """One line of keys above all panels, from the left edge.
-
-    Args:
-        figure: Laid out by the constrained engine.
-        handles: What is explained.
-    """
-    figure.legend(
-        handles=handles,
-        loc="outside upper left",
-        ncols=len(handles),
-        borderaxespad=0.2,
-        columnspacing=1.6,
-        handletextpad=0.5,
-        handlelength=1.8,
-    )
-
-
 def _in_words(joints: Sequence[JointResult]) -> str:
     driven = [j for j in joints if j.gain.value is not None]
     if not driven:
@@ -337,144 +263,3 @@ def _segments_caption(joints: Sequence[JointResult]) -> str:
             "body."
         )
     return text
-
-
-def body_motion(body: BodyResult, prefix: str) -> Drawing:
-    """Head, middle and tail over one gait cycle, with the perfect-tracking nulls dashed.
-
-    The curve of a place is A cos(Phi + phase), A and phase with respect to the head link; the
-    band is what amplitude and phase may do within their intervals.
-
-    Args:
-        body: With one or more observed points.
-        prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure.
-    """
-    points = body.observed
-    colors = joint_hex(len(points))
-    cycle = np.linspace(0.0, 2.0 * np.pi, 121)
-    with drawing():
-        figure = new_figure(WIDTH_IN, 2.7)
-        grid = figure.subplots(1, len(points), sharex=True, sharey=True, squeeze=False)
-        for k, point in enumerate(points):
-            axes: Axes = grid[0, k]
-            for style, points_of_null in zip(_NULL_STYLES, body.null.values(), strict=False):
-                for null in points_of_null:
-                    if null.place == point.place:
-                        _harmonic(axes, null, cycle, REFERENCE, style)
-            _harmonic(axes, point, cycle, colors[k], "-")
-            axes.set_title(short(f"{point.place} ({point.link})", 28))
-            axes.set_xticks([0.0, 90.0, 180.0, 270.0, 360.0])
-        sideways = body.plane != "vertical"
-        grid[0, 0].set_ylabel("left of the heading [mm]" if sideways else "up [mm]")
-        figure.supxlabel("phase of the gait [°], zero at the head link's peak", fontsize=8.0)
-        measured = key([], [], color=colors[len(colors) // 2], label="measured, 95 %")
-        nulls = [
-            key([], [], color=REFERENCE, linestyle=style, label=short(f"perfect tracking, {name}"))
-            for style, name in zip(_NULL_STYLES, body.null, strict=False)
-        ]
-        legend(figure, [measured, *nulls])
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title=f"Motion of {', '.join(p.place for p in points)} over one gait cycle",
-            description="; ".join(_point_in_words(p) for p in points)
-            + ". Dashed grey: the same body with every joint exactly on its command.",
-        )
-    caption = (
-        "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
-        "perfect-tracking null: the same body with every joint exactly on its command. Head, "
-        "middle and tail differ there already, by kinematics alone, so only what departs from the "
-        "dashed line speaks of the joints."
-    )
-    return Drawing(svg, caption)
-
-
-_NULL_STYLES = ((0, (5, 3)), (0, (1.5, 2)), (0, (7, 2, 1.5, 2)))
-
-
-def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style: object) -> None:
-    amplitude = scaled(point.amplitude_m, 1000.0)
-    if amplitude.value is None or point.phase_rad.value is None:
-        return
-    x = np.degrees(cycle)
-    if style == "-":
-        low_a, high_a = amplitude.ci95 or (amplitude.value, amplitude.value)
-        low_p, high_p = point.phase_rad.ci95 or (point.phase_rad.value, point.phase_rad.value)
-        family = np.stack(
-            [a * np.cos(cycle + p) for a in (low_a, high_a) for p in np.linspace(low_p, high_p, 9)]
-        )
-        axes.fill_between(x, family.min(0), family.max(0), color=color, alpha=0.3, linewidth=0)
-    axes.plot(
-        x,
-        amplitude.value * np.cos(cycle + point.phase_rad.value),
-        color=color,
-        linestyle=style,
-        linewidth=2.0 if style == "-" else 1.4,
-        zorder=3 if style == "-" else 2,
-    )
-
-
-def _point_in_words(point: BodyPoint) -> str:
-    amplitude = estimate(scaled(point.amplitude_m, 1000.0), " mm")
-    phase = estimate(degrees(point.phase_rad), "°")
-    return f"{point.place}: amplitude {amplitude}, phase {phase}"
-
-
-def coupling_matrix(
-    matrix: Sequence[Sequence[float]], names: Sequence[str], prefix: str
-) -> Drawing:
-    """A coupling matrix as squares whose side goes with the square root of the magnitude.
-
-    Filled squares are positive, hollow ones negative, so that the sign needs no colour (after
-    Hinton & Shallice 1991, Psychological Review 98, 74).
-
-    Args:
-        matrix: Rows of responding joints, columns of commanded joints, m by m.
-        names: Joint names, m.
-        prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure.
-    """
-    values = np.array(matrix, dtype=np.float64)
-    count = len(values)
-    largest = float(np.max(np.abs(values))) or 1.0
-    colors = joint_hex(count)
-    with drawing():
-        figure = new_figure(WIDTH_IN, WIDTH_IN * 0.62)
-        axes = figure.subplots()
-        axes.set_aspect("equal")
-        axes.grid(visible=False)
-        side = 0.9 * np.sqrt(np.abs(values) / largest)
-        for (i, j), width in np.ndenumerate(side):
-            x, y = j + 1 - width / 2, i + 1 - width / 2
-            corners = ([x, x + width, x + width, x], [y, y, y + width, y + width])
-            positive = values[i, j] >= 0
-            axes.fill(
-                *corners,
-                facecolor=colors[i] if positive else "none",
-                edgecolor=colors[i],
-                linewidth=1.0,
-            )
-        axes.set_xlim(0.4, count + 0.6)
-        axes.set_ylim(count + 0.6, 0.4)
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(MaxNLocator(nbins=14, integer=True, steps=[1, 2, 5, 10]))
-        axes.set_xlabel("commanded joint, head to tail")
-        axes.set_ylabel("responding joint, head at the top")
-        axes.spines[:].set_color(GRID)
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title="Coupling matrix",
-            description=f"{count} by {count} entries between joints {', '.join(names)}; "
-            f"largest magnitude {largest:.3g}. The table beside it holds every number.",
-        )
-    caption = (
-        "Area of a square: magnitude; filled: positive, hollow: negative. "
-        f"The largest square is {number(largest, 3)}."
-    )
-    return Drawing(svg, caption)
