@@ -3,7 +3,7 @@
 The map is a curve in OKLab (Ottosson 2020, https://bottosson.github.io/posts/oklab/) from blue
 at the head over green to amber at the tail, sampled at equal steps of arc length, so neighbours
 differ equally everywhere. Lightness rises all the way, so the order survives colour blindness
-and grey print, and stays between 0.47 and 0.79, so it reads on white and on black.
+and grey print, and stays between 0.53 and 0.77, so it reads on white and on black.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ COMMANDED_RGB: tuple[int, int, int] = (140, 140, 140)
 """Grey of everything commanded, a null or a reference."""
 
 # Control points of a quadratic Bezier curve in OKLab (lightness, a, b): blue, green, amber.
-_CURVE = np.array([[0.47, -0.01, -0.18], [0.62, -0.20, 0.02], [0.79, 0.06, 0.16]])
+_CURVE = np.array([[0.53, -0.02, -0.18], [0.64, -0.20, 0.02], [0.77, 0.07, 0.16]])
 
 # OKLab -> cube roots of cone responses -> linear sRGB (Ottosson 2020).
 _LAB_TO_CONE = np.array(
