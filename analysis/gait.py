@@ -17,7 +17,7 @@ import numpy as np
 from capture.arrays import BoolArray, ComplexArray
 from capture.errors import DataError
 
-from .harmonic import HarmonicFit, HarmonicModel, fit_shared
+from .harmonic import HarmonicFit, HarmonicModel, fit_at, fit_shared
 from .series import Series
 
 MIN_CYCLES = 3.0
@@ -64,17 +64,19 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
     moving = [one for one in series if one.count > 16 and np.ptp(one.values) > 0]
     if not moving or duration_s <= 0:
         return None
-    peak = _periodogram_peak(moving, duration_s)
-    if peak is None:
-        return None
+    scouts = sorted(moving, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
+    peak = _periodogram_peak(scouts, duration_s)
+    best: Rhythm | None = None
     # A second harmonic that is stronger than the fundamental makes the peak an octave too high.
-    found = [_try(moving, omega) for omega in (peak, peak / 2)]
-    rhythms = [one for one in found if one and one.omega * duration_s >= 2 * np.pi * MIN_CYCLES]
-    if not rhythms:
-        return None
-    best = max(rhythms, key=lambda one: one.explained)
-    # The octave below explains what the peak explains, and a little noise more.
-    return rhythms[0] if rhythms[0].explained >= MIN_EXPLAINED else best
+    for omega in () if peak is None else (peak, peak / 2):
+        rhythm = _refine(scouts, moving, omega)
+        if rhythm is None or rhythm.omega * duration_s < 2 * np.pi * MIN_CYCLES:
+            continue
+        if best is None or rhythm.explained > best.explained:
+            best = rhythm
+        if best.explained >= MIN_EXPLAINED:
+            break
+    return best
 
 
 def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> HarmonicModel:
@@ -136,25 +138,25 @@ def wave_name(step_rad: float) -> str:
     return "head-to-tail" if step_rad < 0 else "tail-to-head"
 
 
-def _try(series: Sequence[Series], omega: float) -> Rhythm | None:
+def _refine(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
+    """The rhythm of the scouts near a frequency, and what it explains of all channels."""
     model = allowed_model(series, omega)
     if any(one.count <= model.size + 1 for one in series):
         return None
     try:
-        fit = fit_shared(series, omega, model)
+        found = fit_shared(scouts, omega, model).omega
+        fit = fit_at(series, found, model)
     except DataError:
         return None
-    explained = 1.0 - float(fit.rss.sum() / fit.total.sum())
-    return Rhythm(fit.omega, explained, model)
+    return Rhythm(found, 1.0 - float(fit.rss.sum() / fit.total.sum()), model)
 
 
-def _periodogram_peak(series: Sequence[Series], duration_s: float) -> float | None:
-    """Peak of the summed periodogram of the liveliest channels [rad/s].
+def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | None:
+    """Peak of the channels' summed periodogram [rad/s].
 
     Only a starting point: the channels are interpolated to an even grid and tapered, and the
     Gauss-Newton fit does the rest on the true times.
     """
-    scouts = sorted(series, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
     step = max(one.period_s for one in scouts)
     start = max(one.t_s[0] for one in scouts)
     stop = min(one.t_s[-1] for one in scouts)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtr, chndtrinc, fdtrc, ndtri, stdtr
 
 from capture.arrays import FloatArray
 
@@ -57,9 +58,7 @@ class Spread:
     @property
     def p(self) -> float:
         """p-value of no true spread."""
-        from scipy.stats import f
-
-        return float(f.sf(self.ratio, self.dof, self.noise_dof))
+        return float(fdtrc(self.dof, self.noise_dof, self.ratio))
 
     @property
     def deviation(self) -> float:
@@ -223,18 +222,11 @@ def _circular(lag: FloatArray, linear: Spread) -> Spread:
 
 def _noncentral_root(value: float, dof: float, quantile: float) -> float:
     """Root of the noncentrality whose chi-square has the value at this quantile; 0 if none has."""
-    from scipy.optimize import brentq
-    from scipy.stats import chi2, ncx2, norm
-
     if value > _ASYMPTOTIC:
-        return float(value**0.5 - norm.ppf(quantile))
-    if chi2.cdf(value, dof) <= quantile:
+        return float(value**0.5 - ndtri(quantile))
+    if chdtr(dof, value) <= quantile:
         return 0.0
-
-    def excess(root: float) -> float:
-        return float(ncx2.cdf(value, dof, root**2)) - quantile
-
-    return float(brentq(excess, 1e-6, value**0.5 + 10, xtol=1e-6))
+    return float(chndtrinc(value, dof, quantile)) ** 0.5
 
 
 def _contrast(
@@ -254,9 +246,7 @@ def _contrast(
 
 
 def _t_p(value: float, error: float, dof: float) -> float:
-    from scipy.stats import t
-
-    return float(2 * t.sf(abs(value) / error, dof)) if error > 0 else float(value == 0)
+    return float(2 * stdtr(dof, -abs(value) / error)) if error > 0 else float(value == 0)
 
 
 def _equivalence(
@@ -273,13 +263,11 @@ def _equivalence(
     Claimed for all joints at once, so the largest p counts and needs no correction (intersection
     union test, Berger 1982).
     """
-    from scipy.stats import t
-
     m = deviation.size
     error = np.sqrt(variance * (1 - 2 / m) + variance.sum() / m**2)
     room = margin - np.abs(deviation)
     score = np.divide(room, error, out=np.sign(room) * np.inf, where=error > 0)
-    worst = float(np.max(t.sf(score, dof)))
+    worst = float(np.max(stdtr(dof, -score)))
     largest = float(np.max(np.abs(deviation)))
     return Index(largest, None, worst, unit, f"largest deviation from the mean; H1: {label}")
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 from capture.arrays import ComplexArray, FloatArray
 
@@ -137,9 +138,7 @@ def t_factor(dof: float, confidence: float = CONFIDENCE) -> float:
     Returns:
         The factor on the standard error.
     """
-    from scipy.stats import t
-
-    return float(t.ppf(0.5 + confidence / 2, dof))
+    return float(stdtrit(dof, 0.5 + confidence / 2))
 
 
 def gain_estimate(response: Response, joint: int) -> Estimate:

@@ -11,11 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fdtrc
 
 from capture.arrays import ComplexArray
 
 from .harmonic import HarmonicFit
 from .series import Series
+from .spectrum import demodulated
 
 DRIFT_PER_CYCLE = 1e-4
 """Drift of ln H per cycle below which a motion counts as settled."""
@@ -58,8 +60,6 @@ def worst_drift(series: list[Series], fit: HarmonicFit, channels: list[int]) -> 
         The worst drift, if it is above ``DRIFT_PER_CYCLE`` and noise doesn't explain the drift of
         all joints together (F test of the slopes against the scatter about them); else None.
     """
-    from scipy.stats import f
-
     found: list[Drift] = []
     explained = scatter = 0.0
     slopes = rests = 0
@@ -78,7 +78,7 @@ def worst_drift(series: list[Series], fit: HarmonicFit, channels: list[int]) -> 
     worst = max(found, key=lambda drift: drift.size, default=None)
     if worst is None or worst.size <= DRIFT_PER_CYCLE:
         return None
-    if scatter > 0 and f.sf(explained / slopes / (scatter / rests), slopes, rests) > SIGNIFICANT:
+    if scatter > 0 and fdtrc(slopes, rests, explained / slopes / (scatter / rests)) > SIGNIFICANT:
         return None
     return worst
 
@@ -86,18 +86,16 @@ def worst_drift(series: list[Series], fit: HarmonicFit, channels: list[int]) -> 
 def _each_cycle(one: Series, fit: HarmonicFit, channel: int) -> ComplexArray:
     """Deviation of ln a from the fit in each whole cycle, shape (c,)."""
     amplitude = complex(fit.amplitudes[channel, 0])
+    nothing = np.zeros(0, dtype=np.complex128)
     if amplitude == 0 or one.count < 2:
-        return np.zeros(0, dtype=np.complex128)
-    place = (one.t_s - one.t_s[0]) * fit.omega / (2 * np.pi)
-    cycles = int(place[-1] + fit.omega * one.period_s / (2 * np.pi) + 0.01)
-    if cycles < 1:
-        return np.zeros(0, dtype=np.complex128)
-    turned = (one.values - fit.predict(channel, one.t_s)) * np.exp(-1j * fit.omega * one.t_s)
-    edges = np.searchsorted(place, np.arange(cycles + 1))
-    filled = np.diff(edges)
-    if np.min(filled) < 2:
-        return np.zeros(0, dtype=np.complex128)
-    sums = np.add.reduceat(turned, edges[:-1])
-    if edges[-1] < one.count:
-        sums[-1] = np.sum(turned[edges[-2] : edges[-1]])
-    return np.asarray(2 * sums / filled / amplitude, dtype=np.complex128)
+        return nothing
+    turn_s = 2 * np.pi / fit.omega
+    cycles = int((one.t_s[-1] - one.t_s[0] + one.period_s) / turn_s + 0.01)
+    sums, filled = np.zeros(cycles + 1, dtype=np.complex128), np.zeros(cycles + 1)
+    for part in demodulated([one], fit, [channel]):
+        cycle = np.minimum((part.t_s - one.t_s[0]) / turn_s, cycles).astype(np.int64)
+        np.add.at(sums, cycle, part.residual[0])
+        np.add.at(filled, cycle, 1.0)
+    if cycles < 1 or filled[:cycles].min() < 2:
+        return nothing
+    return 2 * sums[:cycles] / filled[:cycles] / amplitude
