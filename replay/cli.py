@@ -28,7 +28,8 @@ def view(
     """See a session in Rerun: the body in space, its joints, power and response.
 
     Opens the viewer and waits until its window is closed. The recording that it shows is a cache:
-    it can be made again from the session at any time.
+    it can be made again from the session at any time. The session stays on this machine; the
+    viewer counts its own use on its makers' server, which `rerun analytics disable` ends.
 
     Example: `undulog view run.mcap --save run.rrd`
 

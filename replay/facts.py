@@ -14,7 +14,14 @@ from capture import Session
 FACTS = "/session"
 
 
-def markdown(session: Session, analysis: Analysis | None, notes: Sequence[str], colors: str) -> str:
+def markdown(
+    session: Session,
+    analysis: Analysis | None,
+    *,
+    notes: Sequence[str],
+    colors: str,
+    has_cycles: bool,
+) -> str:
     """What a reader needs beside the picture.
 
     Args:
@@ -22,6 +29,7 @@ def markdown(session: Session, analysis: Analysis | None, notes: Sequence[str], 
         analysis: Its analysis, or None where there is none.
         notes: What is missing or was assumed, a sentence each.
         colors: What the body's colours mean.
+        has_cycles: Whether there is a timeline of gait cycles.
 
     Returns:
         Markdown.
@@ -36,11 +44,13 @@ def markdown(session: Session, analysis: Analysis | None, notes: Sequence[str], 
         *_versions(session.metadata),
     )
     parts = [f"**{answer(analysis)}**", " · ".join(facts)]
-    if notes:
-        parts.append("\n".join(f"- {note}" for note in notes))
-    parts.append(
-        f"{colors}. Grey is commanded. On `gait_cycle` one second is one cycle of the gait."
-    )
+    told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
+    if told:
+        parts.append("\n".join(f"- {note}" for note in told))
+    legend = f"{colors}. Grey is commanded."
+    if has_cycles:
+        legend += " On `gait_cycle` one second is one cycle of the gait."
+    parts.append(legend)
     return "\n\n".join(parts) + "\n"
 
 
@@ -90,7 +100,8 @@ def _degrees(estimate: Estimate) -> str:
 def _robot(session: Session) -> str:
     if session.robot is None:
         return "no description in the session"
-    return f"{session.robot.name}, {len(session.robot.joints)} joints"
+    count = len(session.robot.joints)
+    return f"{session.robot.name}, {count} joint{'s' if count != 1 else ''}"
 
 
 def _utc(t_ns: int) -> str:

@@ -18,7 +18,7 @@ MARKERS = "/world/snake/places"
 LABELS = "/world/snake/place_names"
 
 _LIFT_RADII = 4.0
-_LABEL_COLOR = (225, 225, 230, 255)
+_LABEL_COLOR = (255, 255, 255, 255)
 
 
 def above_joints(

@@ -15,8 +15,9 @@ MECHANICAL = "/power/mechanical"
 ELECTRICAL = "/power/electrical"
 TOTAL = "/power/total"
 
-_WARM = (255, 84, 48, 255)
-_PLAIN = (214, 214, 220, 255)
+# Vermilion as on the body; violet is on no other map and reads on black and on white.
+_MECHANICAL = (255, 84, 48, 255)
+_ELECTRICAL = (150, 124, 230, 255)
 
 
 def mechanical_power(columns: Columns) -> tuple[Track, ...]:
@@ -106,8 +107,8 @@ def log_total(
         Whether there was any.
     """
     kinds: list[tuple[str, Sequence[Track], tuple[int, int, int, int]]] = [
-        ("electrical", electrical, _PLAIN),
-        ("mechanical", mechanical, _WARM),
+        ("electrical", electrical, _ELECTRICAL),
+        ("mechanical", mechanical, _MECHANICAL),
     ]
     for kind, tracks, color in kinds:
         whole = total(tracks)

@@ -119,7 +119,13 @@ def write_recording(
             rec.send_recording_start_time_nanos(session.start_ns)
             content = _log(rec, clock, sources, analysis)
             told = tuple(dict.fromkeys([*notes, *sources.warnings, *session.warnings]))
-            text = facts.markdown(session, analysis, told, body_title(content))
+            text = facts.markdown(
+                session,
+                analysis,
+                notes=told,
+                colors=body_title(content),
+                has_cycles=rhythm is not None,
+            )
             facts.log_facts(rec, text)
             rec.send_blueprint(layout(content))
         finally:

@@ -78,11 +78,25 @@ def serve(recording: Path, tell: Callable[[str], None]) -> None:
     Raises:
         UndulogError: If the server fails.
     """
-    page, data = _free_ports(2)
+    page, data = free_ports(2)
     source = quote(f"rerun+http://{LOOPBACK}:{data}/proxy", safe="")
     tell(f"http://{LOOPBACK}:{page}/?url={source}")
     ports = ["--web-viewer-port", str(page), "--port", str(data)]
     _run([str(recording), "--serve-web", "--bind", LOOPBACK, *ports])
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of this machine that nobody listens on at the moment.
+
+    Args:
+        count: How many.
+
+    Returns:
+        Different ports.
+    """
+    with ExitStack() as stack:
+        held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
+        return [int(one.getsockname()[1]) for one in held]
 
 
 def _run(arguments: list[str]) -> None:
@@ -112,10 +126,3 @@ def _run(arguments: list[str]) -> None:
         lines = [line for line in said.splitlines() if "Error" in line] or said.splitlines()[-3:]
         reason = " ".join(line.strip() for line in lines) or f"exit code {process.returncode}"
         raise UndulogError(f"the Rerun viewer failed: {reason}")
-
-
-def _free_ports(count: int) -> list[int]:
-    """Ports that nobody listens on at the moment."""
-    with ExitStack() as stack:
-        held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
-        return [int(one.getsockname()[1]) for one in held]

@@ -99,7 +99,7 @@ def _body_view(content: Content, start: Start) -> rrb.Spatial3DView:
     # From behind its right shoulder and above, where the wave shows along the whole body.
     eye = rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
-        position=_beside(start, (-0.42 * span, -0.56 * span, 0.68 * span)),
+        position=_beside(start, (-0.92 * span, -0.55 * span, 0.65 * span)),
         look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
         eye_up=(0.0, 0.0, 1.0),
         tracking_entity=body.MEASURED,
@@ -165,7 +165,9 @@ def _bar_views(content: Content) -> list[rrb.View]:
 def _angle_views(content: Content) -> list[rrb.View]:
     views: list[rrb.View] = []
     if content.places is not None:
-        views.append(_plot("Head, middle, tail [°]", [f"{joints.PLACES}/**"]))
+        three = len(content.places.names) == 3
+        title = "Head, middle, tail [°]" if three else "Angle [°]"
+        views.append(_plot(title, [f"{joints.PLACES}/**"]))
     for plane in Plane:
         names = _names(content.robot, plane)
         if names & {name for series in content.measured for name in series.names}:

@@ -4,9 +4,7 @@ import ctypes.util
 import io
 import math
 import os
-import socket
 import subprocess
-import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -274,82 +272,6 @@ def rerun_command():
     return run
 
 
-class HeadlessViewer:
-    """One viewer without a window, 1440 x 900, reachable from this machine only."""
-
-    def __init__(self, log):
-        from rerun.experimental import ViewerClient
-
-        from replay.viewer import viewer_binary
-
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            port = free.getsockname()[1]
-        self._process = subprocess.Popen(
-            [
-                viewer_binary(),
-                "--headless",
-                "--window-size",
-                "1440x900",
-                "--bind",
-                "127.0.0.1",
-                "--port",
-                str(port),
-            ],
-            stdout=log,
-            stderr=log,
-            env={**os.environ, "RERUN_APP_ONLY": "true"},
-        )
-        address = f"rerun+http://127.0.0.1:{port}/proxy"
-        deadline = time.monotonic() + 60
-        while True:
-            try:
-                self._client = ViewerClient.connect(address)
-                self._client.get_state()
-            except (ConnectionError, RuntimeError, TimeoutError) as error:
-                if self._process.poll() is not None or time.monotonic() > deadline:
-                    self.close()
-                    raise RuntimeError("the headless viewer did not start") from error
-                time.sleep(0.2)
-            else:
-                return
-
-    def open(self, path, seconds):
-        """Show a recording at a time."""
-        self._client.open(str(path))
-        while self._client.get_state().loading:
-            time.sleep(0.05)
-        self._client.set_time("session_time", duration=seconds, play_state="paused")
-        self.views = {view.name: view for view in self._client.get_state().views}
-
-    def reports(self):
-        """What the views complain of."""
-        self._settled(None)
-        return [report for view in self._client.get_state().views for report in view.reports]
-
-    def picture(self, name=None):
-        """RGB of a view, or of the whole window, once two shots agree."""
-        from PIL import Image
-
-        data = self._settled(None if name is None else self.views[name].view_id)
-        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
-
-    def _settled(self, view_id):
-        last = b""
-        for _ in range(60):
-            shot = self._client.take_screenshot(view_id)
-            if shot == last:
-                return shot
-            last = shot
-            time.sleep(0.2)
-        raise AssertionError("the picture did not come to rest")
-
-    def close(self):
-        """End this viewer and nothing else."""
-        if self._process.poll() is None:
-            self._process.terminate()
-        self._process.wait()
-
-
 @pytest.fixture(scope="session")
 def vulkan(display_tests_required):
     """Skips where there is no Vulkan driver, fails where one is required."""
@@ -367,14 +289,22 @@ def vulkan(display_tests_required):
 @pytest.fixture(scope="module")
 def show(vulkan, tmp_path_factory):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
-    path = tmp_path_factory.mktemp("viewer") / "viewer.log"
+    from replay.headless import HeadlessViewer
+
+    log = tmp_path_factory.mktemp("viewer") / "viewer.log"
     with ExitStack() as stack:
-        log = stack.enter_context(path.open("wb"))
 
         def start(recording, seconds):
-            viewer = HeadlessViewer(log)
-            stack.callback(viewer.close)
+            viewer = stack.enter_context(HeadlessViewer(log=log))
             viewer.open(recording, seconds)
             return viewer
 
         yield start
+
+
+@pytest.fixture(scope="session")
+def rgb():
+    """Turns a PNG into an array of integers, shape (height, width, 3)."""
+    from PIL import Image
+
+    return lambda png: np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)

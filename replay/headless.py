@@ -1,0 +1,138 @@
+"""Pictures of a recording without a window: for the manual and for tests of what is drawn.
+
+Rerun's viewer draws off screen where there is a Vulkan driver, Mesa's software one included.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rerun.experimental import View, ViewerClient
+
+from capture.errors import UndulogError
+
+from .timeline import SESSION_TIME
+from .viewer import LOOPBACK, free_ports, viewer_binary
+
+_START_S = 60.0
+_REST_S = 30.0
+_LOOK_AGAIN_S = 0.2
+
+
+class HeadlessViewer:
+    """A viewer without a window, which this machine only can reach."""
+
+    def __init__(self, size: tuple[int, int] = (1440, 900), *, log: Path | None = None) -> None:
+        """Start it.
+
+        Args:
+            size: Width and height of the window that isn't there [pixels].
+            log: File for what the viewer prints; None throws it away.
+
+        Raises:
+            UndulogError: If it doesn't start, e.g. without a Vulkan driver.
+        """
+        (port,) = free_ports(1)
+        window = ["--window-size", f"{size[0]}x{size[1]}"]
+        with Path(log or os.devnull).open("ab") as sink:
+            self._process = subprocess.Popen(  # noqa: S603  our own arguments
+                [
+                    str(viewer_binary()),
+                    *("--headless", *window, "--bind", LOOPBACK, "--port", str(port)),
+                ],
+                stdout=sink,
+                stderr=sink,
+            )
+        self._client = self._connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+
+    def __enter__(self) -> Self:
+        """Nothing to do: it runs."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it."""
+        self.close()
+
+    def close(self) -> None:
+        """End it; safe to call twice."""
+        if self._process.poll() is None:
+            self._process.terminate()
+        self._process.wait()
+
+    def open(self, recording: Path, seconds: float) -> None:
+        """Show a recording, standing still.
+
+        Args:
+            recording: The .rrd file.
+            seconds: Place on ``session_time`` [s].
+        """
+        self._client.open(str(recording.resolve()))
+        while self._client.get_state().loading:
+            time.sleep(_LOOK_AGAIN_S)
+        self._client.set_time(SESSION_TIME, duration=seconds, play_state="paused")
+
+    @property
+    def views(self) -> dict[str, View]:
+        """All views by name, those behind tabs included."""
+        return {view.name: view for view in self._client.get_state().views}
+
+    def complaints(self) -> list[str]:
+        """What the views say they could not draw."""
+        self.picture()
+        return [
+            f"{view.name}: {report.summary}"
+            for view in self._client.get_state().views
+            for report in view.reports
+        ]
+
+    def picture(self, view: str | None = None) -> bytes:
+        """A picture, once two shots in a row agree.
+
+        Args:
+            view: Name of a view in front, or None for the whole window.
+
+        Returns:
+            PNG.
+
+        Raises:
+            ConnectionError: If the view is behind a tab.
+            UndulogError: If the picture doesn't come to rest.
+        """
+        view_id = None if view is None else self.views[view].view_id
+        deadline = time.monotonic() + _REST_S
+        last = b""
+        while time.monotonic() < deadline:
+            shot = self._client.take_screenshot(view_id)
+            if shot == last:
+                return shot
+            last = shot
+            time.sleep(_LOOK_AGAIN_S)
+        raise UndulogError("the viewer's picture doesn't come to rest")
+
+    def _connect(self, address: str) -> ViewerClient:
+        """Wait until it answers."""
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                client = ViewerClient.connect(address)
+                client.get_state()
+            except (ConnectionError, RuntimeError, TimeoutError) as error:
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    self.close()
+                    raise UndulogError(
+                        "the headless viewer did not start; it needs a Vulkan driver "
+                        "(Debian: mesa-vulkan-drivers libvulkan1)"
+                    ) from error
+                time.sleep(_LOOK_AGAIN_S)
+            else:
+                return client
