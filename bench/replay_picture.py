@@ -39,7 +39,7 @@ def main(target: Path) -> None:
             picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
     picture = picture.crop((0, TITLE_BAR, *picture.size))
     target.parent.mkdir(parents=True, exist_ok=True)
-    picture.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
+    picture.save(target, optimize=True)
     print(f"{target}: {target.stat().st_size / 1e3:.0f} kB")
 
 
