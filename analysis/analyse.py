@@ -17,15 +17,15 @@ from .body_motion import body_motion
 from .coupling import one_gait_coupling
 from .fitting import GaitFit, fit_gait
 from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
-from .heterogeneity import energy_indices, response_indices
-from .joints import Energies, Span, joint_energies, joint_results
+from .indices import heterogeneity_indices
+from .joints import Span, joint_energies, joint_results
+from .ledger import check_ledger
 from .reading import Warn, by_plane, drag_ratio, read_columns, settle_time_s
 from .response import CONFIDENCE, around, t_factor
 from .result import (
     Analysis,
     Estimate,
     GaitFacts,
-    Index,
     JointResult,
     Provenance,
     SessionFacts,
@@ -70,6 +70,7 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
     gait = fit_gait(commands, responses, stretch.duration_s, warn)
     span = _span(stretch, origin_ns, gait)
     energies = joint_energies(columns, span, warn)
+    check_ledger(session, energies.values(), span, warn)
     joints = joint_results(
         session.robot,
         columns,
@@ -79,9 +80,9 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
         energies=energies,
         span=span,
     )
-    _warn_flags(joints, warn)
+    _warn_flags(joints, gait, warn)
     body = body_motion(session, responses, gait, span, warn)
-    heterogeneity = _heterogeneity(session, gait, energies, warn)
+    heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     return Analysis(
         session=SessionFacts(
             id=session.session_id,
@@ -127,7 +128,7 @@ def _warn_dropped(
             )
 
 
-def _warn_flags(joints: tuple[JointResult, ...], warn: Warn) -> None:
+def _warn_flags(joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn) -> None:
     meaning = {
         "saturated": "at the joint limit",
         "frozen": "frozen while commanded to move",
@@ -138,7 +139,17 @@ def _warn_flags(joints: tuple[JointResult, ...], warn: Warn) -> None:
     for flag, text in meaning.items():
         names = [joint.name for joint in joints if flag in joint.flags]
         if names:
-            warn(f"{text} (an artefact or a limit, not mechanics): {', '.join(names)}")
+            warn(f"{', '.join(names)}: {text} (an artefact or a limit, not mechanics)")
+    lost = [
+        joint.name
+        for joint in joints
+        if gait is not None and joint.name in gait.answered and joint.lag_rad.value is None
+    ]
+    if lost:
+        warn(
+            f"{', '.join(lost)}: no response at the gait frequency that can be told from noise, or "
+            "a frozen one: gain and lag are null"
+        )
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
@@ -176,36 +187,6 @@ def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Str
             stretch.duration_s * frequency,
         ),
     )
-
-
-def _heterogeneity(
-    session: Session, gait: GaitFit | None, energies: Mapping[str, Energies], warn: Warn
-) -> dict[str, Index]:
-    """Indices of each driven plane; their names carry the plane where both are driven."""
-    if gait is None or gait.response is None:
-        return {}
-    planes = by_plane(session.robot, gait.answered)
-    result: dict[str, Index] = {}
-    for plane, names in planes.items():
-        response = gait.response.select([gait.answered.index(name) for name in names])
-        found = response_indices(response)
-        powers = [energies[name].mechanical for name in names]
-        known = [power.abs_j for power in powers if power is not None]
-        if known and len(known) == len(names):
-            found |= energy_indices(np.stack(known))
-        suffix = f"_{plane}" if len(planes) > 1 else ""
-        result |= {f"{name}{suffix}": index for name, index in found.items()}
-        if not found:
-            warn("fewer than two joints respond in one plane: no heterogeneity indices")
-    if result:
-        result["module_share"] = Index(
-            None, None, None, "1", "share of the spread that is due to the modules themselves"
-        )
-        warn(
-            "boundary or module: not separable from a wave in one direction (module_share is "
-            "null); record the reverse"
-        )
-    return result
 
 
 def _provenance(session: Session, options: Options) -> Provenance:

@@ -18,8 +18,8 @@ from scipy.special import chdtr, chndtrinc, fdtrc, ndtri, stdtr
 
 from capture.arrays import FloatArray
 
-from .response import CONFIDENCE, Response, t_factor
-from .result import Index
+from .response import CONFIDENCE, Response, around, t_factor
+from .result import Index, Interval
 
 EQUIVALENT_GAIN = 0.02
 EQUIVALENT_LAG_RAD = np.pi / 180
@@ -27,6 +27,20 @@ EQUIVALENT_LAG_RAD = np.pi / 180
 
 ENDS = 2
 MIDDLE = 5
+
+KINDS: dict[str, tuple[str, str]] = {
+    "gain_cv": ("1", "coefficient of variation of gain"),
+    "lag_sd": ("rad", "circular standard deviation of lag"),
+    "boundary_contrast_gain": ("1", "gain, two end joints minus middle five"),
+    "boundary_contrast_lag": ("rad", "lag, two end joints minus middle five"),
+    "common_response": ("1", "F of H0: all joints have the same gain and delay"),
+    "equivalence_gain": ("1", "largest deviation from the mean; H1: all within 2 %"),
+    "equivalence_lag": ("rad", "largest deviation from the mean; H1: all within 1 degree"),
+    "energy_cv": ("1", "coefficient of variation of E_abs"),
+    "energy_gini": ("1", "Gini coefficient of E_abs"),
+    "module_share": ("1", "share of the spread that is due to the modules themselves"),
+}
+"""Every index: its unit and what it measures."""
 
 _ASYMPTOTIC = 1e4
 """D over noise beyond which the noncentral distribution is replaced by its normal limit."""
@@ -79,6 +93,26 @@ class Spread:
         return low, high
 
 
+def index(
+    name: str,
+    value: float | None = None,
+    ci95: Interval | None = None,
+    p: float | None = None,
+) -> Index:
+    """An index of a known kind.
+
+    Args:
+        name: One of ``KINDS``.
+        value: Its value; None where it can't be computed.
+        ci95: Its 95 % interval.
+        p: p-value of its null.
+
+    Returns:
+        The index with its unit and label.
+    """
+    return Index(value, ci95, p, *KINDS[name])
+
+
 def response_indices(response: Response) -> dict[str, Index]:
     """Indices of gain and lag of one plane's driven joints, head to tail.
 
@@ -87,58 +121,41 @@ def response_indices(response: Response) -> dict[str, Index]:
 
     Returns:
         ``gain_cv``, ``lag_sd``, ``boundary_contrast_gain``, ``boundary_contrast_lag``,
-        ``common_response``, ``equivalence_gain``, ``equivalence_lag``; empty for fewer than two
-        joints.
+        ``common_response``, ``equivalence_gain``, ``equivalence_lag``. None of them for fewer
+        than two joints, no contrasts for fewer than seven.
     """
     count = response.ratio.size
     if count < 2:
         return {}
+    dof = response.dof
     gain, lag = response.gain, _unwrapped(response)
     relative = gain / gain.mean()
-    gain_variance = response.log_gain_variance * relative**2
+    gain_variance, lag_variance = response.log_gain_variance * relative**2, response.lag_variance
     both = spread(
         np.concatenate([np.log(gain), lag]),
-        np.concatenate([response.log_gain_variance, response.lag_variance]),
-        response.dof,
+        np.concatenate([response.log_gain_variance, lag_variance]),
+        dof,
         blocks=2,
     )
-    gains = spread(relative, gain_variance, response.dof)
-    lags = _circular(lag, spread(lag, response.lag_variance, response.dof))
+    gains = spread(relative, gain_variance, dof)
+    lags = _circular(lag, spread(lag, lag_variance, dof))
     result = {
-        "gain_cv": Index(
-            gains.deviation, gains.interval, gains.p, "1", "coefficient of variation of gain"
+        "gain_cv": index("gain_cv", gains.deviation, gains.interval, gains.p),
+        "lag_sd": index("lag_sd", lags.deviation, lags.interval, lags.p),
+        "common_response": index("common_response", both.ratio, None, both.p),
+        "equivalence_gain": index(
+            "equivalence_gain", *_equivalence(relative - 1, gain_variance, dof, EQUIVALENT_GAIN)
         ),
-        "lag_sd": Index(
-            lags.deviation, lags.interval, lags.p, "rad", "circular standard deviation of lag"
+        "equivalence_lag": index(
+            "equivalence_lag",
+            *_equivalence(lag - lag.mean(), lag_variance, dof, EQUIVALENT_LAG_RAD),
         ),
     }
     if count >= MIDDLE + ENDS:
-        for name, values, variance, unit in (
-            ("gain", gain, response.log_gain_variance * gain**2, "1"),
-            ("lag", lag, response.lag_variance, "rad"),
-        ):
-            result[f"boundary_contrast_{name}"] = _contrast(
-                values, variance, response.dof, unit, f"{name}, two end joints minus middle five"
-            )
-    result["common_response"] = Index(
-        both.ratio, None, both.p, "1", "F of H0: all joints have the same gain and delay"
-    )
-    result["equivalence_gain"] = _equivalence(
-        relative - 1,
-        gain_variance,
-        response.dof,
-        margin=EQUIVALENT_GAIN,
-        unit="1",
-        label="gain within 2 %",
-    )
-    result["equivalence_lag"] = _equivalence(
-        lag - lag.mean(),
-        response.lag_variance,
-        response.dof,
-        margin=EQUIVALENT_LAG_RAD,
-        unit="rad",
-        label="lag within 1 degree",
-    )
+        scaled = response.log_gain_variance * gain**2
+        for name, values, variance in (("gain", gain, scaled), ("lag", lag, lag_variance)):
+            key = f"boundary_contrast_{name}"
+            result[key] = index(key, *_contrast(values, variance, dof))
     return result
 
 
@@ -155,8 +172,8 @@ def energy_indices(per_cycle_j: FloatArray) -> dict[str, Index]:
     if per_cycle_j.shape[0] < 2 or not np.any(per_cycle_j):
         return {}
     return {
-        "energy_cv": _jackknifed(per_cycle_j, _cv, "coefficient of variation of E_abs"),
-        "energy_gini": _jackknifed(per_cycle_j, gini, "Gini coefficient of E_abs"),
+        "energy_cv": index("energy_cv", *_jackknifed(per_cycle_j, _cv)),
+        "energy_gini": index("energy_gini", *_jackknifed(per_cycle_j, gini)),
     }
 
 
@@ -230,9 +247,9 @@ def _noncentral_root(value: float, dof: float, quantile: float) -> float:
 
 
 def _contrast(
-    values: FloatArray, variance: FloatArray, dof: FloatArray, unit: str, label: str
-) -> Index:
-    """Mean of the first and last joint minus mean of the middle five."""
+    values: FloatArray, variance: FloatArray, dof: FloatArray
+) -> tuple[float, Interval, float]:
+    """Mean of the first and last joint minus mean of the middle five; interval and p."""
     count = values.size
     weight = np.zeros(count)
     weight[[0, -1]] = 1 / ENDS
@@ -241,8 +258,7 @@ def _contrast(
     parts = weight**2 * variance
     value, error = float(weight @ values), float(parts.sum()) ** 0.5
     freedom = float(parts.sum() ** 2 / np.sum(parts**2 / dof)) if error > 0 else float(dof.min())
-    half = t_factor(freedom) * error
-    return Index(value, (value - half, value + half), _t_p(value, error, freedom), unit, label)
+    return value, around(value, t_factor(freedom) * error), _t_p(value, error, freedom)
 
 
 def _t_p(value: float, error: float, dof: float) -> float:
@@ -250,14 +266,8 @@ def _t_p(value: float, error: float, dof: float) -> float:
 
 
 def _equivalence(
-    deviation: FloatArray,
-    variance: FloatArray,
-    dof: FloatArray,
-    *,
-    margin: float,
-    unit: str,
-    label: str,
-) -> Index:
+    deviation: FloatArray, variance: FloatArray, dof: FloatArray, margin: float
+) -> tuple[float, None, float]:
     """Two one-sided tests (Schuirmann 1987) that every joint is within a margin of the mean.
 
     Claimed for all joints at once, so the largest p counts and needs no correction (intersection
@@ -267,9 +277,7 @@ def _equivalence(
     error = np.sqrt(variance * (1 - 2 / m) + variance.sum() / m**2)
     room = margin - np.abs(deviation)
     score = np.divide(room, error, out=np.sign(room) * np.inf, where=error > 0)
-    worst = float(np.max(stdtr(dof, -score)))
-    largest = float(np.max(np.abs(deviation)))
-    return Index(largest, None, worst, unit, f"largest deviation from the mean; H1: {label}")
+    return float(np.max(np.abs(deviation))), None, float(np.max(stdtr(dof, -score)))
 
 
 def _cv(values: FloatArray) -> float:
@@ -277,15 +285,15 @@ def _cv(values: FloatArray) -> float:
 
 
 def _jackknifed(
-    per_cycle: FloatArray, statistic: Callable[[FloatArray], float], label: str
-) -> Index:
+    per_cycle: FloatArray, statistic: Callable[[FloatArray], float]
+) -> tuple[float, Interval | None]:
     """Statistic of the joints' totals, leaving out one cycle at a time (Tukey 1958)."""
     cycles = per_cycle.shape[1]
     total = per_cycle.sum(axis=1)
     value = statistic(total)
     if cycles < 3:
-        return Index(value, None, None, "1", label)
+        return value, None
     partial = np.array([statistic(total - per_cycle[:, c]) for c in range(cycles)])
     error = ((cycles - 1) / cycles * np.sum((partial - partial.mean()) ** 2)) ** 0.5
     half = t_factor(cycles - 1) * float(error)
-    return Index(value, (max(0.0, value - half), value + half), None, "1", label)
+    return value, (max(0.0, value - half), value + half)

@@ -110,7 +110,6 @@ def joint_results(
         response = responses.get(name)
         part = None if response is None else response.between(span.start_s, span.stop_s)
         fraction = 0.0 if part is None else coverage(part.t_s, span.start_s, span.stop_s)
-        gain, lag = _estimates(gait, name)
         driven = gait is not None and name in gait.driven
         flags: tuple[str, ...] = ("not_recorded",)
         if response is not None and response.count:
@@ -121,6 +120,8 @@ def joint_results(
                 driven_hz=gait.fit.frequency_hz if gait is not None and driven else None,
                 fraction_covered=fraction,
             )
+        # A frozen encoder says nothing about its joint.
+        gain, lag = _estimates(None if "frozen" in flags else gait, name)
         power = energies[name]
         mechanical, electrical = power.mechanical, power.electrical
         results.append(

@@ -191,18 +191,17 @@ def _read(session: Session, wanted: Mapping[str, tuple[str, str]]) -> dict[str, 
 
 def _check_voltage(session: Session, found: dict[str, JointSignals], warn: Warn) -> None:
     """E_el needs the voltage at the motor: a bridge's duty times the supply, not the supply."""
-    if "current" not in found or "voltage" not in found:
-        warn(f"no {CURRENT_TOPIC} or no {VOLTAGE_TOPIC}: electrical energies are null")
+    lacking = [
+        topic
+        for key, topic in (("current", CURRENT_TOPIC), ("voltage", VOLTAGE_TOPIC))
+        if key not in found
+    ]
+    if lacking:
+        warn(f"no {' and no '.join(lacking)}: electrical energies are null")
         found.pop("current", None)
         return
-    kind = session.channels[VOLTAGE_TOPIC].metadata.get("of", "")
-    if kind == "supply":
+    if "scenario" not in session.metadata.get("undulog", {}):
         warn(
-            f"{VOLTAGE_TOPIC} is the supply voltage, not the motor's: electrical energies are null"
-        )
-        del found["voltage"]
-    elif kind != "motor" and "scenario" not in session.metadata.get("undulog", {}):
-        warn(
-            f"{VOLTAGE_TOPIC} does not say whose voltage it is (channel metadata 'of'): taken as "
-            "the motor's; if it is the supply's, the electrical energies are too large"
+            f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, E_el is "
+            "too large"
         )

@@ -43,7 +43,7 @@ def render(analysis: Analysis, *, width: int = _WIDTH, color: bool = False) -> s
     tables = [_joint_table(analysis)]
     if analysis.body is not None:
         tables.append(_body_table(analysis.body))
-    if analysis.heterogeneity:
+    if any(one.value is not None for one in analysis.heterogeneity.values()):
         tables.append(_index_table(analysis.heterogeneity))
     for table in tables:
         prose.print()

@@ -1,5 +1,6 @@
 """Whole sessions of known truth, written by a foreign writer: open, analyse, compare."""
 
+import json
 import struct
 from pathlib import Path
 
@@ -146,7 +147,7 @@ def test_a_ramp_has_no_gait(bag, epoch_ns):
         assert joint.lag_rad.value is None
         assert joint.command_amplitude_rad is None
         assert joint.samples == 600
-    assert result.heterogeneity == {}
+    assert {index.value for index in result.heterogeneity.values()} == {None}
     (why,) = [text for text in result.warnings if text.startswith("no gait")]
     assert "no rhythm of at least 3 cycles" in why
 
@@ -236,6 +237,50 @@ def test_artefacts_are_dropped_flagged_and_said(bag, wave):
     assert result.joints[1].coverage == pytest.approx(0.9, abs=0.02)
     np.testing.assert_allclose(lags(result), truth.lag, atol=1e-7)
     assert any("3 samples that are not numbers and 6 with a time" in t for t in result.warnings)
+
+
+def test_dead_and_frozen_joints_are_left_out_and_named(bag, wave):
+    rng = np.random.default_rng(11)
+    truth = wave(rng, joints=12, duration=8.0)
+    one = bag()
+    for tick, t_ns in enumerate(truth.ticks_ns):
+        response = truth.response(t_ns) + rng.normal(0, 1e-3, 12)
+        response[2] = 0.1
+        response[4] = 0.2 + rng.normal(0, 1e-3)
+        if 300 <= tick < 400:
+            response[6] = 0.1234
+        one.write("/joint_commands", t_ns, truth.names, truth.command(t_ns))
+        one.write("/joint_states", t_ns, truth.names, response)
+    one.close()
+    result = analysed(one.path)
+    lost = [joint.name for joint in result.joints if joint.lag_rad.value is None]
+    assert lost == ["joint03", "joint05", "joint07"]
+    assert all(joint.gain.value is None for joint in result.joints if joint.name in lost)
+    assert [joint.flags for joint in result.joints if joint.flags] == [("frozen",), ("frozen",)]
+    assert any(
+        text.startswith("joint03, joint05, joint07: no response") for text in result.warnings
+    )
+    sound = np.delete(truth.gain, [2, 4, 6])
+    spread = result.heterogeneity["gain_cv"]
+    assert spread.value == pytest.approx(sound.std() / sound.mean(), abs=0.003)
+    assert result.heterogeneity["boundary_contrast_lag"].value is None
+    assert json.dumps(result.to_dict(), allow_nan=False)
+
+
+def test_samples_without_effort_count_no_energy(bag, epoch_ns):
+    one = bag()
+    for tick in range(1000):
+        q = [0.4 * np.sin(5 * tick / 100)]
+        one.write("/joint_commands", epoch_ns + tick * 10**7, ["a"], q)
+        effort = [2.0] if tick < 600 else [np.nan]
+        one.write("/joint_states", epoch_ns + tick * 10**7, ["a"], q, [1.0], effort)
+    one.close()
+    result = analysed(one.path)
+    (window,) = result.gait.windows
+    counted = 6.0 - window.start_s
+    assert result.joints[0].energy_net_j == pytest.approx(2.0 * counted, abs=0.05)
+    assert result.joints[0].coverage == pytest.approx(1.0)
+    assert any("the power of a has gaps" in text for text in result.warnings)
 
 
 def test_missing_commands_and_missing_responses(bag, wave):

@@ -32,7 +32,7 @@ def write_twin(
     lag=0.0,
     change=None,
     odometry=True,
-    voltage_of=None,
+    ledger=None,
 ):
     """A robot with perfect servos (by default) that moves as the viscous null says, K = 6."""
     robot = load_robot("snake25")
@@ -66,6 +66,8 @@ def write_twin(
         parts = [f"{p}.{v}" for p in planes for v in ("A", "omega", "lag", "offset", "phase")]
         gait = w.joint_state("/gait", parts, unit="1")
         odometry = w.odometry("/odom", frame="world", child="link01") if odometry else None
+        terms = ("mechanical_net", "electrical_net")
+        booked = w.joint_state("/energy_ledger", terms, unit="J") if ledger else None
         rng = np.random.default_rng(1)
         for k in ticks:
             t_ns = EPOCH_NS + int(k) * TICK_NS
@@ -81,6 +83,8 @@ def write_twin(
             gait.write(
                 t_ns, np.tile([0.3 * ramp, OMEGA, -np.pi / 3, 0.0, OMEGA * k / 100], len(planes))
             )
+            if booked is not None:
+                booked.write(t_ns, np.array(ledger) * k / 100)
             if odometry is not None:
                 quaternion = np.array([0, 0, np.sin(yaw[k] / 2), np.cos(yaw[k] / 2)])
                 odometry.write(
@@ -165,6 +169,15 @@ def test_weaker_middle_joints_show(tmp_path):
     assert len(robot.joints) == len(result.joints)
     assert result.body is None
     assert any("no head pose on /odom" in text for text in result.warnings)
+
+
+def test_the_twins_own_ledger_is_the_judge(tmp_path):
+    # 13 joints of 0.25 (A omega)^2 W each, and 25 W electrical, which the ledger books as 20 W.
+    mechanical = 13 * 0.25 * (0.3 * OMEGA) ** 2
+    path = write_twin(tmp_path / "booked.mcap", ledger=(mechanical, 20.0), odometry=False)
+    said = [text for text in analysed(path).warnings if "ledger" in text]
+    assert len(said) == 1
+    assert said[0].startswith("electrical energy is 300 J from the samples but 239.8 J")
 
 
 def test_a_change_of_gait_splits_the_session(tmp_path):

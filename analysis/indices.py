@@ -1,0 +1,80 @@
+"""The heterogeneity indices of a session: one set for each driven plane."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from capture.robot import Robot
+
+from .fitting import GaitFit
+from .heterogeneity import ENDS, KINDS, MIDDLE, energy_indices, index, response_indices
+from .joints import Energies
+from .reading import Warn, by_plane
+from .result import Index, JointResult
+
+
+def heterogeneity_indices(
+    robot: Robot | None,
+    gait: GaitFit | None,
+    joints: tuple[JointResult, ...],
+    energies: Mapping[str, Energies],
+    warn: Warn,
+) -> dict[str, Index]:
+    """Indices of each driven plane.
+
+    Args:
+        robot: The robot, or None; then all joints are one chain.
+        gait: The fitted gait, or None.
+        joints: The joints' results.
+        energies: By joint name.
+        warn: Told why an index is None.
+
+    Returns:
+        Every index of :data:`analysis.heterogeneity.KINDS`, None where it can't be computed. Where
+        both planes are driven each has its own, named e.g. ``gain_cv_horizontal``.
+    """
+    unknown = {name: index(name) for name in KINDS}
+    if gait is None or gait.response is None:
+        warn("no joint's gain and lag are known: the heterogeneity indices are null")
+        return unknown
+    known = {joint.name for joint in joints if joint.lag_rad.value is not None}
+    planes = by_plane(robot, gait.driven)
+    result: dict[str, Index] = {}
+    for plane, names in planes.items():
+        sound = [name for name in names if name in known]
+        found = unknown | _of_plane(plane, names, sound, gait, warn)
+        powers = [energies[name].mechanical for name in sound]
+        per_cycle = [power.abs_j for power in powers if power is not None]
+        if per_cycle and len(per_cycle) == len(sound):
+            found |= energy_indices(np.stack(per_cycle))
+        suffix = f"_{plane}" if len(planes) > 1 else ""
+        result |= {f"{name}{suffix}": one for name, one in found.items()}
+    warn(
+        "boundary or module: not separable from a wave in one direction (module_share is null); "
+        "record the reverse"
+    )
+    return result
+
+
+def _of_plane(
+    plane: str, names: list[str], sound: list[str], gait: GaitFit, warn: Warn
+) -> dict[str, Index]:
+    """Indices of gain and lag of one plane; its contrasts need every joint of it."""
+    if gait.response is None or len(sound) < 2:
+        warn(f"fewer than two {plane} joints have a response: its heterogeneity indices are null")
+        return {}
+    found = response_indices(gait.response.select([gait.answered.index(name) for name in sound]))
+    if len(names) < MIDDLE + ENDS:
+        warn(
+            f"{len(names)} driven {plane} joints are too few for a contrast of the ends with the "
+            f"middle {MIDDLE}: the boundary contrasts are null"
+        )
+    elif len(sound) < len(names):
+        warn(
+            f"the {plane} indices leave out joints without gain and lag; the boundary contrasts, "
+            "which need them all, are null"
+        )
+        found = {k: one for k, one in found.items() if not k.startswith("boundary_contrast")}
+    return found
