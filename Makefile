@@ -35,10 +35,11 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	$(call undulog,report $(DEMO)/session.mcap -o $(DEMO)/report.html --force)
 	$(call undulog,view $(DEMO)/session.mcap --save $(DEMO)/replay.rrd --force)
 	@echo 'Where to look next:'
-	@echo '  $(DEMO)/report.html                          the answer on one page, in any browser'
-	@echo '  $(BIN)/rerun $(DEMO)/replay.rrd         the motion'
-	@echo '  $(BIN)/undulog log info $(DEMO)/session.mcap    what was recorded'
-	@echo '  $(BIN)/undulog sim list                       what else can be simulated'
+	@printf '  %-46s %s\n' \
+	  '$(DEMO)/report.html' 'the answer on one page, in any browser' \
+	  '$(BIN)/undulog view $(DEMO)/session.mcap' 'the motion, in Rerun' \
+	  '$(BIN)/undulog log info $(DEMO)/session.mcap' 'what was recorded' \
+	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
 test: $(READY)  ## all tests but the slow ones
 	$(BIN)/python -m pytest -m "not slow"
