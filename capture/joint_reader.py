@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .cdr import layout_of
 from .columns import Messages
 from .errors import DataError, MissingChannelError
 from .joint_rows import JointRows, merge_rows, own_times, rows_of
 from .rosmsg import MessageType
 from .signals import JointSignals
+from .stamp_clock import StampClock
 from .topics import Topics, Window
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -37,27 +37,27 @@ OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
 _SLACK_NS = 5 * _NS
 """How far a sampling time may lie from its log time before a window could miss it."""
 
-_FAR_NS = 3600 * _NS
-"""Stamps further than this from the log time are on another clock (simulated time)."""
-
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
 class JointReader:
     """Joint signals of one session."""
 
-    def __init__(self, path: Path, topics: Topics, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self, path: Path, topics: Topics, clock: StampClock, warn: Callable[[str], None]
+    ) -> None:
         """Keep what reading needs.
 
         Args:
             path: The file, for messages.
             topics: Its topics.
+            clock: Of its header stamps.
             warn: Takes one sentence for each irregularity.
         """
         self._path = path
         self._topics = topics
+        self._clock = clock
         self._warn = warn
-        self._shift_ns: int | None = None
         self._offsets: dict[str, JointSignals] = {}
 
     def read(
@@ -83,8 +83,6 @@ class JointReader:
             None if start is None else start - _SLACK_NS,
             None if stop is None else stop + _SLACK_NS,
         )
-        if self._shift_ns is None:
-            self._shift_ns = self._find_shift(next(iter(wanted)))
         found = self._topics.read({topic: [*_STAMP, *wanted[topic]] for topic in wanted}, wide)
         return {
             (topic, field): self._signals(topic, field, found[topic], window_ns, chain)
@@ -153,38 +151,12 @@ class JointReader:
         found = self._topics.read({topic: list(UNITS)}, (None, None))[topic]
         return [name for name in UNITS if any(name in group.columns for group in found.groups)]
 
-    def _find_shift(self, topic: str) -> int:
-        """How far the topic's clock is from the log's [ns], 0 unless it is another clock."""
-        first = self._topics.first(topic)
-        if first is None:
-            return 0
-        log_ns, message, kind = first
-        try:
-            leaves = layout_of(kind, message).leaves
-        except DataError:
-            return 0
-        sec, nanosec = (
-            int(np.frombuffer(message, leaves[path].dtype, 1, leaves[path].offset)[0])
-            for path in _STAMP
-        )
-        stamp_ns = sec * _NS + nanosec
-        if not stamp_ns or abs(log_ns - stamp_ns) <= _FAR_NS:
-            return 0
-        # Whole seconds, so that all topics of the session get the same shift.
-        shift_s = round((log_ns - stamp_ns) / _NS)
-        self._warn(
-            f"header stamps lie {-shift_s} s from the log times (another clock, such as simulated "
-            "time); they are shifted by that"
-        )
-        return shift_s * _NS
-
     def _on_log_clock(self, row: JointRows, topic: str) -> JointRows:
         if len(row.stamp_ns) and not row.stamp_ns.any():
             self._warn(f"{topic}: header stamps are zero; log times are used instead")
             return JointRows(row.names, row.log_ns, row.log_ns, row.values)
-        if self._shift_ns:
-            return JointRows(row.names, row.stamp_ns + self._shift_ns, row.log_ns, row.values)
-        return row
+        shift_ns = self._clock.shift_ns(topic)
+        return JointRows(row.names, row.stamp_ns + shift_ns, row.log_ns, row.values)
 
     def _at_own_times(
         self, topic: str, names: Sequence[str], times: Sequence[IntArray]

@@ -22,6 +22,7 @@ from .joint_reader import JointReader
 from .robot import Robot
 from .robot_file import parse_robot
 from .signals import JointSignals
+from .stamp_clock import StampClock
 from .storage import LogFile
 from .topics import Channel, Topics, Window
 
@@ -45,7 +46,8 @@ class Session:
         self._file = LogFile(self.path)
         self._warnings = list(self._file.warnings)
         self._topics = Topics(self._file, self._warn)
-        self._joints = JointReader(self.path, self._topics, self._warn)
+        self._clock = StampClock(self._topics, self._warn)
+        self._joints = JointReader(self.path, self._topics, self._clock, self._warn)
 
     @classmethod
     def open(cls, path: Path | str) -> Self:
@@ -221,7 +223,8 @@ class Session:
             stop_ns: One past the last log time wanted [Unix ns]; None for the end.
 
         Returns:
-            Index ``t_ns``: header.stamp [Unix ns], or the log time where the type has none.
+            Index ``t_ns``: header.stamp [Unix ns] on the log's clock, or the log time where the
+            type has none or the stamp is zero.
             Columns by field path, e.g. ``pose.pose.position.x`` or ``position[3]``, units as the
             message type has them.
 
@@ -230,7 +233,8 @@ class Session:
             DataError: If its type can't be read.
         """
         groups = self._groups(topic, None, (start_ns, stop_ns))
-        frames = [_frame(group) for group in groups]
+        shift_ns = self._clock.shift_ns(topic)
+        frames = [_frame(group, shift_ns) for group in groups]
         if not frames:
             return pd.DataFrame(index=pd.Index([], dtype="int64", name="t_ns"))
         table = pd.concat(frames) if len(frames) > 1 else frames[0]
@@ -295,7 +299,7 @@ class Session:
         return found.groups
 
 
-def _frame(group: Group) -> pd.DataFrame:
+def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """One layout group as a table."""
     count = sum(map(len, group.log_ns))
     columns: dict[str, Any] = {}
@@ -311,6 +315,7 @@ def _frame(group: Group) -> pd.DataFrame:
     for prefix in ("header.", ""):
         if f"{prefix}stamp.sec" in columns:
             seconds = columns.pop(f"{prefix}stamp.sec").astype(np.int64)
-            t_ns = seconds * _NS + columns.pop(f"{prefix}stamp.nanosec").astype(np.int64)
+            stamp_ns = seconds * _NS + columns.pop(f"{prefix}stamp.nanosec").astype(np.int64)
+            t_ns = np.where(stamp_ns == 0, t_ns, stamp_ns + shift_ns)
             break
     return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"))

@@ -386,6 +386,7 @@ def test_simulated_time_is_shifted_to_the_log_clock(tmp_path: Path) -> None:
         commands = session.joints("/joint_commands")
         assert len(states.t_ns[0]) == 50
         np.testing.assert_array_equal(states.t_ns[0], commands.t_ns[0])
+        np.testing.assert_array_equal(session.table("/joint_states").index, commands.t_ns[0])
         assert "another clock" in session.warnings[0]
 
 
