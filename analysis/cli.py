@@ -74,8 +74,10 @@ def analyse(
         return
     from .table import render
 
-    width = shutil.get_terminal_size((118, 24)).columns
-    texts = [render(one, width=width, color=sys.stdout.isatty()) for one in results]
+    # Into a file or a pipe nothing is wrapped: one sentence, one line.
+    terminal = sys.stdout.isatty()
+    look = {"width": shutil.get_terminal_size().columns, "color": True} if terminal else {}
+    texts = [render(one, **look) for one in results]
     print("\n".join(texts), end="")
     if output is not None:
         print(f"Result: {output}")

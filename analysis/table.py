@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _MISSING = "–"
-_WIDTH = 118
+_UNLIMITED = 10_000
 
 
-def render(analysis: Analysis, *, width: int = _WIDTH, color: bool = False) -> str:
+def render(analysis: Analysis, *, width: int = _UNLIMITED, color: bool = False) -> str:
     """Set a result as text.
 
     Args:
         analysis: The result.
-        width: Columns of the terminal: sentences wrap there, tables are never cut.
+        width: Columns of the terminal: sentences wrap there, but for the first line and the tables.
         color: Whether to use bold and dim type.
 
     Returns:
@@ -38,8 +38,8 @@ def render(analysis: Analysis, *, width: int = _WIDTH, color: bool = False) -> s
             file=text, width=columns, color_system=system, force_terminal=color, highlight=False
         )
 
-    prose, wide = console(max(width, 40)), console(10_000)
-    prose.print(answer(analysis), style="bold", markup=False)
+    prose, wide = console(max(width, 40)), console(_UNLIMITED)
+    wide.print(answer(analysis), style="bold", markup=False)
     tables = [_joint_table(analysis)]
     if analysis.body is not None:
         tables.append(_body_table(analysis.body))
