@@ -72,12 +72,12 @@ def analyse(
     if json:
         emit_json(whole)
         return
-    from .table import render
+    from .table import UNLIMITED, render
 
     # Into a file or a pipe nothing is wrapped: one sentence, one line.
     terminal = sys.stdout.isatty()
-    look = {"width": shutil.get_terminal_size().columns, "color": True} if terminal else {}
-    texts = [render(one, **look) for one in results]
+    width = shutil.get_terminal_size().columns if terminal else UNLIMITED
+    texts = [render(one, width=width, color=terminal) for one in results]
     print("\n".join(texts), end="")
     if output is not None:
         print(f"Result: {output}")

@@ -14,10 +14,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _MISSING = "–"
-_UNLIMITED = 10_000
+UNLIMITED = 10_000
+"""A width at which nothing wraps."""
 
 
-def render(analysis: Analysis, *, width: int = _UNLIMITED, color: bool = False) -> str:
+def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -> str:
     """Set a result as text.
 
     Args:
@@ -38,7 +39,7 @@ def render(analysis: Analysis, *, width: int = _UNLIMITED, color: bool = False) 
             file=text, width=columns, color_system=system, force_terminal=color, highlight=False
         )
 
-    prose, wide = console(max(width, 40)), console(_UNLIMITED)
+    prose, wide = console(max(width, 40)), console(UNLIMITED)
     wide.print(answer(analysis), style="bold", markup=False)
     tables = [_joint_table(analysis)]
     if analysis.body is not None:
