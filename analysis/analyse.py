@@ -11,7 +11,7 @@ import numpy as np
 
 from capture import Session
 from capture.environment import base_versions
-from capture.signals import Signal
+from capture.log.signals import Signal
 
 from .body_motion import body_motion
 from .coupling import one_gait_coupling

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray
-from capture.kinematics import link_poses, rotation_from_quaternion
 from capture.robot import Plane, Robot
+from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from .gait import allowed_model
 from .harmonic import HarmonicFit, HarmonicModel, fit_at

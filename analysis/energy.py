@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import FloatArray, IntArray
-from capture.signals import Signal
+from capture.log.signals import Signal
 
 from .series import GAP_FACTOR, Series, clean, coverage, sample_weights
 

@@ -9,8 +9,8 @@ from typing import Any, cast
 
 from capture import Session
 from capture.errors import MissingChannelError
+from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
-from capture.signals import JointSignals, Signal
 
 from .null import DRAG_RATIO
 

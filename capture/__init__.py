@@ -17,12 +17,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .log.session import Session
+    from .log.signals import JointSignals, Signal
+    from .log.topics import Channel
+    from .log.writer import SessionWriter
     from .robot import Robot
-    from .robot_file import load_robot, robot_names
-    from .session import Session
-    from .signals import JointSignals, Signal
-    from .topics import Channel
-    from .writer import SessionWriter
+    from .robot.description import load_robot, robot_names
 
 __all__ = [
     "Channel",
@@ -36,14 +36,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Channel": "topics",
-    "JointSignals": "signals",
+    "Channel": "log.topics",
+    "JointSignals": "log.signals",
     "Robot": "robot",
-    "Session": "session",
-    "SessionWriter": "writer",
-    "Signal": "signals",
-    "load_robot": "robot_file",
-    "robot_names": "robot_file",
+    "Session": "log.session",
+    "SessionWriter": "log.writer",
+    "Signal": "log.signals",
+    "load_robot": "robot.description",
+    "robot_names": "robot.description",
 }
 
 

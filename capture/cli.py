@@ -11,8 +11,8 @@ from .console import emit_json
 from .errors import UsageError
 
 if TYPE_CHECKING:
-    from .column_map import ColumnMap
-    from .import_output import ImportReport
+    from .exchange.column_map import ColumnMap
+    from .exchange.import_output import ImportReport
     from .robot import Robot
 
 
@@ -50,11 +50,11 @@ def import_log(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from .can_import import import_can
     from .console import refuse_existing
-    from .csv_import import import_csv
+    from .exchange.can_import import import_can
+    from .exchange.csv_import import import_csv
     from .interruption import interruptible
-    from .robot_file import load_robot
+    from .robot.description import load_robot
 
     _require_mcap(output)
     refuse_existing(output, force=force)
@@ -97,7 +97,7 @@ def export_log(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from .log_export import export_log as export
+    from .exchange.log_export import export_log as export
 
     report = export(session, output, bus=bus, force=force)
     if json:
@@ -118,7 +118,7 @@ def _column_map(
     log: Path, robot: Robot, columns: Path | None, options: tuple[str, ...]
 ) -> ColumnMap | None:
     """The column map of a CSV log; None for a log of CAN frames."""
-    from .csv_import import is_frame_csv
+    from .exchange.csv_import import is_frame_csv
 
     if not log.is_file():
         raise UsageError(f"{log}: no such file")
@@ -126,7 +126,7 @@ def _column_map(
         if columns is not None or options:
             raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
         return None
-    from .column_map import column_map_from_options, read_column_map
+    from .exchange.column_map import column_map_from_options, read_column_map
 
     if (columns is None) == (not options):
         given = "not both" if options else "to say what its columns mean"

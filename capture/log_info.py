@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .console import emit_json
-from .session import Session
+from .log.session import Session
 
 
 def describe(session: Session) -> dict[str, Any]:

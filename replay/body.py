@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rerun.components import FillMode
 
 from capture.arrays import FloatArray
-from capture.kinematics import quaternion_from_rotation
 from capture.palette import joint_colors
 from capture.robot import Robot
+from capture.robot.kinematics import quaternion_from_rotation
 
 from .colors import power_colors, power_limit
 from .joints import GREY

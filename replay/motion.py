@@ -8,8 +8,8 @@ import numpy as np
 
 from capture import Session
 from capture.arrays import FloatArray, IntArray
-from capture.kinematics import link_poses, rotation_from_quaternion
 from capture.robot import Robot
+from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from .sampling import decimate, hold, interpolate, mark_gaps, ordered
 from .tracks import Track, resampled

@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 from analysis.result import Analysis
 from capture import Session
 from capture.errors import DataError, LogWriteError
-from capture.kinematics import rotation_from_quaternion
+from capture.robot.kinematics import rotation_from_quaternion
 
 from . import body, facts, gait, joints, markers, power, ranges, trail
 from .blueprint import build_blueprint

@@ -11,7 +11,7 @@ import numpy as np
 from capture import Session
 from capture.arrays import FloatArray, IntArray
 from capture.errors import DataError, MissingChannelError
-from capture.signals import JointSignals
+from capture.log.signals import JointSignals
 
 from .sampling import ordered
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from capture.errors import SimulationError
 from capture.interruption import StopRequest
+from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain
-from capture.writer import SessionWriter
 
 from .ledger import TERMS
 from .scenario import Scenario

@@ -62,7 +62,7 @@ from typing import Any
 
 from capture.errors import Fault, ScenarioError, UsageError
 from capture.robot import Plane, Robot, Servo
-from capture.robot_file import load_robot, robot_names
+from capture.robot.description import load_robot, robot_names
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
 from .contact import FrictionLaw, Ground

@@ -15,8 +15,8 @@ from importlib.metadata import version
 
 import numpy as np
 
-from capture.kinematics import rotation_from_quaternion
-from capture.writer import SessionWriter
+from capture.log.writer import SessionWriter
+from capture.robot.kinematics import rotation_from_quaternion
 
 from .ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario

@@ -6,7 +6,7 @@ import pytest
 from analysis.energy import integrate, power_of
 from analysis.flags import joint_flags
 from analysis.series import Series, clean, coverage, sample_weights
-from capture.signals import Signal
+from capture.log.signals import Signal
 
 SECOND = 10**9
 

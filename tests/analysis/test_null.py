@@ -15,8 +15,8 @@ from analysis.null import (
 )
 from analysis.series import Series
 from capture import load_robot
-from capture.kinematics import quaternion_from_rotation
 from capture.robot import ClockDomain, Joint, Link, Plane, Robot
+from capture.robot.kinematics import quaternion_from_rotation
 
 
 def planar_robot(links=13, plane=Plane.HORIZONTAL):

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capture import load_robot
-from capture.bit_field import BitField
-from capture.bus import BusDecoder
+from capture.bus.bit_field import BitField
+from capture.bus.decoding import BusDecoder
 from capture.errors import DataError
-from capture.frames import (
+from capture.log.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -23,7 +23,7 @@ from capture.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
-from capture.robot_file import parse_robot
+from capture.robot.description import parse_robot
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from capture.candump import candump_lines, read_candump
 from capture.errors import ImportFormatError
-from capture.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from capture.exchange.candump import candump_lines, read_candump
+from capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 
 
 def read(path):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from capture import Session, load_robot
-from capture.can_logs import RELATIVE_EPOCH_NS
-from capture.column_map import column_map_from_options, read_column_map
-from capture.csv_import import import_csv, is_frame_csv
 from capture.errors import FaultyFileError, ImportFormatError, UsageError
+from capture.exchange.can_logs import RELATIVE_EPOCH_NS
+from capture.exchange.column_map import column_map_from_options, read_column_map
+from capture.exchange.csv_import import import_csv, is_frame_csv
 from capture.interruption import StopRequest
 
 ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"

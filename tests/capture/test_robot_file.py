@@ -9,7 +9,7 @@ import pytest
 from capture import load_robot, robot_names
 from capture.errors import RobotFileError, UsageError
 from capture.robot import ClockDomain, Direction, Plane, Quantity, SensorKind, Servo
-from capture.robot_file import parse_robot
+from capture.robot.description import parse_robot
 
 MINIMAL = """
 name = "worm"

@@ -15,7 +15,6 @@ from mcap_ros2.writer import Writer as RosWriter
 from rosbags.highlevel import AnyReader
 
 from capture import Session, SessionWriter, load_robot
-from capture.cdr import encode
 from capture.errors import (
     DataError,
     LogError,
@@ -24,8 +23,9 @@ from capture.errors import (
     NotALogError,
     OutputExistsError,
 )
-from capture.frames import DIR_TX, EXTENDED_FLAG, empty_frames
-from capture.schemas import message_type, schema_text
+from capture.log.cdr import encode
+from capture.log.frames import DIR_TX, EXTENDED_FLAG, empty_frames
+from capture.log.schemas import message_type, schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.kinematics import link_poses
+from capture.robot.kinematics import link_poses
 from replay.body import ROUNDING, capsule_columns, capsule_poses, capsule_shape, segment_power
 from replay.markers import above_joints
 from replay.motion import HeadPath, assemble

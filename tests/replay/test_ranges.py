@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.kinematics import link_poses
 from capture.robot import Sensor, SensorKind
+from capture.robot.kinematics import link_poses
 from replay.ranges import rays, sensor_topic
 
 

@@ -9,8 +9,8 @@ import pybullet
 import pytest
 
 from capture.errors import UsageError
-from capture.kinematics import link_poses, rotation_from_quaternion
 from capture.robot import Link
+from capture.robot.kinematics import link_poses, rotation_from_quaternion
 from sim.body import Body
 from sim.twin import Twin
 from sim.urdf import frame_origins, urdf

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.kinematics import rotation_from_quaternion
+from capture.robot.kinematics import rotation_from_quaternion
 from sim.contact import FrictionLaw, Ground, contact_law, friction_force, normal_force, tangents
 
 MU = np.array([[0.05], [0.5]])

@@ -14,7 +14,7 @@ import pytest
 from capture import Session
 from capture.errors import OutputExistsError, SimulationError
 from capture.interruption import StopRequest
-from capture.kinematics import link_poses, rotation_from_quaternion
+from capture.robot.kinematics import link_poses, rotation_from_quaternion
 from sim import Ground, Noise, World, load_scenario, parse_scenario
 from sim.ledger import TERMS
 from sim.record import record

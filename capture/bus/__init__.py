@@ -1,0 +1,1 @@
+"""Frames of a CAN bus, and what they mean by DBC and bus map."""

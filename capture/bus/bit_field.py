@@ -1,0 +1,112 @@
+"""One signal in the data bytes of many CAN frames at once.
+
+Bit numbering is that of DBC files: bit ``n`` is bit ``n % 8`` (0 the least significant) of byte
+``n // 8``. An Intel (little-endian) signal starts at its least significant bit and runs upwards;
+a Motorola (big-endian) one starts at its most significant bit and runs downwards through each byte
+and on to the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray
+
+if TYPE_CHECKING:
+    from cantools.database.can.signal import Signal
+
+_FLOATS: dict[int, type[np.floating[Any]]] = {16: np.float16, 32: np.float32, 64: np.float64}
+_UNSIGNED: dict[int, type[np.unsignedinteger[Any]]] = {16: np.uint16, 32: np.uint32, 64: np.uint64}
+
+
+@dataclass(frozen=True)
+class BitField:
+    """Where a signal lies and what its bits mean.
+
+    Attributes:
+        start: Start bit.
+        length: Number of bits, 1 to 64.
+        little_endian: Intel byte order.
+        signed: Two's complement.
+        is_float: IEEE 754 of 16, 32 or 64 bits.
+        scale: Physical value of one.
+        offset: Physical value of zero.
+    """
+
+    start: int
+    length: int
+    little_endian: bool = True
+    signed: bool = False
+    is_float: bool = False
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @classmethod
+    def of(cls, signal: Signal) -> BitField:
+        """The field of a DBC signal.
+
+        Args:
+            signal: The signal.
+
+        Returns:
+            Its layout and conversion.
+        """
+        return cls(
+            start=signal.start,
+            length=signal.length,
+            little_endian=signal.byte_order == "little_endian",
+            signed=signal.is_signed,
+            is_float=signal.is_float,
+            scale=float(signal.scale),
+            offset=float(signal.offset),
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of data bytes that a frame must have to hold it."""
+        first = self.start if self.little_endian else self._from_top
+        return (first + self.length - 1) // 8 + 1
+
+    @property
+    def _from_top(self) -> int:
+        """Position of a Motorola start bit, counted from the top bit of byte 0."""
+        return 8 * (self.start // 8) + 7 - self.start % 8
+
+    def raw(self, data: NDArray[np.uint8]) -> NDArray[Any]:
+        """The bits as numbers, not yet scaled.
+
+        Args:
+            data: Data bytes, shape (n, 8), C-contiguous; ``size`` is at most 8.
+
+        Returns:
+            Shape (n,), of type uint64, int64 or the field's floating type.
+        """
+        words: NDArray[np.uint64] = data.view("<u8" if self.little_endian else ">u8")[:, 0]
+        words = words.astype(np.uint64)
+        unused = 64 - self.length
+        # The field goes to the top of the word, so that one shift down drops the bits above it
+        # and, arithmetic for signed fields, extends the sign.
+        up = unused - self.start if self.little_endian else self._from_top
+        top = words << np.uint64(up)
+        if self.is_float:
+            bits = (top >> np.uint64(unused)).astype(_UNSIGNED[self.length])
+            return bits.view(_FLOATS[self.length])
+        if self.signed:
+            return top.view(np.int64) >> np.int64(unused)
+        return top >> np.uint64(unused)
+
+    def values(self, data: NDArray[np.uint8]) -> FloatArray:
+        """The physical values.
+
+        Args:
+            data: Data bytes, shape (n, 8), C-contiguous; ``size`` is at most 8.
+
+        Returns:
+            ``scale * raw + offset``, shape (n,).
+        """
+        with np.errstate(invalid="ignore"):  # a NaN in the frame is a NaN in the log
+            return self.raw(data).astype(np.float64) * self.scale + self.offset

@@ -1,0 +1,105 @@
+"""Joints that are sampled in turn, gathered into messages that carry all of them.
+
+Servos on a bus answer one after the other. One message holds one such round: its stamp is the time
+of the round's first sample, and each joint's own time follows from its offset to that stamp, so no
+sample is moved in time. A round ends when a joint comes round again, or after
+:data:`LONGEST_ROUND_NS`; joints that are missing from it are NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray
+
+LONGEST_ROUND_NS = 100_000_000
+"""No round spans more than this [ns]: later samples belong to the next one."""
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """Complete rounds of samples.
+
+    Attributes:
+        stamp_ns: Time of the first sample of each round [Unix ns], shape (g,).
+        last_ns: Latest sample time of each round [Unix ns], shape (g,).
+        offset_s: Sample time minus stamp [s], NaN where missing, shape (g, m).
+        values: NaN where missing, shape (g, m, q).
+    """
+
+    stamp_ns: IntArray
+    last_ns: IntArray
+    offset_s: FloatArray
+    values: FloatArray
+
+
+class RoundGatherer:
+    """Gathers samples into rounds, over any number of calls."""
+
+    def __init__(self, joints: int, quantities: int) -> None:
+        """Start with no samples.
+
+        Args:
+            joints: Number of joints m.
+            quantities: Number of values q a sample.
+        """
+        self._joints = joints
+        self._t_ns: IntArray = np.empty(0, dtype=np.int64)
+        self._joint: IntArray = np.empty(0, dtype=np.int64)
+        self._values: FloatArray = np.empty((0, quantities), dtype=np.float64)
+
+    def add(self, t_ns: IntArray, joint: IntArray, values: FloatArray) -> Rounds:
+        """Add samples in the order in which they were recorded.
+
+        Args:
+            t_ns: Sample times [Unix ns], shape (k,).
+            joint: Joint indices, shape (k,).
+            values: Shape (k, q).
+
+        Returns:
+            The rounds that are complete now; the last one may still grow and is kept back.
+        """
+        self._append(t_ns, joint, values)
+        starts = list(_round_starts(self._t_ns, self._joint))
+        return self._take(starts[:-1], starts[-1] if starts else 0)
+
+    def finish(self) -> Rounds:
+        """The last round, complete or not."""
+        starts = list(_round_starts(self._t_ns, self._joint))
+        return self._take(starts, len(self._t_ns))
+
+    def _append(self, t_ns: IntArray, joint: IntArray, values: FloatArray) -> None:
+        self._t_ns = np.concatenate([self._t_ns, t_ns])
+        self._joint = np.concatenate([self._joint, joint])
+        self._values = np.concatenate([self._values, values])
+
+    def _take(self, starts: list[int], stop: int) -> Rounds:
+        """Turn the samples before ``stop`` into rounds and keep the rest."""
+        t_ns, joint, values = self._t_ns[:stop], self._joint[:stop], self._values[:stop]
+        self._t_ns, self._joint = self._t_ns[stop:], self._joint[stop:]
+        self._values = self._values[stop:]
+        lengths = np.diff([*starts, stop])
+        which = np.repeat(np.arange(len(starts)), lengths)
+        stamp_ns = t_ns[starts]
+        shape = (len(starts), self._joints)
+        offset_s = np.full(shape, np.nan)
+        offset_s[which, joint] = (t_ns - stamp_ns[which]) * 1e-9
+        gathered = np.full((*shape, values.shape[1]), np.nan)
+        gathered[which, joint] = values
+        last_ns = np.maximum.reduceat(t_ns, starts) if starts else stamp_ns
+        return Rounds(stamp_ns, last_ns, offset_s, gathered)
+
+
+def _round_starts(t_ns: IntArray, joint: IntArray) -> Iterator[int]:
+    """Index of the first sample of each round."""
+    seen: set[int] = set()
+    begun = 0
+    for i, (t, j) in enumerate(zip(t_ns.tolist(), joint.tolist(), strict=True)):
+        if not seen or j in seen or abs(t - begun) > LONGEST_ROUND_NS:
+            seen.clear()
+            begun = t
+            yield i
+        seen.add(j)

@@ -1,0 +1,1 @@
+"""Logs of other makes, in and out: CAN traces, CSV."""

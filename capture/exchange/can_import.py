@@ -1,0 +1,172 @@
+"""Logs of CAN frames into sessions: every frame kept raw, and what the robot's bus map names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from ..bus.decoding import BusDecoder, FrameTally
+from ..bus.frame_log import FrameLog, LogBlock
+from ..console import progress
+from ..errors import ImportFormatError
+from ..interruption import StopRequest
+from ..log.channels import FrameChannel
+from ..log.frames import FrameArray
+from ..log.writer import SessionWriter
+from ..robot import Robot
+from .can_logs import log_suffix, open_frame_log
+from .decoded_topics import DecodedTopics, Message
+from .import_output import ImportReport, imported_session
+
+FRAME_TOPIC_PREFIX = "/can/"
+"""Raw frames of bus ``can0`` are on ``/can/can0``."""
+
+DIRECTIONS_KEY = "import.directions"
+"""Metadata key: ``recorded``, or ``none`` for a log that doesn't tell sent from received."""
+
+_BATCH_NS = 50_000_000  # one message of raw frames spans at most this
+
+
+def import_can(
+    source: Path,
+    output: Path,
+    robot: Robot,
+    *,
+    bus: str | None = None,
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ImportReport:
+    """Turn a log of CAN frames into a session.
+
+    Every classic frame is kept raw on ``/can/<bus>``. The frames of one bus are decoded by the
+    robot's databases and bus map onto the topics of the log contract
+    (:mod:`capture.exchange.decoded_topics`); each sample keeps the time of its frame.
+
+    Args:
+        source: The log: candump, ASC, BLF, TRC, python-can CSV or SQLite, MF4.
+        output: The session to write.
+        robot: The robot that made the log.
+        bus: The bus to decode; the first one in the log if None.
+        force: Replace an existing file.
+        stop: Ends the import early, with a whole file of what was read so far.
+
+    Returns:
+        What was done.
+
+    Raises:
+        ImportFormatError: If the log can't be read or has no such bus.
+        OutputExistsError: If the output is there and ``force`` is not given.
+        LogWriteError: If the output can't be written.
+    """
+    report = ImportReport(source, output, robot.name, frames=0)
+    with open_frame_log(source) as log, progress(f"import {source.name}", 1.0) as bar:
+        blocks = iter(log.blocks)
+        first = next(blocks, None)
+        if first is None:
+            raise ImportFormatError(source, "holds no classic CAN frames")
+        chosen = bus or log.buses[int(first.bus[0])]
+        facts = {
+            "import.format": log_suffix(source).removeprefix("."),
+            "import.time": log.time,
+            DIRECTIONS_KEY: "recorded" if log.directions else "none",
+            "import.bus": chosen,
+        }
+        report.start_ns = report.end_ns = int(first.frames["t_host_ns"][0])
+        with imported_session(
+            source, output, robot, epoch_ns=report.start_ns, facts=facts, force=force
+        ) as writer:
+            work = _Import(writer, robot, log, chosen, report)
+            for block in chain([first], blocks):
+                work.add(block)
+                bar.update(block.done)
+                if stop is not None and stop.requested:
+                    report.complete = False
+                    break
+            work.finish()
+            if chosen not in log.buses:
+                raise ImportFormatError(
+                    source, f"has no frames of bus {chosen}; it has {', '.join(log.buses)}"
+                )
+            writer.set_verdict(report.verdict, [*report.problems, *report.notes])
+    return report
+
+
+class _Import:
+    """One import at work."""
+
+    def __init__(
+        self, writer: SessionWriter, robot: Robot, log: FrameLog, chosen: str, report: ImportReport
+    ) -> None:
+        self._writer, self._log, self._chosen, self._report = writer, log, chosen, report
+        self._decoder = BusDecoder(robot, directions=log.directions) if robot.bus else None
+        self._topics = DecodedTopics(writer, robot, self._decoder) if self._decoder else None
+        self._channels: dict[str, FrameChannel] = {}
+        self._tally = FrameTally()
+        self._other_buses: dict[str, int] = {}
+        self._latest_ns: dict[str, int] = {}
+        self._backward = 0
+
+    def add(self, block: LogBlock) -> None:
+        messages: list[Message] = []
+        for index, name in enumerate(self._log.buses):
+            frames = block.frames[block.bus == index]
+            if not len(frames):
+                continue
+            messages += self._raw_messages(name, frames)
+            if name != self._chosen:
+                self._other_buses[name] = self._other_buses.get(name, 0) + len(frames)
+            elif self._decoder is not None and self._topics is not None:
+                samples, tally = self._decoder.decode(frames)
+                self._tally.add(tally)
+                messages += self._topics.add(samples)
+        self._write(messages)
+        self._note_times(block.frames)
+
+    def finish(self) -> None:
+        report, log = self._report, self._log
+        if self._topics is not None:
+            self._write(self._topics.finish())
+        report.problems += log.problems + self._tally.problems()
+        if self._backward:
+            report.problems.append(f"{self._backward} frames are stamped before the one ahead")
+        if self._decoder is None:
+            report.problems.append(f"nothing decoded: the robot {report.robot} has no bus map")
+        report.notes += self._tally.notes()
+        for name, count in self._other_buses.items():
+            report.notes.append(f"{count} frames of bus {name} kept raw, not decoded")
+        if not log.directions:
+            report.notes.append("the log has no directions: all frames count as received")
+
+    def _write(self, messages: list[Message]) -> None:
+        for message in sorted(messages, key=lambda message: message.log_ns):
+            message.write()
+            samples = self._report.samples
+            samples[message.topic] = samples.get(message.topic, 0) + 1
+
+    def _note_times(self, frames: FrameArray) -> None:
+        t_ns = frames["t_host_ns"].astype(np.int64)
+        report = self._report
+        report.frames = (report.frames or 0) + len(frames)
+        self._backward += int((np.diff(t_ns, prepend=report.end_ns) < 0).sum())
+        report.start_ns = min(report.start_ns, int(t_ns.min()))
+        report.end_ns = max(report.end_ns, int(t_ns.max()))
+
+    def _raw_messages(self, name: str, frames: FrameArray) -> Iterator[Message]:
+        """Batches of raw frames; their log times increase, so that their order is kept."""
+        topic = FRAME_TOPIC_PREFIX + name
+        if name not in self._channels:
+            self._channels[name] = self._writer.frames(topic)
+        channel = self._channels[name]
+        t_ns = np.maximum.accumulate(frames["t_host_ns"].astype(np.int64))
+        ends = np.flatnonzero(np.diff(t_ns // _BATCH_NS)) + 1
+        for batch in np.split(np.arange(len(frames)), ends):
+            latest_ns = max(self._latest_ns.get(name, 0) + 1, int(t_ns[batch[-1]]))
+            self._latest_ns[name] = latest_ns
+            yield Message(topic, latest_ns, _writing(channel, latest_ns, frames[batch]))
+
+
+def _writing(channel: FrameChannel, log_ns: int, frames: FrameArray) -> Callable[[], None]:
+    return lambda: channel.write(log_ns, frames)

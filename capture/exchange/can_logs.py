@@ -1,0 +1,243 @@
+"""Logs of CAN frames that other tools write: candump by ourselves, the rest by python-can.
+
+python-can hands out times as floating-point seconds, which at today's Unix time resolve 0.24 us;
+they are rounded to 1 us, the resolution of the formats it reads. Logs whose times count from their
+own start (ASC, some TRC) are put at :data:`RELATIVE_EPOCH_NS`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import logging
+import os
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO, cast
+
+from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
+from ..errors import ImportFormatError
+from ..log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from .candump import read_candump
+
+if TYPE_CHECKING:
+    from can import Message
+    from can.io.generic import MessageReader
+
+RELATIVE_EPOCH_NS = 946_684_800_000_000_000
+"""Where a log without a date is put: 2000-01-01T00:00:00Z [Unix ns]."""
+
+SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
+"""Suffixes of the logs that can be read, each also with ``.gz`` behind it where it is text."""
+
+CSV_HEADER = "timestamp,arbitration_id,"
+"""How a CSV file begins that python-can wrote; any other needs a column map."""
+
+_EARLIEST_S = 1e8  # less is no date but a time since the log's start
+_WITHOUT_DIRECTIONS = (".csv", ".db")
+_READ_ERRORS = (
+    ValueError,  # text that is no number, a wrong file version
+    IndexError,
+    KeyError,
+    TypeError,
+    EOFError,
+    OSError,
+    struct.error,
+    zlib.error,
+    sqlite3.Error,
+)
+
+
+@contextmanager
+def open_frame_log(path: Path) -> Generator[FrameLog]:
+    """Open a log of CAN frames by its suffix.
+
+    Args:
+        path: The file, with one of :data:`SUFFIXES`.
+
+    Yields:
+        The log.
+
+    Raises:
+        ImportFormatError: If there is no such file, its format isn't known or isn't what its
+            suffix says, or it holds no frames; also while its blocks are taken.
+    """
+    if not path.is_file():
+        raise ImportFormatError(path, "no such file")
+    suffix = log_suffix(path)
+    if suffix not in SUFFIXES:
+        raise ImportFormatError(path, f"is no CAN log by its suffix; valid: {', '.join(SUFFIXES)}")
+    if suffix == ".log":
+        opener = gzip.open if path.suffix == ".gz" else open
+        with cast("TextIO", opener(path, "rt", encoding="ascii", errors="replace")) as lines:
+            yield read_candump(path, _lines(path, lines))
+        return
+    reader = _reader(path)
+    try:
+        yield _python_can_log(path, reader, suffix)
+    finally:
+        reader.stop()
+
+
+def log_suffix(path: Path) -> str:
+    """The suffix that tells the format, in lower case: that before ``.gz``, if compressed.
+
+    Args:
+        path: The file.
+
+    Returns:
+        E.g. ``.asc``.
+    """
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    return next((suffix for suffix in reversed(suffixes) if suffix != ".gz"), "")
+
+
+def _reader(path: Path) -> MessageReader:
+    from can import LogReader
+
+    try:
+        if log_suffix(path) == ".blf" and path.suffix != ".gz":
+            _check_blf(path)  # its reader would leave the file open
+        return LogReader(path)
+    except NotImplementedError as error:  # raised for MF4 where asammdf is not installed
+        raise ImportFormatError(
+            path, "MF4 is read by the package asammdf, which is not installed: pip install asammdf"
+        ) from error
+    except _READ_ERRORS as error:
+        raise ImportFormatError(path, f"can't be read: {error}") from error
+
+
+def _check_blf(path: Path) -> None:
+    with path.open("rb") as stream:
+        if stream.read(4) != b"LOGG":
+            raise ValueError("not a BLF file")
+
+
+def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
+    messages = _messages(path, reader)
+    first = next(messages, None)
+    if first is None:
+        raise ImportFormatError(path, "holds no CAN frames")
+    relative = first.timestamp < _EARLIEST_S
+    log = FrameLog(
+        blocks=iter(()),
+        buses=[],
+        directions=suffix not in _WITHOUT_DIRECTIONS,
+        time="counted from the log's start, put at 2000-01-01T00:00:00Z; rounded to 1 us"
+        if relative
+        else "as recorded, rounded to 1 us",
+    )
+    epoch_ns = RELATIVE_EPOCH_NS if relative else 0
+    log.blocks = _blocks(path, chain([first], messages), log, epoch_ns, lambda: _read_part(reader))
+    claimed = getattr(reader, "file_size", 0)  # of a BLF file, by its header
+    if suffix == ".blf" and claimed > path.stat().st_size:
+        log.problems.append(
+            f"the file is cut short: {path.stat().st_size} bytes of the {claimed} in its header"
+        )
+    return log
+
+
+def _lines(path: Path, stream: TextIO) -> Iterator[str]:
+    """The lines of a text, its errors with the file."""
+    try:
+        yield from stream
+    except (OSError, EOFError) as error:  # a damaged .gz, above all
+        raise ImportFormatError(path, f"can't be read: {error}") from error
+
+
+def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
+    """The reader's messages, its errors with the file and the place."""
+    count = 0
+    try:
+        for message in reader:
+            yield message
+            count += 1
+    except _READ_ERRORS as error:
+        text = f"can't be read after {count} frames: {error}"
+        raise ImportFormatError(path, text) from error
+
+
+def _read_part(reader: MessageReader) -> float:
+    """How much of its file a reader has taken, 0 to 1; 0 where it can't be told."""
+    stream = getattr(reader, "file", None)
+    raw = getattr(stream, "buffer", stream)  # of a text stream, which itself can't tell
+    if not isinstance(raw, io.BufferedIOBase):
+        return 0.0
+    try:
+        return raw.tell() / os.fstat(raw.fileno()).st_size
+    except (OSError, ZeroDivisionError):
+        return 0.0
+
+
+def _blocks(
+    path: Path,
+    messages: Iterator[Message],
+    log: FrameLog,
+    epoch_ns: int,
+    done: Callable[[], float],
+) -> Iterator[LogBlock]:
+    rows = BlockBuilder()
+    fd_frames = 0
+    with _noted("can", log.problems):
+        for message in messages:
+            if message.is_fd:
+                fd_frames += 1
+                continue
+            _append(rows, message, log, epoch_ns, path)
+            if len(rows) == FRAMES_PER_BLOCK:
+                yield rows.block(done())
+                rows = BlockBuilder()
+    if fd_frames:
+        log.problems.append(f"{fd_frames} CAN FD frames left out: only classic frames are kept")
+    if len(rows):
+        yield rows.block(1.0)
+
+
+def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, path: Path) -> None:
+    t_ns = epoch_ns + round(message.timestamp * 1e6) * 1000
+    if t_ns < 0:
+        raise ImportFormatError(path, f"has a frame at {message.timestamp} s, before 1970")
+    flags = (
+        (ERROR_FLAG if message.is_error_frame else 0)
+        | (REMOTE_FLAG if message.is_remote_frame else 0)
+        | (EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
+    )
+    channel = message.channel
+    bus = f"can{channel}" if isinstance(channel, int) else str(channel or "can0")
+    if bus not in log.buses:
+        log.buses.append(bus)
+    rows.append(
+        t_ns=t_ns,
+        id_flags=message.arbitration_id | flags,
+        dlc=message.dlc,
+        way=DIR_RX if message.is_rx else DIR_TX,
+        bus=log.buses.index(bus),
+        data=bytes(message.data[:8]),
+    )
+
+
+class _Noting(logging.Handler):
+    """Keeps the warnings of a logger."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._problems = problems
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._problems.append(record.getMessage())
+
+
+@contextmanager
+def _noted(name: str, problems: list[str]) -> Generator[None]:
+    """Note what a library only warns of, e.g. a line that it passes over."""
+    logger, handler = logging.getLogger(name), _Noting(problems)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)

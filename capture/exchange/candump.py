@@ -1,0 +1,166 @@
+"""The log format of ``candump -L``, read and written exactly.
+
+One frame a line::
+
+    (1717639553.000022) can0 14B#9B00000000000000 T
+
+that is time [s], interface, identifier (three hexadecimal digits, eight if extended or an error
+frame), data, and in newer versions the direction: ``T`` sent, ``R`` received. ``ID#R`` or
+``ID#R8`` is a remote frame; ``_9`` to ``_F`` after eight data bytes is a raw length code above 8;
+``ID##`` begins a CAN FD frame. Source: ``lib.c`` of https://github.com/linux-can/can-utils.
+
+Times are kept as integers, so what is read here and written again is the same text.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
+from ..errors import ImportFormatError
+from ..log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    ID_MASK,
+    REMOTE_FLAG,
+    FrameArray,
+)
+
+_LINE = re.compile(
+    r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
+    r"(?:((?:[0-9A-Fa-f]{2}){0,8})(?:_([9A-Fa-f]))?|R([0-8]?)|#[0-9A-Fa-f]+)"
+    r"(?:\s+([RTrt]))?\s*"
+)
+_NS = 1_000_000_000
+
+
+def read_candump(path: Path, lines: Iterator[str]) -> FrameLog:
+    """Read a candump log.
+
+    Args:
+        path: The file, for messages.
+        lines: Its lines, with their line ends.
+
+    Returns:
+        The log; faults in its lines are raised while its blocks are taken.
+
+    Raises:
+        ImportFormatError: If a line is not what candump writes, or there is none.
+    """
+    head = next(lines, "")
+    match = _LINE.fullmatch(head)
+    if match is None:
+        raise ImportFormatError(path, f"is not a candump log; its first line is {_quoted(head)}")
+    log = FrameLog(iter(()), [], match[8] is not None, "as recorded, exact")
+    log.blocks = _blocks(path, chain([head], lines), log)
+    return log
+
+
+def _blocks(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[LogBlock]:
+    rows = BlockBuilder()
+    fd_frames = other_way = done = 0
+    size = max(path.stat().st_size, 1)
+    for number, line in enumerate(lines, start=1):
+        done += len(line)
+        match = _LINE.fullmatch(line)
+        if match is None:
+            if not line.strip():
+                continue
+            if not line.endswith("\n"):
+                log.problems.append(f"the last line is cut short and left out: {_quoted(line)}")
+                break
+            raise ImportFormatError(path, f"line {number} is no candump line: {_quoted(line)}")
+        if match[5] is None and match[7] is None:
+            fd_frames += 1
+            continue
+        other_way += (match[8] is not None) != log.directions
+        _append(rows, match, log.buses)
+        if len(rows) == FRAMES_PER_BLOCK:
+            yield rows.block(done / size)
+            rows = BlockBuilder()
+    if fd_frames:
+        log.problems.append(f"{fd_frames} CAN FD frames left out: only classic frames are kept")
+    if other_way:
+        having = "without" if log.directions else "with"
+        log.problems.append(f"{other_way} frames {having} a direction, unlike the first one")
+    if len(rows):
+        yield rows.block(1.0)
+
+
+def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
+    seconds, fraction, bus, digits, data, raw_dlc, remote_dlc, way = match.groups()
+    identifier = int(digits, 16)
+    if remote_dlc is not None:
+        flags, dlc, data = REMOTE_FLAG, int(remote_dlc or 0), ""
+    else:
+        flags, dlc = 0, int(raw_dlc, 16) if raw_dlc else len(data) // 2
+    if len(digits) == 8:
+        # candump prints the error flag within the digits, and nothing else above 29 bits.
+        flags |= ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
+    if bus not in buses:
+        buses.append(bus)
+    rows.append(
+        t_ns=int(seconds) * _NS + int(fraction.ljust(9, "0")),
+        id_flags=(identifier & ID_MASK) | flags,
+        dlc=dlc,
+        way=DIR_TX if way in {"T", "t"} else DIR_RX,
+        bus=buses.index(bus),
+        data=bytes.fromhex(data),
+    )
+
+
+def candump_lines(
+    frames: FrameArray, buses: list[str], bus: IntArray, *, directions: bool
+) -> Iterator[str]:
+    """Frames as candump writes them.
+
+    Args:
+        frames: The frames, in the order wanted, shape (n,).
+        buses: Interface names.
+        bus: Index into ``buses`` for each frame, shape (n,).
+        directions: Whether to write ``R`` and ``T``.
+
+    Yields:
+        One line a frame, with its line end. Times have six decimals, as candump has them, or nine
+        if a time needs them.
+    """
+    t_ns: NDArray[np.uint64] = frames["t_host_ns"]
+    digits, unit = (9, 1) if bool((t_ns % 1000).any()) else (6, 1000)
+    columns = (
+        t_ns.tolist(),
+        frames["id_flags"].tolist(),
+        frames["dlc"].tolist(),
+        frames["dir"].tolist(),
+        bus.tolist(),
+    )
+    data = frames["data"].tobytes()
+    for i, (t, id_flags, dlc, way, which) in enumerate(zip(*columns, strict=True)):
+        seconds, rest = divmod(t, _NS)
+        payload = data[8 * i : 8 * i + min(dlc, 8)].hex().upper()
+        if id_flags & REMOTE_FLAG:
+            payload = f"R{dlc or ''}"
+        elif dlc > 8:
+            payload += f"_{dlc:X}"
+        tail = (" T" if way == DIR_TX else " R") if directions else ""
+        time = f"({seconds}.{rest // unit:0{digits}d})"
+        yield f"{time} {buses[which]} {_identifier(id_flags)}#{payload}{tail}\n"
+
+
+def _identifier(id_flags: int) -> str:
+    if id_flags & ERROR_FLAG:
+        return f"{id_flags & (ID_MASK | ERROR_FLAG):08X}"
+    return f"{id_flags & ID_MASK:0{8 if id_flags & EXTENDED_FLAG else 3}X}"
+
+
+def _quoted(line: str) -> str:
+    text = line.rstrip("\n")
+    return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -1,0 +1,266 @@
+"""CSV logs into sessions, by a column map."""
+
+from __future__ import annotations
+
+import csv
+import math
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray
+from ..console import progress
+from ..errors import ImportFormatError
+from ..interruption import StopRequest
+from ..log.writer import SessionWriter
+from ..robot import Quantity, Robot
+from ..strict_table import listed
+from ..units import SESSION_UNIT, TIME_UNITS, unit_for
+from .can_logs import CSV_HEADER, RELATIVE_EPOCH_NS
+from .column_map import Column, ColumnMap
+from .decoded_topics import JOINT_TOPIC
+from .import_output import ImportReport, imported_session
+
+_EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
+_ROWS_PER_UPDATE = 4096
+_BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+
+
+def is_frame_csv(path: Path) -> bool:
+    """Whether a CSV file holds CAN frames, as python-can writes them.
+
+    Args:
+        path: The file.
+
+    Returns:
+        False for any other table; also for a file that can't be read.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as stream:
+            return stream.readline().startswith(CSV_HEADER)
+    except OSError:
+        return False
+
+
+def import_csv(
+    source: Path,
+    output: Path,
+    robot: Robot,
+    column_map: ColumnMap,
+    *,
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ImportReport:
+    """Turn a CSV log into a session.
+
+    Positions go to ``/joint_states``, with velocities and efforts beside them; commands, currents,
+    voltages and temperatures to their own topics. An empty cell is no sample: NaN where other
+    joints have one, no message where none has. Times since the log's start, that is before 1973,
+    are put at 2000-01-01T00:00:00Z.
+
+    Args:
+        source: The log, with a header line.
+        output: The session to write.
+        robot: The robot that made the log.
+        column_map: What its columns mean.
+        force: Replace an existing file.
+        stop: Ends the import early, with a whole file of what was written so far.
+
+    Returns:
+        What was done.
+
+    Raises:
+        ImportFormatError: If the log lacks a column or a cell is no number; names row and column.
+        OutputExistsError: If the output is there and ``force`` is not given.
+        LogWriteError: If the output can't be written.
+    """
+    table = _read(source, column_map)
+    relative = abs(int(table.t_ns[0])) < _EARLIEST_NS
+    t_ns = table.t_ns + (RELATIVE_EPOCH_NS if relative else 0)
+    report = ImportReport(
+        source, output, robot.name, start_ns=int(t_ns[0]), end_ns=int(t_ns[-1]), notes=table.notes
+    )
+    facts = {
+        "import.format": "csv",
+        "import.time": "counted from the log's start, put at 2000-01-01T00:00:00Z"
+        if relative
+        else "as recorded",
+    }
+    with (
+        imported_session(
+            source, output, robot, epoch_ns=report.start_ns, facts=facts, force=force
+        ) as writer,
+        progress(f"import {source.name}", len(t_ns)) as bar,
+    ):
+        writer.attach("columns.toml", "application/toml", column_map.toml().encode())
+        topics = [
+            _Topic(writer, robot, quantities, column_map.columns, table.values)
+            for quantities in _topics_of({column.quantity for column in column_map.columns})
+        ]
+        for i, t in enumerate(t_ns.tolist()):
+            if i % _ROWS_PER_UPDATE == 0:
+                bar.update(i)
+                if stop is not None and stop.requested:
+                    report.complete, report.end_ns = False, t
+                    break
+            for topic in topics:
+                topic.write(i, t)
+        report.samples = {topic.name: topic.count for topic in topics}
+        writer.set_verdict(report.verdict, [*report.problems, *report.notes])
+    return report
+
+
+@dataclass(frozen=True)
+class _TimedColumns:
+    """Times [ns] since whatever the log counts from, (n,), and values of each column, (n,)."""
+
+    t_ns: IntArray
+    values: list[FloatArray]
+    notes: list[str]
+
+
+class _Topic:
+    """One JointState topic: the joints that have a column for it, in chain order."""
+
+    def __init__(
+        self,
+        writer: SessionWriter,
+        robot: Robot,
+        quantities: Sequence[Quantity],
+        columns: Sequence[Column],
+        values: Sequence[FloatArray],
+    ) -> None:
+        found = {
+            (column.joint, column.quantity): series
+            for column, series in zip(columns, values, strict=True)
+        }
+        names = [n for n in robot.joint_names if any((n, q) in found for q in quantities)]
+        missing = np.full(len(values[0]), np.nan)
+        fields = [
+            np.stack([found.get((name, quantity), missing) for name in names], axis=1)
+            for quantity in quantities
+        ]
+        self.name = JOINT_TOPIC[quantities[0]]
+        self.count = 0
+        self._filled = ~np.all([np.isnan(field).all(axis=1) for field in fields], axis=0)
+        self._position, self._rest = fields[0], dict(zip(quantities[1:], fields[1:], strict=True))
+        self._channel = writer.joint_state(
+            self.name,
+            names,
+            unit=SESSION_UNIT[quantities[0]],
+            velocity=Quantity.VELOCITY in self._rest,
+            effort=Quantity.EFFORT in self._rest,
+        )
+
+    def write(self, row: int, t_ns: int) -> None:
+        if not self._filled[row]:
+            return
+        velocity, effort = (
+            self._rest[quantity][row] if quantity in self._rest else ()
+            for quantity in _BESIDE_POSITION
+        )
+        self._channel.write(t_ns, self._position[row], velocity, effort)
+        self.count += 1
+
+
+def _topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
+    """The quantities of each topic; a row's velocity and effort belong to its position."""
+    beside = [q for q in _BESIDE_POSITION if q in present and Quantity.POSITION in present]
+    for quantity in JOINT_TOPIC:
+        if quantity is Quantity.POSITION and quantity in present:
+            yield (quantity, *beside)
+        elif quantity in present and quantity not in beside:
+            yield (quantity,)
+
+
+def _read(source: Path, column_map: ColumnMap) -> _TimedColumns:
+    try:
+        with source.open(encoding="utf-8-sig", newline="") as stream:
+            return _read_stream(source, stream, column_map)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportFormatError(source, f"can't be read: {error}") from error
+
+
+def _read_stream(source: Path, stream: TextIO, column_map: ColumnMap) -> _TimedColumns:
+    reader = csv.reader(stream, delimiter=column_map.delimiter, skipinitialspace=True)
+    header = [name.strip() for name in next(reader, list[str]())]
+    wanted = [column_map.time_column, *(column.column for column in column_map.columns)]
+    places = [_place(source, header, name) for name in wanted]
+    unit_ns = TIME_UNITS[column_map.time_unit]
+    times: list[int] = []
+    cells = [array("d") for _ in column_map.columns]
+    for row in reader:
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise ImportFormatError(
+                source, f"row {reader.line_num} has {len(row)} cells, the header {len(header)}"
+            )
+        where = _cell_namer(source, reader.line_num)
+        t_ns = _time_ns(row[places[0]], unit_ns, where, wanted[0])
+        if times and t_ns < times[-1]:
+            raise where(wanted[0], f"time goes back, from {times[-1] / unit_ns:g}")
+        times.append(t_ns)
+        for numbers, place, name in zip(cells, places[1:], wanted[1:], strict=True):
+            numbers.append(_number(row[place], where, name))
+    if not times:
+        raise ImportFormatError(source, "has no rows below its header")
+    series = [np.frombuffer(numbers, dtype=np.float64) for numbers in cells]
+    notes = [
+        f"column {column.column!r}: {count} cells without a value"
+        for column, values in zip(column_map.columns, series, strict=True)
+        if (count := int(np.isnan(values).sum()))
+    ]
+    values = [
+        _converted(column, values)
+        for column, values in zip(column_map.columns, series, strict=True)
+    ]
+    return _TimedColumns(np.array(times, dtype=np.int64), values, notes)
+
+
+def _place(source: Path, header: list[str], name: str) -> int:
+    if header.count(name) != 1:
+        found = f"{header.count(name)} columns" if name in header else "no column"
+        raise ImportFormatError(source, f"has {found} {name!r}; it has {listed(header, name)}")
+    return header.index(name)
+
+
+def _cell_namer(source: Path, row: int) -> Callable[[str, str], ImportFormatError]:
+    return lambda column, what: ImportFormatError(source, f"row {row}, column {column!r}: {what}")
+
+
+def _time_ns(
+    cell: str, unit_ns: int, where: Callable[[str, str], ImportFormatError], name: str
+) -> int:
+    """A time in ns, without going through a double, which can't hold Unix times to the ns."""
+    try:
+        return round(Decimal(cell.strip()) * unit_ns)
+    except (InvalidOperation, ValueError, OverflowError) as error:
+        raise where(name, f"{cell!r} is not a time") from error
+
+
+def _number(cell: str, where: Callable[[str, str], ImportFormatError], name: str) -> float:
+    if not cell or cell.isspace():
+        return math.nan
+    try:
+        number = float(cell)
+    except ValueError as error:
+        raise where(name, f"{cell!r} is not a number") from error
+    if math.isinf(number):
+        raise where(name, f"{cell!r} is not a finite number")
+    return number
+
+
+def _converted(column: Column, values: FloatArray) -> FloatArray:
+    """Cells in the session's unit: unwrapped, scaled and offset, converted."""
+    plain = values.copy()
+    if column.wrap:
+        known = ~np.isnan(plain)
+        plain[known] = np.unwrap(plain[known], period=column.wrap)
+    unit = unit_for(column.unit, column.quantity)
+    return unit.convert(column.scale * plain + column.offset)

@@ -1,0 +1,1 @@
+"""The log: messages, MCAP storage, the session writer and reader."""

@@ -1,0 +1,99 @@
+"""Chunks of an MCAP file: decompression and the walk over records.
+
+Format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import lz4.frame  # pyright: ignore[reportMissingTypeStubs]
+import zstandard
+
+from ..arrays import IntArray
+
+PREFIX_SIZE = 9
+"""Opcode (u8) and length (u64) before each record's body."""
+
+Buffer = bytes | mmap.mmap
+
+
+@dataclass
+class Block:
+    """A stretch of messages: one chunk, or the unchunked messages of a file.
+
+    Attributes:
+        start: First payload byte in the file.
+        stop: One past the last payload byte in the file.
+        compression: ``zstd``, ``lz4`` or empty.
+        size: Uncompressed size [byte].
+        crc: CRC-32 of the uncompressed payload, 0 where there is none.
+        start_ns: Earliest log time in it [ns].
+        end_ns: Latest log time in it [ns].
+        index_at: Channel id to the file offset of its MessageIndex record.
+        offsets: Channel id to message offsets in the payload; filled where there is no index.
+        complete: False for a chunk that the end of the file cuts short.
+    """
+
+    start: int
+    stop: int
+    compression: str
+    size: int
+    crc: int
+    start_ns: int
+    end_ns: int
+    index_at: dict[int, int] = field(default_factory=dict[int, int])
+    offsets: dict[int, IntArray] | None = None
+    complete: bool = True
+
+
+def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
+    """Decompress a payload; of a cut one, as much as there is.
+
+    Args:
+        compression: ``zstd`` or ``lz4``.
+        raw: The compressed bytes.
+        size: Uncompressed size of the whole payload [byte]; no more than this is produced.
+        whole: False where the end of the file cuts ``raw`` short.
+
+    Returns:
+        The payload, or its readable beginning.
+
+    Raises:
+        RuntimeError: If the compression is unknown or the lz4 frame is damaged.
+        zstandard.ZstdError: If the zstd frame is damaged.
+    """
+    if compression == "zstd":
+        if whole:
+            return zstandard.ZstdDecompressor().decompress(raw, max_output_size=max(size, 1))
+        return zstandard.ZstdDecompressor().decompressobj().decompress(raw)
+    if compression == "lz4":
+        frame = cast("Any", lz4.frame.LZ4FrameDecompressor())  # the package has no types
+        return bytes(frame.decompress(raw, max_length=size))
+    raise RuntimeError(f"unknown compression {compression!r}")
+
+
+def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
+    """Walk records back to back.
+
+    Args:
+        data: The bytes.
+        start: Offset of the first record's opcode.
+        stop: One past the last byte to look at.
+
+    Yields:
+        Opcode, body start and body stop of each whole record in [start, stop).
+    """
+    at = start
+    while at + PREFIX_SIZE <= stop:
+        opcode = data[at]
+        (length,) = struct.unpack_from("<Q", data, at + 1)
+        body = at + PREFIX_SIZE
+        if body + length > stop:
+            return
+        yield opcode, body, body + length
+        at = body + length

@@ -1,0 +1,321 @@
+"""The session reader: any log to the contract, and any ROS 2 bag with JointStates, as columns.
+
+Opening reads the summary only. Columns are read when asked for, over a time window if given;
+whatever could not be read is said in ``warnings``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+
+from ..errors import DataError, RobotFileError
+from ..robot import Robot
+from ..robot.description import parse_robot
+from .columns import Group
+from .frames import FRAME_DTYPE, FrameArray, empty_frames, frames_from_bytes
+from .joint_reader import JointReader
+from .signals import JointSignals
+from .stamp_clock import StampClock
+from .storage import LogFile
+from .topics import Channel, Topics, Window
+
+_NS = 1_000_000_000
+
+
+class Session:
+    """A recorded session, opened for reading."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Open a session.
+
+        Args:
+            path: The MCAP file.
+
+        Raises:
+            NotALogError: If it is not an MCAP file or nothing in it can be read.
+            LogError: If it can't be opened.
+        """
+        self.path = Path(path)
+        self._file = LogFile(self.path)
+        self._warnings = list(self._file.warnings)
+        self._topics = Topics(self._file, self._warn)
+        self._clock = StampClock(self._topics, self._warn)
+        self._joints = JointReader(self.path, self._topics, self._clock, self._warn)
+
+    @classmethod
+    def open(cls, path: Path | str) -> Self:
+        """Open a session; the same as calling the class.
+
+        Args:
+            path: The MCAP file.
+
+        Returns:
+            The session, usable in a ``with`` block.
+
+        Raises:
+            NotALogError: If it is not an MCAP file or nothing in it can be read.
+            LogError: If it can't be opened.
+        """
+        return cls(path)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        """Nothing to do: the file is open."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Release the file."""
+        self.close()
+
+    @property
+    def channels(self) -> Mapping[str, Channel]:
+        """Topic to channel."""
+        return self._topics.channels
+
+    # -- facts -----------------------------------------------------------------------------
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing or doubtful, one sentence each; grows while columns are read."""
+        return list(self._warnings)
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of the first message [Unix ns]; 0 where there is none."""
+        return min((block.start_ns for block in self._filled()), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """Log time of the last message [Unix ns]; 0 where there is none."""
+        return max((block.end_ns for block in self._filled()), default=0)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return (self.end_ns - self.start_ns) / _NS
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """The file's metadata records; ``undulog`` holds session id, epoch and versions."""
+        return MappingProxyType(self._file.metadata)
+
+    @property
+    def attachments(self) -> Mapping[str, bytes]:
+        """Attached files, e.g. ``robot.toml``, by name."""
+        stored = self._file.attachments
+        return MappingProxyType({name: item.data for name, item in stored.items()})
+
+    @property
+    def session_id(self) -> str:
+        """The session's id, or the file's name for a log that has none."""
+        return self._file.metadata.get("undulog", {}).get("session_id") or self.path.stem
+
+    @cached_property
+    def robot(self) -> Robot | None:
+        """The robot whose description is attached, or None."""
+        stored = self.attachments
+        if "robot.toml" not in stored:
+            return None
+        databases = {
+            name: data.decode("utf-8", "replace")
+            for name, data in stored.items()
+            if name.endswith(".dbc")
+        }
+        try:
+            text = stored["robot.toml"].decode()
+            return parse_robot(text, source=f"{self.path}:robot.toml", databases=databases)
+        except (RobotFileError, UnicodeDecodeError) as error:
+            self._warn(f"the attached robot description can't be used: {error}")
+            return None
+
+    @property
+    def verdict(self) -> str | None:
+        """The recorder's final health verdict, or None."""
+        return self._file.metadata.get("undulog.health", {}).get("verdict")
+
+    @property
+    def library(self) -> str:
+        """The library that wrote the file."""
+        return self._file.library
+
+    @property
+    def profile(self) -> str:
+        """The MCAP profile, ``ros2`` for a log to the contract."""
+        return self._file.profile
+
+    # -- columns ---------------------------------------------------------------------------
+
+    def joints(
+        self,
+        topic: str,
+        field: str = "position",
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> JointSignals:
+        """One quantity of all joints of a JointState topic.
+
+        Args:
+            topic: E.g. ``/joint_states``.
+            field: ``position``, ``velocity`` or ``effort``.
+            start_ns: First sampling time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
+
+        Returns:
+            The samples, in the robot's chain order where the session has a robot, at their own
+            sampling times: header.stamp plus the logged sample offset.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If the topic is not of JointStates or the field is none of the three.
+        """
+        return self.joint_columns({topic: [field]}, start_ns=start_ns, stop_ns=stop_ns)[
+            topic, field
+        ]
+
+    def joint_columns(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Several quantities in one pass over the file.
+
+        Args:
+            wanted: Topic to fields, e.g. ``{"/joint_states": ["position", "velocity"]}``.
+            start_ns: First sampling time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
+
+        Returns:
+            (topic, field) to samples, as :meth:`joints` gives them.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If a topic is not of JointStates or a field is none of the three.
+        """
+        chain = self.robot.joint_names if self.robot is not None else ()
+        return self._joints.read(wanted, (start_ns, stop_ns), chain)
+
+    def table(
+        self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> pd.DataFrame:
+        """All numbers and strings of a topic, one row a message.
+
+        Args:
+            topic: Any topic whose type has a ``ros2msg`` schema.
+            start_ns: First log time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last log time wanted [Unix ns]; None for the end.
+
+        Returns:
+            Index ``t_ns``: header.stamp [Unix ns] on the log's clock, or the log time where the
+            type has none or the stamp is zero.
+            Columns by field path, e.g. ``pose.pose.position.x`` or ``position[3]``, units as the
+            message type has them.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If its type can't be read.
+        """
+        groups = self._groups(topic, None, (start_ns, stop_ns))
+        shift_ns = self._clock.shift_ns(topic)
+        frames = [_frame(group, shift_ns) for group in groups]
+        if not frames:
+            return pd.DataFrame(index=pd.Index([], dtype="int64", name="t_ns"))
+        table = pd.concat(frames) if len(frames) > 1 else frames[0]
+        return table.sort_index(kind="stable")
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Decode a topic message by message, for types of any shape (slow).
+
+        Args:
+            topic: Any topic with a ``ros2msg`` schema.
+
+        Yields:
+            Log time [Unix ns] and the decoded message, fields as attributes.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a message can't be decoded.
+        """
+        decode = self._topics.decoder(topic)
+        for log_ns, message in self._topics.raw(topic):
+            yield log_ns, decode(message)
+
+    def frames(self, topic: str) -> FrameArray:
+        """All raw CAN frames of a bus, in the order they were logged.
+
+        Args:
+            topic: E.g. ``/can/can0``.
+
+        Returns:
+            Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If the topic holds something else.
+        """
+        groups = self._groups(topic, ["data"], (None, None))
+        batches: list[tuple[int, int, FrameArray]] = []
+        for group in groups:
+            data = group.values("data")
+            if data.shape[1] % FRAME_DTYPE.itemsize or not group.layout.strings:
+                raise DataError(f"{self.path}: {topic} does not hold frames of 32 bytes")
+            places = zip(group.times().tolist(), np.concatenate(group.order).tolist(), strict=True)
+            for (log_ns, order), row in zip(places, data, strict=True):
+                batches.append((log_ns, order, frames_from_bytes(row.tobytes())))
+        batches.sort(key=lambda batch: batch[:2])
+        return np.concatenate([empty_frames(0), *(frames for _, _, frames in batches)])
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _warn(self, sentence: str) -> None:
+        if sentence not in self._warnings:
+            self._warnings.append(sentence)
+
+    def _filled(self) -> list[Any]:
+        return [block for block in self._file.blocks if block.end_ns]
+
+    def _groups(self, topic: str, paths: Sequence[str] | None, window_ns: Window) -> list[Group]:
+        found = self._topics.read({topic: paths}, window_ns)[topic]
+        if found.unread:
+            why = found.unread[0].why
+            self._warn(f"{topic}: {len(found.unread)} messages can't be read: {why}")
+        return found.groups
+
+
+def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
+    """One layout group as a table."""
+    count = sum(map(len, group.log_ns))
+    columns: dict[str, Any] = {}
+    for path, text in group.layout.strings.items():
+        columns[path] = np.full(count, text, dtype=object)
+    for path, leaf in group.layout.leaves.items():
+        values = group.values(path)
+        if leaf.is_array:
+            columns |= {f"{path}[{k}]": values[:, k] for k in range(leaf.count)}
+        else:
+            columns[path] = values[:, 0]
+    t_ns = group.times()
+    for prefix in ("header.", ""):
+        if f"{prefix}stamp.sec" in columns:
+            seconds = columns.pop(f"{prefix}stamp.sec").astype(np.int64)
+            stamp_ns = seconds * _NS + columns.pop(f"{prefix}stamp.nanosec").astype(np.int64)
+            t_ns = np.where(stamp_ns == 0, t_ns, stamp_ns + shift_ns)
+            break
+    return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"))

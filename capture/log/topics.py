@@ -1,0 +1,198 @@
+"""The topics of an open log: their channels, message types, and the general decoder."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, cast
+
+from mcap.exceptions import McapError
+from mcap.records import Schema
+
+from ..errors import DataError, MissingChannelError
+from .columns import Messages, Request, message_blocks, message_bytes, read_messages
+from .rosmsg import MessageType, parse_message_type
+from .storage import LogFile
+
+Window = tuple[int | None, int | None]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One topic of a session.
+
+    Attributes:
+        topic: E.g. ``/joint_states``.
+        type_name: E.g. ``sensor_msgs/msg/JointState``.
+        count: Number of messages.
+        metadata: Of the channel, e.g. ``unit``.
+    """
+
+    topic: str
+    type_name: str
+    count: int
+    metadata: Mapping[str, str]
+
+
+class Topics:
+    """Reads topics of one file by name."""
+
+    def __init__(self, log_file: LogFile, warn: Callable[[str], None]) -> None:
+        """Sort the file's channels by topic.
+
+        Args:
+            log_file: The open file.
+            warn: Takes one sentence for each irregularity.
+        """
+        self._file = log_file
+        self._warn = warn
+        self._types: dict[str, MessageType] = {}
+        self._ids: dict[str, list[int]] = {}
+        for channel in log_file.channels.values():
+            self._ids.setdefault(channel.topic, []).append(channel.id)
+        self.channels: Mapping[str, Channel] = MappingProxyType(
+            {topic: self._channel(topic) for topic in self._ids}
+        )
+
+    def read(
+        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+    ) -> dict[str, Messages]:
+        """Read topics in one pass.
+
+        Args:
+            wanted: Topic to leaf paths; None for all.
+            window_ns: Half-open window of log times [Unix ns]; None for open ends.
+
+        Returns:
+            Topic to messages.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If a topic's type can't be read.
+        """
+        requests = [
+            Request(self._channel_ids(topic), self.message_type(topic), paths)
+            for topic, paths in wanted.items()
+        ]
+        found = read_messages(self._file, requests, window_ns=window_ns, warn=self._warn)
+        return dict(zip(wanted, found, strict=True))
+
+    def message_type(self, topic: str) -> MessageType:
+        """The type of a topic's messages.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            The parsed schema.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the schema can't be read.
+        """
+        if topic not in self._types:
+            schema = self._schema(topic)
+            text = schema.data.decode("utf-8", "replace")
+            self._types[topic] = parse_message_type(schema.name, text)
+        return self._types[topic]
+
+    def first(self, topic: str) -> tuple[int, bytes, MessageType] | None:
+        """The first message of a topic.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            Log time [Unix ns], bytes and type; None where there is none.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the topic's type can't be read.
+        """
+        kind = self.message_type(topic)
+        for log_ns, message in self.raw(topic):
+            return log_ns, message, kind
+        return None
+
+    def raw(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """The messages of a topic as bytes, in the order of the file.
+
+        Args:
+            topic: Its name.
+
+        Yields:
+            Log time [Unix ns] and the message's bytes.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+        """
+        ids = self._channel_ids(topic)
+        for data, (offsets,) in message_blocks(self._file, [ids], (None, None), self._warn):
+            for offset in offsets.tolist():
+                yield message_bytes(data, offset)
+
+    def decoder(self, topic: str) -> Callable[[bytes], Any]:
+        """The general decoder of a topic, for messages of any shape.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            A function from bytes to a message with fields as attributes; it raises DataError for a
+            damaged message.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the topic's schema can't be used.
+        """
+        from mcap_ros2.decoder import DecoderFactory, McapROS2DecodeError
+
+        schema = self._schema(topic)
+        where = f"{self._file.path}: {topic}"
+        try:
+            decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
+        except (McapROS2DecodeError, ValueError) as error:
+            raise DataError(f"{where}: its schema can't be used: {error}") from error
+
+        def checked(message: bytes) -> Any:
+            try:
+                return decode(message)
+            except (McapError, struct.error, ValueError, IndexError, ArithmeticError) as error:
+                raise DataError(f"{where}: a message is damaged: {error}") from error
+
+        return checked
+
+    def _channel(self, topic: str) -> Channel:
+        channels = [self._file.channels[channel_id] for channel_id in self._ids[topic]]
+        types = [self._file.schemas.get(channel.schema_id) for channel in channels]
+        names = [schema.name if schema is not None else "" for schema in types]
+        if len(set(names)) > 1:
+            self._warn(
+                f"{topic} has several types, {', '.join(sorted(set(names)))}: {names[0]} is read"
+            )
+            self._ids[topic] = [
+                channel.id
+                for channel, name in zip(channels, names, strict=True)
+                if name == names[0]
+            ]
+        count = sum(self._file.counts.get(channel_id, 0) for channel_id in self._ids[topic])
+        return Channel(topic, names[0], count, MappingProxyType(dict(channels[0].metadata)))
+
+    def _channel_ids(self, topic: str) -> list[int]:
+        if topic not in self._ids:
+            raise MissingChannelError(self._file.path, topic, sorted(self._ids))
+        return self._ids[topic]
+
+    def _schema(self, topic: str) -> Schema:
+        channel = self._file.channels[self._channel_ids(topic)[0]]
+        schema = self._file.schemas.get(channel.schema_id)
+        if schema is None or schema.encoding != "ros2msg" or channel.message_encoding != "cdr":
+            found = f"{channel.message_encoding or 'no encoding'} with " + (
+                f"a {schema.encoding or 'nameless'} schema" if schema is not None else "no schema"
+            )
+            raise DataError(
+                f"{self._file.path}: {topic} is {found}; only ROS 2 messages (cdr) are read"
+            )
+        return schema

@@ -1,0 +1,187 @@
+"""The ``bus`` table of a robot description: databases, and the map from signals to quantities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from ..errors import UsageError
+from ..strict_table import Faults, Table, listed
+from ..units import unit_for, valid_units
+from .model import Bus, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+_PLACEHOLDER = "{joint}"
+_OF_SENSOR = {
+    SensorKind.IR: Quantity.RANGE,
+    SensorKind.SONAR: Quantity.RANGE,
+    SensorKind.ACCELEROMETER: Quantity.ACCELERATION,
+    SensorKind.COMPASS: Quantity.MAGNETIC_FIELD,
+}
+JOINT_QUANTITIES = tuple(q for q in Quantity if q not in _OF_SENSOR.values())
+"""What can be known of a joint."""
+
+
+def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str, Message] | None:
+    """The messages of some DBC databases by name.
+
+    Args:
+        databases: DBC file name to text.
+        faults: Where faults are noted: syntax, overlapping signals, repeated message names.
+
+    Returns:
+        Message name to message, None if a database could not be read.
+    """
+    from cantools.database.errors import UnsupportedDatabaseFormatError
+
+    messages: dict[str, Message] = {}
+    readable = True
+    for name, text in databases.items():
+        try:
+            found = _messages(text)
+        except UnsupportedDatabaseFormatError as error:
+            faults.add(f"bus.databases: {name}", str(error.e_dbc), "a DBC without overlaps")
+            readable = False
+            continue
+        for message in found:
+            if message.name in messages:
+                faults.add(
+                    f"bus.databases: {name}",
+                    f"a second message {message.name}",
+                    "message names that are unique in all databases together",
+                )
+            messages[message.name] = message
+    return messages if readable else None
+
+
+@lru_cache(maxsize=16)  # every session of a robot carries the same databases
+def _messages(text: str) -> tuple[Message, ...]:
+    from cantools.database import load_string
+    from cantools.database.can import Database
+
+    database = load_string(text, database_format="dbc", strict=True)
+    return tuple(database.messages) if isinstance(database, Database) else ()
+
+
+def read_bus(
+    table: Table,
+    joints: tuple[Joint, ...],
+    sensors: tuple[Sensor, ...],
+    read_database: Callable[[str], str | None],
+) -> tuple[Bus, tuple[tuple[str, str], ...]]:
+    """Read the bus of a robot.
+
+    Args:
+        table: The ``bus`` table; faults are noted in its list.
+        joints: The robot's joints.
+        sensors: The robot's sensors.
+        read_database: Text of a DBC file by name, None where there is none.
+
+    Returns:
+        The bus, and DBC file name with text for each database.
+    """
+    databases: dict[str, str] = {}
+    names = table.words("databases")
+    if not names:
+        table.fault("databases", 'an array of DBC file names, e.g. ["robot.dbc"]')
+    for name in names:
+        plain = name.endswith(".dbc") and not set(name) & set("/\\:")
+        text = read_database(name) if plain else None
+        if text is None:
+            valid = "the name of a DBC file that lies beside the description"
+            table.faults.add(f"{table.key('databases')}: {name}", "no such file", valid)
+        else:
+            databases[name] = text
+    bitrate = table.integer("bitrate", at_least=1)
+    messages = database_messages(databases, table.faults)
+    if len(databases) != len(names):
+        messages = None  # what a missing database holds is not a fault of the map
+    signals: dict[BusSignal, None] = {}
+    for values, where in table.tables("signals"):
+        for expanded in _expanded(values, joints):
+            entry = Table(expanded, where, table.faults)
+            signal = _signal(entry, messages, joints, sensors)
+            entry.close()
+            if signal in signals:
+                entry.fault("signal", "one entry a signal, target and quantity", "a repeated entry")
+            signals[signal] = None
+    table.close()
+    return Bus(tuple(databases), bitrate, tuple(signals)), tuple(databases.items())
+
+
+def _expanded(values: dict[str, Any], joints: tuple[Joint, ...]) -> list[dict[str, Any]]:
+    """The entry itself, or one entry a joint where its target is the placeholder."""
+    if values.get("target") != _PLACEHOLDER:
+        return [values]
+    return [
+        {
+            key: value.replace(_PLACEHOLDER, joint.name) if isinstance(value, str) else value
+            for key, value in values.items()
+        }
+        for joint in joints
+    ]
+
+
+def _signal(
+    entry: Table,
+    messages: Mapping[str, Message] | None,
+    joints: tuple[Joint, ...],
+    sensors: tuple[Sensor, ...],
+) -> BusSignal:
+    message, signal = entry.text("message"), entry.text("signal")
+    if messages is None:
+        pass
+    elif message and message not in messages:
+        entry.fault("message", listed(messages, message))
+    elif message and signal:
+        known = [each.name for each in messages[message].signals]
+        if signal not in known:
+            entry.fault("signal", f"a signal of {message}: {listed(known, signal)}")
+    direction = entry.choice("direction", Direction) or Direction.RX
+    target, quantity = entry.text("target"), entry.choice("quantity", Quantity)
+    unit = entry.text("unit")
+    axis = entry.text("axis", "")
+    fitting = _quantities(target, joints, sensors)
+    if target and not fitting:
+        names = [part.name for part in (*joints, *sensors)]
+        entry.fault("target", listed([*names, _PLACEHOLDER], target))
+    if quantity is not None:
+        if fitting and quantity not in fitting:
+            entry.fault("quantity", f"what {target} has: {', '.join(fitting)}")
+        try:
+            unit_for(unit, quantity)
+        except UsageError:
+            entry.fault("unit", f"for {quantity}: {listed(valid_units(quantity), unit)}")
+        _check_axis(entry, axis, [s for s in sensors if s.name == target])
+    return BusSignal(
+        message=message,
+        signal=signal,
+        direction=direction,
+        target=target,
+        quantity=quantity or Quantity.POSITION,
+        unit=unit,
+        scale=entry.number("scale", default=1.0, nonzero=True),
+        offset=entry.number("offset", default=0.0),
+        axis=axis,
+    )
+
+
+def _quantities(
+    target: str, joints: tuple[Joint, ...], sensors: tuple[Sensor, ...]
+) -> tuple[Quantity, ...]:
+    """What can be known of a target; nothing where there is no such target."""
+    if any(joint.name == target for joint in joints):
+        return JOINT_QUANTITIES
+    return tuple(_OF_SENSOR[sensor.kind] for sensor in sensors if sensor.name == target)
+
+
+def _check_axis(entry: Table, axis: str, sensors: list[Sensor]) -> None:
+    """Note an axis that the target does not measure, or one that is missing."""
+    axes = sensors[0].axes if sensors else ()
+    if axes and axis not in axes:
+        entry.fault("axis", listed(axes, axis))
+    elif axis and not axes:
+        entry.fault("axis", "leave it out: the target has no axes")

@@ -1,0 +1,119 @@
+"""Where the links are, given the head's pose and the joint angles.
+
+Frames and signs as in :mod:`capture.robot`. Quaternions are x, y, z, w, as ROS has them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import DataError
+from .model import Plane, Robot
+
+
+def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """Rotation matrices of unit quaternions.
+
+    Args:
+        quaternion: x, y, z, w, shape (..., 4).
+
+    Returns:
+        Shape (..., 3, 3), columns are the frame's axes in the world.
+    """
+    x, y, z, w = np.moveaxis(quaternion, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternions of rotation matrices, w >= 0.
+
+    Shepperd's method (J. Guidance and Control 1, 1978): the largest of the four components is
+    computed first, so that no division is by a small number.
+
+    Args:
+        rotation: Shape (..., 3, 3).
+
+    Returns:
+        x, y, z, w, shape (..., 4).
+    """
+    r = rotation
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    # Four times the outer product q q^T, q = (x, y, z, w).
+    outer = np.empty((*r.shape[:-2], 4, 4), dtype=np.float64)
+    outer[..., 0, 0] = 1 + xx - yy - zz
+    outer[..., 1, 1] = 1 - xx + yy - zz
+    outer[..., 2, 2] = 1 - xx - yy + zz
+    outer[..., 3, 3] = 1 + xx + yy + zz
+    outer[..., 0, 1] = outer[..., 1, 0] = r[..., 0, 1] + r[..., 1, 0]
+    outer[..., 0, 2] = outer[..., 2, 0] = r[..., 0, 2] + r[..., 2, 0]
+    outer[..., 1, 2] = outer[..., 2, 1] = r[..., 1, 2] + r[..., 2, 1]
+    outer[..., 0, 3] = outer[..., 3, 0] = r[..., 2, 1] - r[..., 1, 2]
+    outer[..., 1, 3] = outer[..., 3, 1] = r[..., 0, 2] - r[..., 2, 0]
+    outer[..., 2, 3] = outer[..., 3, 2] = r[..., 1, 0] - r[..., 0, 1]
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    column = np.take_along_axis(outer, largest[..., None, None], axis=-1)[..., 0]
+    unit = column / np.linalg.norm(column, axis=-1, keepdims=True)
+    sign: FloatArray = np.where(unit[..., 3:] < 0, -1.0, 1.0)
+    return sign * unit
+
+
+def joint_rotations(robot: Robot, angles: FloatArray) -> FloatArray:
+    """Rotation of each rear link in its front link's frame.
+
+    Args:
+        robot: The robot, m joints.
+        angles: Joint angles [rad], shape (..., m).
+
+    Returns:
+        Shape (..., m, 3, 3).
+    """
+    yaw = np.array([joint.plane is Plane.HORIZONTAL for joint in robot.joints])
+    c, s = np.cos(angles), np.sin(angles)
+    rotation = np.zeros((*angles.shape, 3, 3), dtype=np.float64)
+    rotation[..., 0, 0] = c
+    rotation[..., 1, 1] = np.where(yaw, c, 1.0)
+    rotation[..., 2, 2] = np.where(yaw, 1.0, c)
+    rotation[..., 0, 1] = np.where(yaw, -s, 0.0)
+    rotation[..., 1, 0] = np.where(yaw, s, 0.0)
+    rotation[..., 0, 2] = np.where(yaw, 0.0, s)
+    rotation[..., 2, 0] = np.where(yaw, 0.0, -s)
+    return rotation
+
+
+def link_poses(
+    robot: Robot, head_position: FloatArray, head_rotation: FloatArray, angles: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Centres and orientations of all links in the world.
+
+    Args:
+        robot: The robot, m joints.
+        head_position: Centre of the head link [m], shape (..., 3).
+        head_rotation: Orientation of the head link, shape (..., 3, 3).
+        angles: Joint angles [rad], shape (..., m).
+
+    Returns:
+        Link centres [m], shape (..., m + 1, 3), and rotations, shape (..., m + 1, 3, 3).
+
+    Raises:
+        DataError: If ``angles`` has not one column a joint.
+    """
+    m = len(robot.joints)
+    if angles.shape[-1:] != (m,):
+        raise DataError(f"angles has shape {angles.shape}; the robot {robot.name} has {m} joints")
+    turn = joint_rotations(robot, angles)
+    position = np.empty((*angles.shape[:-1], m + 1, 3), dtype=np.float64)
+    rotation = np.empty((*angles.shape[:-1], m + 1, 3, 3), dtype=np.float64)
+    position[..., 0, :] = head_position
+    rotation[..., 0, :, :] = head_rotation
+    half = np.array([link.length / 2 for link in robot.links])
+    for i in range(m):
+        rotation[..., i + 1, :, :] = rotation[..., i, :, :] @ turn[..., i, :, :]
+        pivot = position[..., i, :] - half[i] * rotation[..., i, :, 0]
+        position[..., i + 1, :] = pivot - half[i + 1] * rotation[..., i + 1, :, 0]
+    return position, rotation

@@ -1,0 +1,279 @@
+"""What a robot is: the model that a robot TOML describes.
+
+The chain runs from the head to the tail everywhere in undulog: ``links[0]`` is the head,
+``joints[i]`` joins ``links[i]`` to ``links[i + 1]``. A link's frame sits at its centre, x
+forward (out of the head), y left, z up. At zero angle all frames are parallel and link
+``i + 1`` lies behind link ``i``. A horizontal joint turns about z (yaw), a vertical one about y
+(pitch); the angle is that of the rear link relative to the front link, right-handed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray, frozen
+
+
+class Plane(StrEnum):
+    """The plane in which a joint bends the body."""
+
+    HORIZONTAL = "horizontal"
+    VERTICAL = "vertical"
+
+
+class ClockDomain(StrEnum):
+    """Whose clock stamps the robot's samples."""
+
+    HOST = "host"
+    DEVICE = "device"
+    SIMULATED = "simulated"
+
+
+class SensorKind(StrEnum):
+    """The kinds of sensor a robot description knows."""
+
+    IR = "ir"
+    SONAR = "sonar"
+    ACCELEROMETER = "accelerometer"
+    COMPASS = "compass"
+
+
+@dataclass(frozen=True)
+class Servo:
+    """DC servo with a series-elastic gear.
+
+    Attributes:
+        supply_v: Supply voltage V [V].
+        stall_torque: Torque at full voltage and standstill [N m]; fixes R = Kt V / stall.
+        torque_constant: Kt = Ke [N m/A].
+        proportional_gain: Kp, duty per angle error [1/rad].
+        rotor_inertia: Jm, referred to the joint [kg m^2].
+        viscous_friction: b [N m s/rad].
+        coulomb_friction: t_c [N m].
+        gear_stiffness: k_g [N m/rad].
+        gear_damping: c_g [N m s/rad].
+    """
+
+    supply_v: float = 6.0
+    stall_torque: float = 1.5
+    torque_constant: float = 1.0
+    proportional_gain: float = 8.0
+    rotor_inertia: float = 1.5e-3
+    viscous_friction: float = 0.005
+    coulomb_friction: float = 0.03
+    gear_stiffness: float = 40.0
+    gear_damping: float = 0.05
+
+    @property
+    def resistance_ohm(self) -> float:
+        """Winding resistance R = Kt V / stall torque [ohm]."""
+        return self.torque_constant * self.supply_v / self.stall_torque
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One actuated joint.
+
+    Attributes:
+        name: Unique in the robot.
+        plane: The plane in which it bends the body.
+        lower: Lower limit [rad].
+        upper: Upper limit [rad].
+        max_velocity: Rate limit [rad/s].
+        servo: Its servo.
+    """
+
+    name: str
+    plane: Plane
+    lower: float = -math.pi / 6
+    upper: float = math.pi / 6
+    max_velocity: float = 10.0
+    servo: Servo = field(default_factory=Servo)
+
+
+@dataclass(frozen=True)
+class Link:
+    """One rigid link, a capsule along x.
+
+    Attributes:
+        name: Unique in the robot.
+        length: Joint to joint [m].
+        radius: [m].
+        mass: [kg].
+        inertia: Principal moments about the centre, along x, y, z [kg m^2].
+    """
+
+    name: str
+    length: float
+    radius: float
+    mass: float
+    inertia: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One sensor and where it is mounted.
+
+    Attributes:
+        name: Unique in the robot; an IR sensor ``ir01`` is logged on ``/ir/01``.
+        kind: What it measures.
+        link: Name of the link that carries it.
+        position: Mount point in the link's frame [m].
+        rpy: Roll, pitch, yaw of the sensor's frame in the link's frame [rad]; rays leave along x.
+        range_min: Shortest distance it can tell [m]; None where it has no range.
+        range_max: Longest distance it can tell [m]; None where it has no range.
+        field_of_view: Full cone angle [rad]; None where it has none.
+        axes: Measured axes of the sensor's frame, e.g. ``("x", "y", "z")``.
+        assumed: Names of the fields that were assumed rather than known.
+    """
+
+    name: str
+    kind: SensorKind
+    link: str
+    position: tuple[float, float, float]
+    rpy: tuple[float, float, float]
+    range_min: float | None = None
+    range_max: float | None = None
+    field_of_view: float | None = None
+    axes: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
+
+    @property
+    def topic(self) -> str:
+        """Topic on which a session holds it: ``/ir/NN``, ``/sonar``, ``/imu`` or ``/compass``.
+
+        Further sensors of a kind that has one topic follow below it, by their own names.
+        """
+        if self.kind is SensorKind.IR:
+            return f"/ir/{self.name.removeprefix('ir')}"
+        base = "/imu" if self.kind is SensorKind.ACCELEROMETER else f"/{self.kind}"
+        return base if self.name == self.kind else f"{base}/{self.name}"
+
+
+class Direction(StrEnum):
+    """Way of a frame on the bus, seen from the computer on the robot."""
+
+    TX = "tx"
+    RX = "rx"
+
+
+class Quantity(StrEnum):
+    """What a bus signal or a CSV column means."""
+
+    COMMAND = "command"
+    POSITION = "position"
+    VELOCITY = "velocity"
+    EFFORT = "effort"
+    CURRENT = "current"
+    VOLTAGE = "voltage"
+    TEMPERATURE = "temperature"
+    RANGE = "range"
+    ACCELERATION = "acceleration"
+    MAGNETIC_FIELD = "magnetic_field"
+
+
+@dataclass(frozen=True)
+class BusSignal:
+    """Where one quantity of one joint or sensor is found on the bus.
+
+    The physical value is ``scale * raw + offset`` of the decoded DBC value, in ``unit``; readers
+    get it in SI.
+
+    Attributes:
+        message: DBC message name.
+        signal: DBC signal name.
+        direction: Way of the frame; a request and its reply may share one identifier.
+        target: Name of the joint or sensor.
+        quantity: What it is of that target.
+        unit: Unit of the decoded DBC value, e.g. ``deg``.
+        scale: Applied to the decoded value (gear ratio, sign), 1 by default.
+        offset: Added after ``scale``, in ``unit``.
+        axis: Axis of the sensor's frame for a vector quantity (``x``, ``y``, ``z``), else empty.
+    """
+
+    message: str
+    signal: str
+    direction: Direction
+    target: str
+    quantity: Quantity
+    unit: str
+    scale: float = 1.0
+    offset: float = 0.0
+    axis: str = ""
+
+
+@dataclass(frozen=True)
+class Bus:
+    """The robot's bus: databases and the map from signals to quantities.
+
+    Attributes:
+        databases: DBC file names, relative to the robot TOML.
+        bitrate: [bit/s].
+        signals: The map.
+    """
+
+    databases: tuple[str, ...]
+    bitrate: int
+    signals: tuple[BusSignal, ...]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A chain of links and joints with its sensors and its bus.
+
+    Attributes:
+        name: Short name, e.g. ``snake25``.
+        description: One sentence.
+        clock: Whose clock stamps its samples.
+        links: From the head; one more than joints.
+        joints: From the head.
+        sensors: In any order.
+        bus: The bus map, or None.
+        toml: The text it was read from; stored in every session.
+        databases: DBC file name to text, for the session's attachments.
+        assumed: Parts of the description (``links``, ``servo``, ``bus``, ...) that were assumed
+            rather than known.
+    """
+
+    name: str
+    description: str
+    clock: ClockDomain
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    sensors: tuple[Sensor, ...] = ()
+    bus: Bus | None = None
+    toml: str = ""
+    databases: tuple[tuple[str, str], ...] = ()
+    assumed: tuple[str, ...] = ()
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of all joints, head to tail."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of all links [kg]."""
+        return math.fsum(link.mass for link in self.links)
+
+    def joint_indices(self, plane: Plane) -> IntArray:
+        """Indices of the joints of one plane, head to tail.
+
+        Args:
+            plane: The plane.
+
+        Returns:
+            Indices into ``joints``, shape (number of joints in that plane,).
+        """
+        chosen = [i for i, joint in enumerate(self.joints) if joint.plane is plane]
+        return frozen(np.array(chosen, dtype=np.int64))
+
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper joint limits [rad], each of shape (m,)."""
+        lower = np.array([joint.lower for joint in self.joints], dtype=np.float64)
+        upper = np.array([joint.upper for joint in self.joints], dtype=np.float64)
+        return frozen(lower), frozen(upper)
