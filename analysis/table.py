@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from . import formats
+from .answer import answer
 from .result import Analysis, BodyResult, Estimate, Index, JointResult
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-_MISSING = "–"
 UNLIMITED = 10_000
 """A width at which nothing wraps."""
 
@@ -40,7 +40,9 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         )
 
     prose, wide = console(max(width, 40)), console(UNLIMITED)
-    wide.print(answer(analysis), style="bold", markup=False)
+    name, told = Path(analysis.session.path).name, answer(analysis)
+    wide.print(f"{name}: {told.sentence}", style="bold", markup=False)
+    prose.print(told.detail, markup=False)
     tables = [_joint_table(analysis)]
     if analysis.body is not None:
         tables.append(_body_table(analysis.body))
@@ -60,104 +62,44 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
 
 
-def answer(analysis: Analysis) -> str:
-    """The result in one sentence.
-
-    Args:
-        analysis: The result.
-
-    Returns:
-        E.g. ``run.mcap: 13 of 25 joints follow a gait of 0.5000 Hz; lag 7.5 to 13.7 degrees, ...``.
-    """
-    name = Path(analysis.session.path).name
-    if analysis.gait.frequency_hz.value is None:
-        return f"{name}: no gait, so no gain and no lag; see the warnings."
-    rhythm = f"a gait of {analysis.gait.frequency_hz.value:.4g} Hz"
-    known = [joint for joint in analysis.joints if joint.lag_rad.value is not None]
-    if not known:
-        return f"{name}: {rhythm}, but no joint's gain and lag; see the warnings."
-    lags = [math.degrees(joint.lag_rad.value or 0.0) for joint in known]
-    gains = [joint.gain.value or 0.0 for joint in known]
-    spread = ""
-    tests = [
-        i.p
-        for n, i in analysis.heterogeneity.items()
-        if n.startswith("common_") and i.p is not None
-    ]
-    if tests:
-        p = min(1.0, min(tests) * len(tests))
-        alike = "the joints differ" if p < 0.05 else "no difference between joints is shown"
-        spread = f"; {alike} ({_p(p)})"
-    return (
-        f"{name}: {len(known)} of {len(analysis.joints)} joints follow {rhythm}; lag "
-        f"{_range(lags, 1)} degrees, gain {_range(gains, 3)}{spread}."
-    )
-
-
-def _range(values: Sequence[float], decimals: int) -> str:
-    low, high = f"{min(values):.{decimals}f}", f"{max(values):.{decimals}f}"
-    return low if low == high else f"{low} to {high}"
-
-
-def _p(p: float) -> str:
-    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
-
-
 def _estimate(estimate: Estimate, decimals: int, scale: float = 1.0) -> str:
-    if estimate.value is None:
-        return _MISSING
-    text = f"{estimate.value * scale:.{decimals}f}"
-    if estimate.ci95 is None:
-        return text
-    low, high = (f"{end * scale:.{decimals}f}" for end in estimate.ci95)
-    return f"{text} [{low}, {high}]"
-
-
-def _decimals(estimates: Sequence[Estimate], scale: float = 1.0) -> int:
-    """Digits that show the narrowest interval with two figures, 1 to 5."""
-    widths = [(e.ci95[1] - e.ci95[0]) * scale / 2 for e in estimates if e.ci95 is not None]
-    narrow = min((w for w in widths if w > 0), default=0.0)
-    return 3 if narrow == 0 else min(5, max(1, 1 - math.floor(math.log10(narrow))))
-
-
-def _energy(value: float | None) -> str:
-    return _MISSING if value is None else f"{value:.4f}".replace("-0.0000", "0.0000")
+    quantity = formats.scaled(estimate, scale)
+    value = formats.number(quantity.value, decimals)
+    return f"{value} {formats.interval(quantity.ci95, decimals)}".rstrip()
 
 
 def _joint_table(analysis: Analysis) -> Table:
     from rich.table import Table
 
-    joints = analysis.joints
+    moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
+    joints = moved or list(analysis.joints)
     energies: list[tuple[str, list[float | None]]] = [
         ("E_net", [j.energy_net_j for j in joints]),
-        ("E_plus", [j.energy_plus_j for j in joints]),
         ("E_abs", [j.energy_abs_j for j in joints]),
         ("E_el", [j.energy_el_j for j in joints]),
-        ("E_el clipped", [j.energy_el_clipped_j for j in joints]),
     ]
     shown = [(name, values) for name, values in energies if any(v is not None for v in values)]
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("joint", no_wrap=True)
     table.add_column("plane", no_wrap=True)
-    for name in ("command (deg)", "gain (95 %)", "lag (deg, 95 %)"):
+    for name in ("command°", "gain (95 %)", "lag° (95 %)"):
         table.add_column(name, justify="right", no_wrap=True)
     for name, _ in shown:
-        table.add_column(f"{name} (J)", justify="right", no_wrap=True)
+        table.add_column(f"{name} J", justify="right", no_wrap=True)
     table.add_column("cover", justify="right", no_wrap=True)
     table.add_column("flags")
-    degree = math.degrees(1)
-    gain_digits = _decimals([j.gain for j in joints])
-    lag_digits = _decimals([j.lag_rad for j in joints], degree)
+    energy_digits = {name: formats.decimals_for_values(values) for name, values in shown}
+    gain_digits = formats.decimals_for([j.gain for j in joints], most=4)
+    lag_digits = formats.decimals_for([formats.degrees(j.lag_rad) for j in joints], most=2)
     for k, joint in enumerate(joints):
+        amplitude = joint.command_amplitude_rad
         table.add_row(
             *_names(joint),
-            _MISSING
-            if joint.command_amplitude_rad is None
-            else f"{math.degrees(joint.command_amplitude_rad):.2f}",
+            formats.number(None if amplitude is None else math.degrees(amplitude), 1),
             _estimate(joint.gain, gain_digits),
-            _estimate(joint.lag_rad, lag_digits, degree),
-            *(_energy(values[k]) for _, values in shown),
-            f"{100 * joint.coverage:.1f}%",
+            _estimate(joint.lag_rad, lag_digits, math.degrees(1)),
+            *(formats.number(values[k], energy_digits[name]) for name, values in shown),
+            f"{100 * joint.coverage:.0f} %",
             " ".join(joint.flags),
         )
     return table
@@ -166,7 +108,7 @@ def _joint_table(analysis: Analysis) -> Table:
 def _names(joint: JointResult) -> tuple[str, str]:
     from rich.markup import escape
 
-    return escape(joint.name), joint.plane or _MISSING
+    return escape(joint.name), joint.plane or formats.MISSING
 
 
 def _body_table(body: BodyResult) -> Table:
@@ -176,11 +118,11 @@ def _body_table(body: BodyResult) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column(f"body, {body.plane}", no_wrap=True)
     table.add_column("link", no_wrap=True)
-    for name in ("seen (mm, 95 %)", "phase (deg, 95 %)"):
+    for name in ("seen mm (95 %)", "phase° (95 %)"):
         table.add_column(name, justify="right", no_wrap=True)
     for name in body.null:
-        table.add_column(f"{name} null (mm)", justify="right", no_wrap=True)
-        table.add_column("phase (deg)", justify="right", no_wrap=True)
+        table.add_column(f"{name} null mm", justify="right", no_wrap=True)
+        table.add_column("phase°", justify="right", no_wrap=True)
     for k, point in enumerate(body.observed):
         nulls: list[str] = []
         for points in body.null.values():
@@ -209,8 +151,8 @@ def _index_table(indices: dict[str, Index]) -> Table:
         table.add_row(
             name,
             _estimate(Estimate(index.value, index.ci95), 4, math.degrees(1) if angle else 1.0),
-            "deg" if angle else index.unit,
-            _MISSING if index.p is None else _p(index.p),
+            "°" if angle else index.unit,
+            formats.p_value(index.p),
             index.label,
         )
     return table
@@ -223,9 +165,9 @@ def _method(analysis: Analysis) -> str:
         return f"Method: energies integrated on the samples' own times over {spans}."
     fitted = analysis.gait.fitted
     span = "" if fitted is None else f" of {fitted.start_s:.2f} to {fitted.stop_s:.2f} s"
-    rhythm = _estimate(analysis.gait.frequency_hz, 6)
+    rhythm = formats.estimate(analysis.gait.frequency_hz, " Hz", most=6)
     return (
         f"Method: harmonic least squares{span} on each sample's own time, one frequency for all "
-        f"joints: {rhythm} Hz; 95 % intervals from the residual's spectrum beside it, Student's t; "
+        f"joints: {rhythm}; 95 % intervals from the residual's spectrum beside it, Student's t; "
         f"lag positive = response late; energies over {cycles:.0f} whole cycles, {spans}."
     )

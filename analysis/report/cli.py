@@ -52,9 +52,9 @@ def report(
     from capture import Session
 
     from ..analyse import analyse_session
+    from ..answer import answer
     from ..stretch import Options
     from . import render
-    from .answer import answer
 
     options = Options(start, stop, command_topic, response_topic)
     analyses: list[Analysis] = []

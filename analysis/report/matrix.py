@@ -9,8 +9,8 @@ from matplotlib.ticker import MaxNLocator
 
 from capture.palette import joint_hex
 
+from ..formats import number
 from .drawn import WIDTH_IN, Drawing
-from .formats import number
 from .svg import GRID, drawing, inline_svg, new_figure
 
 

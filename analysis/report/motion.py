@@ -7,9 +7,9 @@ import numpy as np
 from capture.arrays import FloatArray
 from capture.palette import joint_hex
 
+from ..formats import degrees, estimate, scaled, short
 from ..result import BodyPoint, BodyResult
 from .drawn import WIDTH_IN, Drawing, key, legend
-from .formats import degrees, estimate, scaled, short
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
 
 _NULL_STYLES = ((0, (5, 3)), (0, (1.5, 2)), (0, (7, 2, 1.5, 2)))

@@ -17,9 +17,9 @@ from capture import Session
 from capture.errors import UsageError
 from capture.palette import joint_hex
 
+from .. import formats
+from ..answer import Answer, answer, answer_to_all
 from ..result import Analysis, BodyPoint, Estimate, Index, JointResult
-from . import formats
-from .answer import Answer, answer, answer_to_all
 from .drawn import Drawing
 from .driven import is_driven
 from .matrix import coupling_matrix

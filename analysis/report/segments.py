@@ -9,10 +9,10 @@ import numpy as np
 
 from capture.palette import joint_hex
 
+from ..formats import degrees, estimate, number
 from ..result import Estimate, JointResult
 from .drawn import WIDTH_IN, Drawing, key, legend, marker
 from .driven import is_driven
-from .formats import degrees, estimate, number
 from .svg import INK, MUTED, PAPER, REFERENCE, Axes, Figure, Handle, drawing, inline_svg, new_figure
 
 _MARKER_SIZE = 5.2

@@ -12,10 +12,10 @@ from capture.arrays import FloatArray, frozen
 from capture.errors import DataError, MissingChannelError
 from capture.palette import joint_hex
 
+from ..formats import degrees, estimate, short
 from ..result import Analysis, JointResult
 from .drawn import WIDTH_IN, Drawing, key, legend
 from .driven import is_driven
-from .formats import degrees, estimate, short
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
 
 CYCLES = 2.5

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 from pathlib import Path
 
@@ -131,6 +132,11 @@ def test_web_serves_this_machine_only_until_told_to_end(session_file, tmp_path):
                 break
             except OSError:
                 assert process.poll() is None
+        for _ in range(300):  # the page may answer before the data's server listens
+            if listening(data):
+                break
+            assert process.poll() is None
+            time.sleep(0.1)
         assert listening(page) == listening(data) == {"0100007F"}
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from analysis.report.answer import Verdict, answer, answer_to_all
+from analysis.answer import Verdict, answer, answer_to_all
 from analysis.result import Index
 
 

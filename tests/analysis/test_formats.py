@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.report import formats
+from analysis import formats
 from analysis.result import Estimate
 
 
