@@ -8,7 +8,8 @@ from datetime import UTC, datetime
 
 import rerun as rr
 
-from analysis.result import Analysis, Estimate, JointResult
+from analysis.answer import answer
+from analysis.result import Analysis
 from capture import Session
 
 FACTS = "/session"
@@ -43,7 +44,8 @@ def markdown(
         *_health(session.metadata),
         *_versions(session.metadata),
     )
-    parts = [f"**{answer(analysis)}**", " · ".join(facts)]
+    told_first = "Not analysed." if analysis is None else answer(analysis).sentence
+    parts = [f"**{told_first}**", " · ".join(facts)]
     told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
     if told:
         parts.append("\n".join(f"- {note}" for note in told))
@@ -54,25 +56,6 @@ def markdown(
     return "\n\n".join(parts) + "\n"
 
 
-def answer(analysis: Analysis | None) -> str:
-    """The session's result in one line.
-
-    Args:
-        analysis: The session's analysis, or None.
-
-    Returns:
-        Lag and gain of the first, middle and last joint that respond to the gait.
-    """
-    if analysis is None:
-        return "Not analysed"
-    found = [j for j in analysis.joints if j.lag_rad.value is not None]
-    if not found:
-        return "No response to a gait could be measured"
-    three = list(dict.fromkeys((0, len(found) // 2, len(found) - 1)))
-    lags = ", ".join(_lag(found[i]) for i in three)
-    return f"Lag behind the command: {lags}"
-
-
 def log_facts(rec: rr.RecordingStream, text: str) -> None:
     """Write the session's facts.
 
@@ -81,20 +64,6 @@ def log_facts(rec: rr.RecordingStream, text: str) -> None:
         text: Markdown.
     """
     rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
-
-
-def _lag(joint: JointResult) -> str:
-    return f"{_degrees(joint.lag_rad)} at {joint.name}"
-
-
-def _degrees(estimate: Estimate) -> str:
-    """Value and half the interval, the latter rounded up."""
-    value = math.degrees(estimate.value or 0.0)
-    if estimate.ci95 is None:
-        return f"{value:.1f}°"
-    half = math.degrees(estimate.ci95[1] - estimate.ci95[0]) / 2.0
-    digits = 2 if half < 0.1 else 1
-    return f"{value:.{digits}f} ± {math.ceil(half * 10**digits) / 10**digits:.{digits}f}°"
 
 
 def _robot(session: Session) -> str:

@@ -6,7 +6,6 @@ import math
 import pytest
 
 from analysis.result import Estimate
-from replay.facts import answer
 from replay.response import charts
 
 
@@ -34,12 +33,3 @@ def test_what_no_joint_has_gets_no_chart(analysis):
     ]
     (energy,) = charts(dataclasses.replace(analysis, joints=tuple(bare)))
     assert energy.title == "Net energy [J]"
-    assert answer(dataclasses.replace(analysis, joints=tuple(bare))).startswith("No response")
-
-
-def test_the_answer_is_the_lag_of_head_middle_and_tail(analysis):
-    assert answer(analysis) == (
-        "Lag behind the command: 7.0 ± 1.2° at joint01, 10.6 ± 1.2° at joint13, "
-        "14.2 ± 1.2° at joint25"
-    )
-    assert answer(None) == "Not analysed"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from analysis.answer import answer
 from capture import Session, SessionWriter
 from capture.errors import DataError, LogWriteError
 from capture.palette import joint_colors
@@ -118,9 +119,9 @@ def test_mode_and_events_are_as_logged(recording):
     assert found.times("/events").tolist() == [5, 1_000_000_000]
 
 
-def test_the_facts_begin_with_the_answer(recording):
+def test_the_facts_begin_with_the_answer(recording, analysis):
     text = recording[1].static("/session", "TextDocument:text")[0]
-    assert text.startswith("**Lag behind the command: 7.0 ± 1.2° at joint01")
+    assert text.startswith(f"**{answer(analysis).sentence}**")
     for fact in ("made-for-tests", "snake25, 25 joints", "2025-01-01", "head-to-tail", "good"):
         assert fact in text
 
