@@ -1,0 +1,75 @@
+"""The main job end to end, on the session and files that `make demo` makes, held by foreign tools."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+RERUN = Path(sys.executable).parent / "rerun"
+JOINTS = [f"joint{i:02d}" for i in range(1, 26)]
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    makefile = Path(__file__).parents[2] / "Makefile"
+    recipe = re.findall(r"\$\(call undulog,(.*)\)\n", makefile.read_text())
+    assert len(recipe) == 4
+    for line in recipe:
+        words = line.replace("$(DEMO)", str(folder)).split()
+        run(sys.executable, "-m", "undulog", *words)
+    return folder
+
+
+def run(*command: object) -> str:
+    done = subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_rosbags_reads_every_message(demo: Path) -> None:
+    with AnyReader([demo / "session.mcap"]) as reader:
+        counts = dict.fromkeys((connection.topic for connection in reader.connections), 0)
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            counts[connection.topic] += 1
+            if connection.topic == "/joint_states":
+                assert list(message.name) == JOINTS
+    assert counts["/joint_states"] == counts["/joint_commands"] == 2001
+    assert counts["/odom"] == 2001
+
+
+def test_rerun_shows_the_named_joints_of_the_session(demo: Path) -> None:
+    run(RERUN, "mcap", "convert", demo / "session.mcap", "-o", demo / "native.rrd")
+    run(RERUN, "rrd", "verify", demo / "native.rrd")
+    where = ("--entity", "/joint_states/position")
+    printed = run(RERUN, "rrd", "print", "-vvv", *where, demo / "native.rrd")
+    assert ", ".join(JOINTS[:10]) in printed  # it cuts long lists short
+
+
+def test_the_replay_file_verifies(demo: Path) -> None:
+    run(RERUN, "rrd", "verify", demo / "replay.rrd")
+
+
+def test_the_result_has_the_papers_claim_with_an_interval(demo: Path) -> None:
+    result = json.loads((demo / "result.json").read_text())
+    contrast = result["heterogeneity"]["boundary_contrast_lag"]
+    degrees = [-57.29577951308232 * value for value in (contrast["value"], *contrast["ci95"])]
+    assert 5 < degrees[2] <= degrees[0] <= degrees[1] < 10
+    assert [joint["name"] for joint in result["joints"]] == JOINTS
+
+
+def test_the_page_opens_silently(demo: Path, browser) -> None:
+    browser.open((demo / "report.html").as_uri())
+    assert browser.complaints() == []
+    assert [url for url in browser.requests() if not url.endswith("report.html")] == []
