@@ -1,4 +1,4 @@
-"""The main job end to end, on the session and files that `make demo` makes, held by foreign tools."""
+"""The main job end to end, on the files that `make demo` makes, held by foreign tools."""
 
 from __future__ import annotations
 
