@@ -229,8 +229,9 @@ def _caveat(analysis: Analysis) -> str:
 
 
 def _why_not(analysis: Analysis) -> str:
-    """The warning that speaks of the gait, or the first."""
+    """The warning that denies a gait, or else speaks of it, or the first."""
     if not analysis.warnings:
         return "The result gives no reason."
+    verdict = [warning for warning in analysis.warnings if warning.startswith("no gait")]
     about = [warning for warning in analysis.warnings if "gait" in warning.lower()]
-    return formats.sentence((about or analysis.warnings)[0])
+    return formats.sentence((verdict or about or analysis.warnings)[0])
