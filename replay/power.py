@@ -12,7 +12,6 @@ from .timeline import Clock
 from .tracks import Columns, Track
 
 MECHANICAL = "/power/mechanical"
-ELECTRICAL = "/power/electrical"
 TOTAL = "/power/total"
 
 # Vermilion as on the body; violet is on no other map and reads on black and on white.

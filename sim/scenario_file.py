@@ -56,13 +56,13 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from enum import StrEnum
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from capture.errors import Fault, ScenarioError, UsageError
+from capture.errors import Fault, ScenarioError
 from capture.robot import Plane, Robot, Servo
 from capture.robot.description import load_robot, robot_names
+from capture.shipped import Shelf
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
 from .contact import FrictionLaw, Ground
@@ -70,6 +70,7 @@ from .gait import PlaneGait, Serpentine, Wave
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Noise, Scenario, World
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
+_SHELF = Shelf("scenario", "sim", "scenarios", ScenarioError)
 _MAY_BE_ZERO = ("viscous_friction", "coulomb_friction", "gear_damping")
 
 
@@ -80,9 +81,7 @@ class _Surface(StrEnum):
 
 def scenario_names() -> tuple[str, ...]:
     """Names of the shipped scenarios, sorted."""
-    shipped = resources.files("sim") / "scenarios"
-    names = [Path(entry.name) for entry in shipped.iterdir()]
-    return tuple(sorted(name.stem for name in names if name.suffix == ".toml"))
+    return _SHELF.names()
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
@@ -99,21 +98,8 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         ScenarioError: If it has faults; lists all of them.
         RobotFileError: If the robot's own file has faults.
     """
-    if str(name_or_path) in scenario_names():
-        shipped = resources.files("sim") / "scenarios" / f"{name_or_path}.toml"
-        return parse_scenario(shipped.read_text(encoding="utf-8"), f"{name_or_path}.toml")
-    path = Path(name_or_path)
-    if not path.is_file():
-        near = listed(scenario_names(), str(name_or_path))
-        raise UsageError(f"no scenario {str(name_or_path)!r}: not a file, nor one of {near}")
-    try:
-        text = path.read_bytes().decode("utf-8")
-    except UnicodeDecodeError as error:
-        fault = Fault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
-        raise ScenarioError(path, [fault]) from error
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
-    return parse_scenario(text, path)
+    found = _SHELF.read(name_or_path)
+    return parse_scenario(found.text, found.source)
 
 
 def parse_scenario(text: str, source: str | Path) -> Scenario:

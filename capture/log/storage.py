@@ -75,7 +75,6 @@ class LogFile:
         self.counts: dict[int, int] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, Attachment] = {}
-        self.indexed = False
         self._cache: OrderedDict[int, Buffer] = OrderedDict()
         self._buffer = self._map()
         try:
@@ -202,7 +201,6 @@ class LogFile:
         if statistics.attachment_count + statistics.metadata_count != len(indexes):
             raise _NoSummaryError("the summary does not list all attachments and metadata")
         self.counts = dict(statistics.channel_message_counts)
-        self.indexed = True
 
     def _summary_range(self) -> tuple[int, int]:
         """First byte of the summary, and of the footer."""

@@ -25,24 +25,23 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ..errors import Fault, RobotFileError, UsageError
+from ..errors import Fault, RobotFileError
+from ..shipped import Shelf
 from ..strict_table import Faults, Table, listed
 from .bus_map import read_bus
 from .model import ClockDomain, Joint, Link, Plane, Robot, Sensor, SensorKind, Servo
 
+_SHELF = Shelf("robot", "capture.robot", "shipped", RobotFileError)
 _PARTS = ("links", "joints", "servo", "sensors", "bus")
 _RANGED = (SensorKind.IR, SensorKind.SONAR)
 
 
 def robot_names() -> tuple[str, ...]:
     """Names of the shipped robots, sorted."""
-    shipped = resources.files("capture.robot") / "shipped"
-    names = [Path(entry.name) for entry in shipped.iterdir()]
-    return tuple(sorted(name.stem for name in names if name.suffix == ".toml"))
+    return _SHELF.names()
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -59,22 +58,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
         UsageError: If there is no such robot or the file cannot be read.
         RobotFileError: If the description has faults; lists all of them.
     """
-    if str(name_or_path) in robot_names():
-        shipped = resources.files("capture.robot") / "shipped"
-        text = (shipped / f"{name_or_path}.toml").read_text(encoding="utf-8")
-        return _parse(text, Path(f"{name_or_path}.toml"), lambda name: _decoded(shipped / name))
-    path = Path(name_or_path)
-    if not path.is_file():
-        near = listed(robot_names(), str(name_or_path))
-        raise UsageError(f"no robot {str(name_or_path)!r}: not a file, nor one of {near}")
-    try:
-        text = path.read_bytes().decode("utf-8")
-    except UnicodeDecodeError as error:
-        fault = Fault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
-        raise RobotFileError(path, [fault]) from error
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
-    return _parse(text, path, lambda name: _decoded(path.parent / name))
+    found = _SHELF.read(name_or_path)
+    return _parse(found.text, found.source, lambda name: _decoded(found.folder / name))
 
 
 def parse_robot(text: str, source: str | Path, databases: Mapping[str, str]) -> Robot:
