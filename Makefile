@@ -35,7 +35,7 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	$(call undulog,report $(DEMO)/session.mcap -o $(DEMO)/report.html --force)
 	$(call undulog,view $(DEMO)/session.mcap --save $(DEMO)/replay.rrd --force)
 	@echo 'Where to look next:'
-	@printf '  %-46s %s\n' \
+	@printf '  %-50s %s\n' \
 	  '$(DEMO)/report.html' 'the answer on one page, in any browser' \
 	  '$(BIN)/undulog view $(DEMO)/session.mcap' 'the motion, in Rerun' \
 	  '$(BIN)/undulog log info $(DEMO)/session.mcap' 'what was recorded' \
