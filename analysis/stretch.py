@@ -17,6 +17,8 @@ from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
 
 GAIT_TOPIC = "/gait"
 _NS = 1e9
+_WORTH_IT = 0.1
+"""Less than this part of a session after its settling time is not worth leaving the rest out."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,14 @@ def choose_stretch(session: Session, columns: Columns, options: Options, warn: W
         )
     settle_s = settle_time_s(session) if options.start_s is None else 0.0
     runs = _gait_runs(session, chosen, settle_s, warn)
+    if not runs and settle_s > 0:
+        runs = _gait_runs(session, chosen, 0.0, warn)
+        if runs:
+            settle_s = 0.0
+            warn(
+                f"fewer than {MIN_CYCLES:g} steady cycles are left after the settling time that "
+                "the session states: the gait is analysed before it has settled"
+            )
     if runs:
         longest = max(runs, key=lambda run: run.duration_s)
         if len(runs) > 1:
@@ -73,11 +83,16 @@ def choose_stretch(session: Session, columns: Columns, options: Options, warn: W
                 f"in {len(runs) - 1} others are not (choose with --start and --stop)"
             )
         return longest
-    later = settled(chosen, session.start_ns, settle_s)
-    if later.duration_s <= 0:
+    if GAIT_TOPIC in session.channels:
         warn(
-            f"the session ends within its settling time of {settle_s:g} s: all of it is analysed, "
-            "unsettled as it is"
+            f"no stretch of {MIN_CYCLES:g} cycles has steady gait parameters: the commands are "
+            "analysed as if it were steady"
+        )
+    later = settled(chosen, session.start_ns, settle_s)
+    if later.duration_s < _WORTH_IT * chosen.duration_s:
+        warn(
+            f"next to nothing is left after the settling time of {settle_s:g} s: all of it is "
+            "analysed, unsettled as it is"
         )
         later = chosen
     return _in_motion(columns, later)
@@ -129,10 +144,6 @@ def _gait_runs(session: Session, chosen: Stretch, settle_s: float, warn: Warn) -
             if ignore:
                 warn("the gait's offset changes within the analysed stretch: the robot steers")
             return found
-    warn(
-        f"no stretch of {MIN_CYCLES:g} cycles has steady gait parameters (after "
-        f"{settle_s:g} s of settling): the gait is analysed as if it were steady"
-    )
     return []
 
 

@@ -280,3 +280,13 @@ def test_files_and_options_of_the_verb(twin, tmp_path, capsys):
 def test_help_has_an_example(capsys):
     undulog.run(["analyse", "--help"])
     assert "undulog analyse run.mcap --json" in capsys.readouterr().out
+
+
+def test_a_session_cut_before_it_settled_is_answered_with_a_warning(twin, tmp_path, capsys):
+    with Session.open(twin) as session:
+        settle_s = float(session.metadata["undulog"]["settle_s"])
+        stop = settle_s + 5.5  # 2.75 cycles, of 3.75 in all
+    assert undulog.run(["analyse", str(twin), "--stop", str(stop), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["gait"]["frequency_hz"] == pytest.approx(0.5, abs=1e-3)
+    assert any("before it has settled" in warning for warning in result["warnings"])
