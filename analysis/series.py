@@ -12,6 +12,8 @@ from capture.arrays import FloatArray, IntArray, frozen
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""
 
+_HALF_NS = 0.5e-9
+
 
 @dataclass(frozen=True)
 class Series:
@@ -63,7 +65,8 @@ class Series:
             Views of the samples with ``start_s <= t < stop_s``; counts of dropped samples stay
             those of the whole.
         """
-        i, j = np.searchsorted(self.t_s, (start_s, stop_s), side="left")
+        limits = np.array([start_s, stop_s]) - _HALF_NS  # times are whole ns but for rounding
+        i, j = np.searchsorted(self.t_s, limits, side="left")
         return Series(
             self.name,
             self.t_s[i:j],

@@ -158,7 +158,10 @@ def whole_cycles(start_s: float, stop_s: float, frequency_hz: float) -> tuple[fl
         Start and end [s], and the number of cycles; none of them where it is shorter than one.
     """
     cycles = math.floor((stop_s - start_s) * frequency_hz + _CYCLE_SLACK)
-    return max(start_s, stop_s - cycles / frequency_hz), stop_s, cycles
+    span_s = cycles / frequency_hz
+    if (stop_s - start_s - span_s) * frequency_hz <= _CYCLE_SLACK:  # the stretch is whole cycles
+        return start_s, min(start_s + span_s, stop_s), cycles
+    return stop_s - span_s, stop_s, cycles
 
 
 def long_enough(duration_s: float, frequency_hz: float) -> bool:

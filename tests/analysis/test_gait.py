@@ -125,6 +125,7 @@ def test_covered_counts_the_last_samples_own_interval():
 def test_whole_cycles_are_those_at_the_end():
     assert whole_cycles(0.0, 9.0, 0.5) == (1.0, 9.0, 4)
     assert whole_cycles(0.0, 7.99999, 0.5) == (0.0, 7.99999, 4)
+    assert whole_cycles(8.0, 20.01, 0.5) == (8.0, 20.0, 6)  # a sample more than whole cycles
     assert whole_cycles(0.0, 1.0, 0.5)[2] == 0
 
 

@@ -107,12 +107,13 @@ def twin(tmp_path_factory):
 def test_the_settled_whole_cycles_are_analysed(twin):
     result = analysed(twin)
     (window,) = result.gait.windows
-    assert (window.start_s, window.stop_s) == (pytest.approx(2.01), pytest.approx(14.01))
+    assert (window.start_s, window.stop_s) == (pytest.approx(2.0), pytest.approx(14.0))
     assert window.cycles == 6
     assert result.gait.fitted.start_s == pytest.approx(2.0)
     assert result.gait.frequency_hz.value == pytest.approx(0.5, abs=1e-9)
     assert result.gait.wave == "head-to-tail"
     assert result.gait.lag_per_joint_rad == {"horizontal": pytest.approx(-np.pi / 3)}
+    assert {joint.samples for joint in result.joints} == {1200}  # 12 s at 100 Hz, half-open
     assert result.session.verdict == "good"
     assert result.session.robot == "snake25"
 
@@ -177,7 +178,7 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     path = write_twin(tmp_path / "booked.mcap", ledger=(mechanical, 20.0), odometry=False)
     said = [text for text in analysed(path).warnings if "ledger" in text]
     assert len(said) == 1
-    assert said[0].startswith("electrical energy is 300 J from the samples but 239.8 J")
+    assert said[0].startswith("electrical energy is 300 J from the samples but 240 J")
 
 
 def test_a_change_of_gait_splits_the_session(tmp_path):
