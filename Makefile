@@ -59,6 +59,8 @@ format: $(READY)  ## mend what lint and format can mend
 
 bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/read_jointstate.py
+	$(BIN)/python bench/twin_step.py
+	$(BIN)/python bench/replay_convert.py 5
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
