@@ -75,6 +75,7 @@ class LogFile:
         self.counts: dict[int, int] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, Attachment] = {}
+        self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self._cache: OrderedDict[int, Buffer] = OrderedDict()
         self._buffer = self._map()
         try:
@@ -110,6 +111,28 @@ class LogFile:
         while len(self._cache) > 1 and sum(map(len, self._cache.values())) > _CACHE_SIZE:
             self._cache.popitem(last=False)
         return data, 0
+
+    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
+        """The uncompressed bytes of a block, checked, and not kept in memory for later.
+
+        Args:
+            block: One of ``blocks``.
+
+        Returns:
+            A buffer, and the first and one past the last byte of the payload in it.
+
+        Raises:
+            LogError: If the payload can't be decompressed or its CRC doesn't fit.
+        """
+        if block.compression:
+            data = self._decompress(block)
+            return data, 0, len(data)
+        if block.crc and block.complete:
+            with memoryview(self._buffer) as whole, whole[block.start : block.stop] as payload:
+                if zlib.crc32(payload) != block.crc:
+                    where = f"the chunk at byte {block.start}"
+                    raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+        return self._buffer, block.start, block.stop
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
         """Where a channel's message records start in a block's payload.
@@ -158,6 +181,7 @@ class LogFile:
         except _NoSummaryError as why:
             self.blocks.clear()
             self.counts.clear()
+            self.appendices.clear()
             self._scan()
             self.warnings.append(f"{why}; read record by record")
         if not self.channels:
@@ -190,7 +214,7 @@ class LogFile:
                     indexes.append((Opcode.METADATA, entry.offset))
                 else:
                     self._take(opcode, start, stop)
-            for opcode, offset in indexes:
+            for opcode, offset in sorted(indexes, key=lambda index: index[1]):  # file order
                 self._take(opcode, *self._record_at(offset))
         except (LogError, McapError, struct.error, ValueError) as error:
             raise _NoSummaryError(f"the summary is damaged ({error})") from error
@@ -227,9 +251,11 @@ class LogFile:
         elif opcode == Opcode.ATTACHMENT:
             attachment = self._parse(Attachment.read, start, stop, data)
             self.attachments[attachment.name] = attachment
+            self.appendices.append(attachment)
         elif opcode == Opcode.METADATA:
             metadata = self._parse(Metadata.read, start, stop, data)
             self.metadata.setdefault(metadata.name, {}).update(metadata.metadata)
+            self.appendices.append(metadata)
 
     def _block(self, index: ChunkIndex) -> Block:
         """The block of a chunk index; the chunk's own header is checked against it."""
@@ -340,7 +366,8 @@ class LogFile:
         """Offsets by channel of a payload without index; schemas and channels are noted."""
         data, base = self.payload(block)
         found: dict[int, list[int]] = {}
-        for opcode, start, stop in walk_records(data, base, len(data)):
+        end = len(data) if block.compression else block.stop
+        for opcode, start, stop in walk_records(data, base, end):
             if opcode == Opcode.MESSAGE:
                 (channel_id,) = struct.unpack_from("<H", data, start)
                 found.setdefault(channel_id, []).append(start - PREFIX_SIZE - base)
