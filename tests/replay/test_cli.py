@@ -143,8 +143,9 @@ def test_web_serves_this_machine_only_until_told_to_end(session_file, tmp_path):
         assert not listening(page)
         assert list(tmp_path.iterdir()) == []
     finally:
-        process.kill()
-        process.wait()
+        if process.poll() is None:
+            process.terminate()  # so that it ends its server too, which kill() would orphan
+            process.wait(timeout=60)
         process.stdout.close()
 
 
