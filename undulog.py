@@ -18,7 +18,7 @@ from capture.errors import MissingExtraError, UndulogError
 VERBS: dict[str, tuple[str, str]] = {
     "import": ("capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
     "log info": ("capture.log_info:log_info", "Say what a log holds."),
-    "log export": ("capture.cli:export_log", "Write a session's raw frames for other tools."),
+    "log export": ("capture.cli:export_log", "Write frames or joint columns for other tools."),
     "sim list": ("sim.cli:list_scenarios", "List the shipped scenarios."),
     "sim run": ("sim.cli:run", "Simulate a scenario and record it."),
     "analyse": ("analysis.cli:analyse", "Numbers: response, energy, spread over the segments."),

@@ -80,38 +80,66 @@ def export_log(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     bus: str | None = None,
+    topics: Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)] = (),
     force: bool = False,
     json: bool = False,
 ) -> None:
-    """Write a session's raw CAN frames for other tools.
+    """Write a session for other tools: its raw CAN frames, or its joint columns as a table.
 
-    The suffix of the output says the format: .log for candump. A candump log that was imported
-    comes back bit for bit.
+    The suffix of the output says the format. Frames: .log (candump), .blf and .asc (Vector), .mcap
+    (ROS 2, one can_msgs/msg/Frame a frame). Columns: .csv and .parquet, one row a sample of a
+    joint at its own time. What a format can't hold is counted in a warning.
 
     Example: `undulog log export run.mcap -o trace.log`
 
+    For Vector's tools: `undulog log export run.mcap -o trace.blf`, or `-o trace.asc`
+
+    For ROS 2: `undulog log export run.mcap -o frames.mcap`
+
+    For pandas: `undulog log export run.mcap -o run.csv`, or `-o states.parquet --topics
+    /joint_states`
+
     Args:
         session: The session.
-        output: The log to write.
-        bus: The bus to write; all by default.
+        output: The file to write.
+        bus: The bus whose frames to write; all by default.
+        topics: The JointState topics whose columns to write; commands and whatever the joints
+            measure by default.
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from .exchange.log_export import export_log as export
+    from .exchange.column_export import TABLE_FORMATS, export_columns
+    from .exchange.frame_formats import FRAME_FORMATS
+    from .exchange.log_export import export_log as export_frames
+    from .interruption import interruptible
 
-    report = export(session, output, bus=bus, force=force)
+    suffix = output.suffix.lower()
+    if suffix not in FRAME_FORMATS and suffix not in TABLE_FORMATS:
+        valid = ", ".join([*FRAME_FORMATS, *TABLE_FORMATS])
+        raise UsageError(f"{output}: no format has the suffix {suffix!r}; valid: {valid}")
+    with interruptible() as stop:
+        if suffix in TABLE_FORMATS:
+            if bus is not None:
+                raise UsageError(f"--bus is for CAN frames; a {suffix} file has joint columns")
+            table = export_columns(session, output, topics=topics, force=force, stop=stop)
+            counts = {"rows": sum(table.rows.values()), "topics": table.rows}
+            what = f"{counts['rows']} rows of {', '.join(table.rows)}"
+            warnings = table.warnings
+        else:
+            if topics:
+                raise UsageError(f"--topics is for tables; a {suffix} file has CAN frames")
+            trace = export_frames(session, output, bus=bus, force=force, stop=stop)
+            counts = {"frames": sum(trace.buses.values()), "buses": trace.buses}
+            what = f"{counts['frames']} frames of {', '.join(trace.buses)}, "
+            what += f"in the format of {trace.title}"
+            warnings = trace.warnings
     if json:
-        emit_json(
-            {
-                "source": str(report.source),
-                "output": str(report.output),
-                "frames": sum(report.buses.values()),
-                "buses": report.buses,
-            }
-        )
+        facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
+        emit_json(facts)
         return
-    total = sum(report.buses.values())
-    print(f"{output}: {total} frames of {', '.join(report.buses)}, in the format of candump -L")
+    print(f"{output}: {what}")
+    for warning in warnings:
+        print(f"  warning: {warning}")
 
 
 def _column_map(

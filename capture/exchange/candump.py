@@ -119,7 +119,12 @@ def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
 
 
 def candump_lines(
-    frames: FrameArray, buses: list[str], bus: IntArray, *, directions: bool
+    frames: FrameArray,
+    buses: list[str],
+    bus: IntArray,
+    *,
+    directions: bool,
+    nanoseconds: bool | None = None,
 ) -> Iterator[str]:
     """Frames as candump writes them.
 
@@ -128,13 +133,16 @@ def candump_lines(
         buses: Interface names.
         bus: Index into ``buses`` for each frame, shape (n,).
         directions: Whether to write ``R`` and ``T``.
+        nanoseconds: Whether times have nine decimals rather than six, as candump has them; if
+            None, where one of these times needs them.
 
     Yields:
-        One line a frame, with its line end. Times have six decimals, as candump has them, or nine
-        if a time needs them.
+        One line a frame, with its line end.
     """
     t_ns: NDArray[np.uint64] = frames["t_host_ns"]
-    digits, unit = (9, 1) if bool((t_ns % 1000).any()) else (6, 1000)
+    if nanoseconds is None:
+        nanoseconds = bool((t_ns % 1000).any())
+    digits, unit = (9, 1) if nanoseconds else (6, 1000)
     columns = (
         t_ns.tolist(),
         frames["id_flags"].tolist(),

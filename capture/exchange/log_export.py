@@ -1,101 +1,105 @@
-"""Raw CAN frames of a session into a log that other tools read."""
+"""Raw CAN frames of a session into a trace that other tools read."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from ..console import progress, refuse_existing
-from ..errors import LogWriteError, MissingChannelError, UsageError
+from ..errors import UsageError
+from ..interruption import StopRequest
 from ..log.session import Session
-from .can_import import DIRECTIONS_KEY, FRAME_TOPIC_PREFIX
-from .candump import candump_lines
-
-EXPORT_SUFFIXES = (".log",)
-"""Suffixes of the formats that can be written: candump."""
-
-_LINES_PER_WRITE = 10_000
+from .frame_blocks import chosen_buses, frame_blocks, frame_facts
+from .frame_formats import FRAME_FORMATS
+from .frame_losses import LossTally
+from .part_file import check_stop, part_file
 
 
-@dataclass(frozen=True)
+@dataclass
 class ExportReport:
-    """What an export did.
+    """What an export of frames did.
 
     Attributes:
         source: The session.
-        output: The log.
+        output: The trace.
+        title: Name of its format.
         buses: Bus to number of frames written.
+        warnings: What the format doesn't hold, or the session doesn't give, one sentence each.
     """
 
     source: Path
     output: Path
+    title: str
     buses: dict[str, int]
+    warnings: list[str] = field(default_factory=list[str])
 
 
 def export_log(
-    source: Path, output: Path, *, bus: str | None = None, force: bool = False
+    source: Path,
+    output: Path,
+    *,
+    bus: str | None = None,
+    force: bool = False,
+    stop: StopRequest | None = None,
 ) -> ExportReport:
-    """Write the raw frames of a session as a candump log.
+    """Write the raw frames of a session as a trace of another format.
 
     The frames of one bus come in the order they were logged, those of several by their times.
-    A log imported from candump comes back bit for bit.
+    Identifier, flags, length code, data, direction and time are kept as far as the format holds
+    them; what it doesn't hold is counted in the report. A candump log that was imported comes back
+    bit for bit.
 
     Args:
         source: The session.
-        output: The log to write; its suffix is one of :data:`EXPORT_SUFFIXES`.
+        output: The trace to write; its suffix is one of
+            :data:`capture.exchange.frame_formats.FRAME_FORMATS`.
         bus: The bus to write; all if None.
         force: Replace an existing file.
+        stop: Ends the export, with nothing left behind.
 
     Returns:
         What was done.
 
     Raises:
-        UsageError: If the suffix is no format that can be written.
+        UsageError: If the suffix is no format that can be written, or the output is the session.
         OutputExistsError: If the output is there and ``force`` is not given.
         MissingChannelError: If the session has no raw frames, or no such bus.
-        LogWriteError: If the output can't be written; nothing is left behind then.
+        LogWriteError: If the output can't be written or the export was stopped; nothing is left
+            behind then.
     """
-    if output.suffix.lower() not in EXPORT_SUFFIXES:
-        valid = ", ".join(EXPORT_SUFFIXES)
+    chosen = FRAME_FORMATS.get(output.suffix.lower())
+    if chosen is None:
+        valid = ", ".join(FRAME_FORMATS)
         raise UsageError(f"{output}: no format has the suffix {output.suffix!r}; valid: {valid}")
+    refuse_same(source, output)
     refuse_existing(output, force=force)
+    tally = LossTally()
     with Session.open(source) as session:
-        names = [
-            topic.removeprefix(FRAME_TOPIC_PREFIX)
-            for topic in sorted(session.channels)
-            if topic.startswith(FRAME_TOPIC_PREFIX)
-        ]
-        if not names:
-            raise MissingChannelError(source, "raw CAN frames", sorted(session.channels))
-        if bus is not None and bus not in names:
-            raise MissingChannelError(source, f"bus {bus}", names)
-        chosen = [bus] if bus is not None else names
-        logs = [session.frames(FRAME_TOPIC_PREFIX + name) for name in chosen]
-        facts = session.metadata.get("undulog", {})
-        directions = facts.get(DIRECTIONS_KEY, "recorded") == "recorded"
-    frames = np.concatenate(logs)
-    which = np.repeat(np.arange(len(logs)), [len(log) for log in logs])
-    if len(logs) > 1:
-        order = np.argsort(frames["t_host_ns"], kind="stable")
-        frames, which = frames[order], which[order]
-    part = output.with_name(f"{output.name}.part")
-    try:
+        facts = frame_facts(session, chosen_buses(session, bus))
         with (
-            part.open("w", encoding="utf-8", newline="\n") as stream,
-            progress(f"export {output.name}", len(frames)) as bar,
+            part_file(output, force=force) as part,
+            progress(f"export {output.name}", 1.0) as bar,
+            chosen.open(part, facts) as write,
         ):
-            lines = candump_lines(frames, chosen, which, directions=directions)
-            for start in range(0, len(frames), _LINES_PER_WRITE):
-                stream.writelines(islice(lines, _LINES_PER_WRITE))
-                bar.update(start)
-        part.replace(output)
-    except OSError as error:
-        raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
-    return ExportReport(
-        source, output, {name: len(log) for name, log in zip(chosen, logs, strict=True)}
-    )
+            for block in frame_blocks(session, facts.buses):
+                kept = chosen.kept(block.frames)
+                tally.add(block.frames, kept)
+                write(kept, block.bus)
+                bar.update(block.done)
+                check_stop(output, stop)
+        warnings = [*session.warnings, *chosen.notes(facts), *tally.sentences()]
+    return ExportReport(source, output, chosen.title, dict(facts.counts), warnings)
+
+
+def refuse_same(source: Path, output: Path) -> None:
+    """Check that an export doesn't replace its own session.
+
+    Args:
+        source: The session.
+        output: The file to write.
+
+    Raises:
+        UsageError: If they are one file.
+    """
+    if output.exists() and source.exists() and output.samefile(source):
+        raise UsageError(f"{output} is the session itself; choose another name")

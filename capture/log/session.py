@@ -257,11 +257,16 @@ class Session:
         for log_ns, message in self._topics.raw(topic):
             yield log_ns, decode(message)
 
-    def frames(self, topic: str) -> FrameArray:
-        """All raw CAN frames of a bus, in the order they were logged.
+    def frames(
+        self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> FrameArray:
+        """Raw CAN frames of a bus, in the order they were logged.
 
         Args:
             topic: E.g. ``/can/can0``.
+            start_ns: First log time of a message of frames wanted [Unix ns]; None for the
+                session's start.
+            stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
 
         Returns:
             Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
@@ -270,7 +275,7 @@ class Session:
             MissingChannelError: If the session has no such topic.
             DataError: If the topic holds something else.
         """
-        groups = self._groups(topic, ["data"], (None, None))
+        groups = self._groups(topic, ["data"], (start_ns, stop_ns))
         batches: list[tuple[int, int, FrameArray]] = []
         for group in groups:
             data = group.values("data")

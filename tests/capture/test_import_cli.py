@@ -48,6 +48,7 @@ def test_reports_as_json(trace, tmp_path: Path, capsys):
         "output": back,
         "frames": 10,
         "buses": {"can0": 10},
+        "warnings": [],
     }
 
 
@@ -106,8 +107,8 @@ def test_what_export_cannot_do_is_said(trace, tmp_path: Path, capsys):
     run = tmp_path / "run.mcap"
     undulog.run(["import", str(trace), "-o", str(run), "--robot", "snake25"])
     capsys.readouterr()
-    assert undulog.run(["log", "export", str(run), "-o", str(tmp_path / "x.blf")]) == 2
-    assert "no format has the suffix '.blf'; valid: .log" in capsys.readouterr().err
+    assert undulog.run(["log", "export", str(run), "-o", str(tmp_path / "x.trc")]) == 2
+    assert "no format has the suffix '.trc'; valid: .log, .blf" in capsys.readouterr().err
     assert (
         undulog.run(["log", "export", str(run), "-o", str(tmp_path / "x.log"), "--bus", "b"]) == 1
     )

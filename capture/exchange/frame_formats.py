@@ -1,0 +1,262 @@
+"""Formats of CAN traces that can be written, by suffix.
+
+A format says what it keeps of frames (:meth:`FrameFormat.kept`) and writes just that, so that what
+is lost can be counted before it is lost. Formats: candump (:mod:`capture.exchange.candump`),
+Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`capture.exchange.ros_frames`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ..arrays import IntArray
+from ..log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
+from .candump import candump_lines
+from .frame_blocks import FrameFacts
+from .frame_losses import is_error, is_remote, without_content
+from .ros_frames import RosFrames
+
+if TYPE_CHECKING:
+    from can.io.generic import MessageWriter
+
+_NS = 1_000_000_000
+_BLF_EPOCH_NS = 631_152_000 * _NS  # 1990: python-can takes less for no date
+_NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
+
+WriteFrames = Callable[[FrameArray, IntArray], None]
+"""Writes frames, shape (n,), and the index of each one's bus, shape (n,)."""
+
+
+class FrameFormat(Protocol):
+    """One format of CAN traces."""
+
+    title: str
+    """Its name, as in ``in the format of ...``."""
+
+    def kept(self, frames: FrameArray) -> FrameArray:
+        """What the format keeps of frames.
+
+        Args:
+            frames: Records, shape (n,).
+
+        Returns:
+            What a reader of the format gets, shape (n,); the device times are not looked at.
+        """
+        ...
+
+    def notes(self, facts: FrameFacts) -> list[str]:
+        """What the format can't say about the trace as a whole.
+
+        Args:
+            facts: Of the trace.
+
+        Returns:
+            One sentence each.
+        """
+        ...
+
+    def open(self, path: Path, facts: FrameFacts) -> AbstractContextManager[WriteFrames]:
+        """Create a file.
+
+        Args:
+            path: The file.
+            facts: Of the trace.
+
+        Returns:
+            A ``with`` block around what writes frames, which must have been through :meth:`kept`.
+
+        Raises:
+            OSError: If it can't be written.
+        """
+        ...
+
+
+class Candump:
+    """Text of ``candump -L``."""
+
+    title = "candump -L"
+
+    def kept(self, frames: FrameArray) -> FrameArray:
+        """Everything but data of remote frames and further flags of error frames."""
+        kept = frames.copy()
+        error, remote = is_error(frames), is_remote(frames)
+        kept["id_flags"][error] &= ID_MASK | ERROR_FLAG
+        kept["data"][remote] = 0
+        kept["dlc"][remote] = np.minimum(frames["dlc"][remote], 8)
+        return kept
+
+    def notes(self, facts: FrameFacts) -> list[str]:  # noqa: ARG002
+        """Nothing."""
+        return []
+
+    @contextmanager
+    def open(self, path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
+        """Create a file."""
+        with path.open("w", encoding="utf-8", newline="\n") as stream:
+
+            def write(frames: FrameArray, bus: IntArray) -> None:
+                stream.writelines(
+                    candump_lines(
+                        frames,
+                        facts.buses,
+                        bus,
+                        directions=facts.directions,
+                        nanoseconds=facts.nanoseconds,
+                    )
+                )
+
+            yield write
+
+
+class Blf:
+    """Vector's binary logging format, by python-can."""
+
+    title = "Vector BLF"
+
+    def kept(self, frames: FrameArray) -> FrameArray:
+        """Everything but data of remote frames, and directions and flags of error frames."""
+        kept = frames.copy()
+        error = is_error(frames)
+        kept["id_flags"][error] &= ID_MASK | ERROR_FLAG
+        kept["dlc"][error] = np.minimum(frames["dlc"][error], 8)
+        kept["dir"][error] = DIR_RX
+        kept["data"][is_remote(frames)] = 0
+        return kept
+
+    def notes(self, facts: FrameFacts) -> list[str]:
+        """Bus names, directions that are none, and dates before 1990."""
+        notes = _notes_on_buses(facts)
+        if facts.start_ns < _BLF_EPOCH_NS:
+            notes.append("its dates begin in 1990: the times are those since 1970, without a date")
+        return notes
+
+    @contextmanager
+    def open(self, path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
+        """Create a file; its times count from the last whole second before the first frame."""
+        from can import BLFWriter
+
+        dated = facts.start_ns >= _BLF_EPOCH_NS
+        start_s = facts.start_ns // _NS if dated else 0
+        with BLFWriter(path) as writer:
+            # Counted from the start, times are exact to 1 ns; as Unix times, which python-can
+            # keeps as floating-point seconds, they would be to 240 ns.
+            writer.start_timestamp = 0.0
+            yield _writing(writer, facts, start_s)
+            writer.start_timestamp = float(start_s) if dated else None
+            writer.stop_timestamp = facts.end_ns / _NS
+
+
+class Asc:
+    """Vector's text format, by python-can."""
+
+    title = "Vector ASC"
+
+    def kept(self, frames: FrameArray) -> FrameArray:
+        """Data and remote frames at whole microseconds; of error frames only the time."""
+        kept = frames.copy()
+        remote = is_remote(frames)
+        without_content(kept, is_error(frames))
+        # Readers take a length code above 8 for that of a CAN FD frame.
+        kept["dlc"] = np.minimum(kept["dlc"], 8)
+        kept["data"][remote] = 0
+        kept["t_host_ns"] = (frames["t_host_ns"] + 500) // 1000 * 1000
+        return kept
+
+    def notes(self, facts: FrameFacts) -> list[str]:
+        """Bus names, and directions that are none."""
+        return _notes_on_buses(facts)
+
+    @contextmanager
+    def open(self, path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
+        """Create a file; its times count from the last whole second before the first frame."""
+        from can import ASCWriter
+
+        start_s = facts.start_ns // _NS
+        # The format's dates are local times, and its readers take them as such.
+        date = datetime.fromtimestamp(start_s).strftime("%a %b %d %H:%M:%S.000 %Y")  # noqa: DTZ006
+        with path.open("w", encoding="ascii", newline="\n") as stream, ASCWriter(stream) as writer:
+            # The writer dates the file by the clock, and from a first frame's fraction of a second.
+            stream.seek(0)
+            stream.truncate()
+            stream.write(f"date {date}\nbase hex  timestamps absolute\ninternal events logged\n")
+            stream.write(f"Begin Triggerblock {date}\n{0:9.6f} Start of measurement\n")
+            writer.header_written = True
+            yield _writing(writer, facts, start_s)
+
+
+FRAME_FORMATS: dict[str, FrameFormat] = {
+    ".log": Candump(),
+    ".blf": Blf(),
+    ".asc": Asc(),
+    ".mcap": RosFrames(),
+}
+"""Suffix to format."""
+
+
+def channel_numbers(buses: Sequence[str]) -> list[int]:
+    """Numbers for buses in formats that have no names, counted from 0 as python-can does.
+
+    Args:
+        buses: Their names.
+
+    Returns:
+        N for a bus ``canN``, so that an import names it the same; the lowest free number for any
+        other.
+    """
+    matches = [_NUMBERED.fullmatch(name) for name in buses]
+    taken = {int(match[1]) for match in matches if match}
+    free = (number for number in range(len(buses) + len(taken)) if number not in taken)
+    return [int(match[1]) if match else next(free) for match in matches]
+
+
+def _notes_on_buses(facts: FrameFacts) -> list[str]:
+    numbers = channel_numbers(facts.buses)
+    notes = [
+        f"it has no names: bus {name} is channel {number + 1}"
+        for name, number in zip(facts.buses, numbers, strict=True)
+        if name != f"can{number}"
+    ]
+    if not facts.directions:
+        notes.append("no directions were recorded: all frames are written as received")
+    return notes
+
+
+def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFrames:
+    """What hands frames to a writer of python-can, timed from ``start_s`` [Unix s]."""
+    from can import Message
+
+    channels = channel_numbers(facts.buses)
+
+    def write(frames: FrameArray, bus: IntArray) -> None:
+        columns: tuple[list[int], ...] = (
+            (frames["t_host_ns"].astype(np.int64) - start_s * _NS).tolist(),
+            frames["id_flags"].tolist(),
+            frames["dlc"].tolist(),
+            frames["dir"].tolist(),
+        )
+        numbers: list[int] = np.array(channels)[bus].tolist()
+        data = frames["data"].tobytes()
+        rows = zip(*columns, numbers, strict=True)
+        for i, (t_ns, id_flags, dlc, way, number) in enumerate(rows):
+            writer(
+                Message(
+                    timestamp=(t_ns + 0.5) / _NS,  # python-can cuts to whole ns
+                    arbitration_id=id_flags & ID_MASK,
+                    is_extended_id=bool(id_flags & EXTENDED_FLAG),
+                    is_remote_frame=bool(id_flags & REMOTE_FLAG),
+                    is_error_frame=bool(id_flags & ERROR_FLAG),
+                    channel=number,
+                    dlc=dlc,
+                    data=data[8 * i : 8 * i + min(dlc, 8)],
+                    is_rx=way != DIR_TX,
+                )
+            )
+
+    return write
