@@ -1,0 +1,89 @@
+"""Raw CAN frames: rate, error frames and an estimate of the bus load."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import IntArray
+from .frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameArray
+from .measures import BusHealth
+from .tallies import NS, TimingTally
+
+
+def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
+    """Length of classic CAN frames on the wire, interframe space included.
+
+    Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
+    refuted, revisited and revised" (2007): C = g + 8 s + 13 + floor((g + 8 s - 1) / 4), with
+    g = 34 for 11-bit and 54 for 29-bit identifiers; the last term is the most stuff bits.
+
+    Args:
+        frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+
+    Returns:
+        Fewest and most bits, each of shape (n,); 0 for error frames, which report what happened
+        on the bus and are not on it themselves.
+    """
+    flags = frames["id_flags"]
+    g = np.where(flags & EXTENDED_FLAG, 54, 34)
+    s = np.where(flags & REMOTE_FLAG, 0, np.minimum(frames["dlc"], 8)).astype(np.int64)
+    on_bus = (flags & ERROR_FLAG) == 0
+    fewest = g + 8 * s + 13
+    return fewest * on_bus, (fewest + (g + 8 * s - 1) // 4) * on_bus
+
+
+class BusTally:
+    """Frames of one bus."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._timing = TimingTally()
+        self._errors = 0
+        self._bits: dict[int, tuple[int, int]] = {}
+
+    def add(self, frames: FrameArray) -> None:
+        """Take the next frames.
+
+        Args:
+            frames: In the order of the log, shape (n,).
+        """
+        if not len(frames):
+            return
+        t_ns = frames["t_host_ns"].astype(np.int64)
+        self._timing.add(t_ns)
+        self._errors += int(((frames["id_flags"] & ERROR_FLAG) != 0).sum())
+        fewest, most = frame_bits(frames)
+        seconds, place = np.unique(t_ns // NS, return_inverse=True)
+        sums = [np.bincount(place, bits).astype(np.int64).tolist() for bits in (fewest, most)]
+        for second, low, high in zip(seconds.tolist(), *sums, strict=True):
+            had = self._bits.get(second, (0, 0))
+            self._bits[second] = (had[0] + low, had[1] + high)
+
+    def result(self, topic: str, bitrate: int | None) -> BusHealth:
+        """What the frames so far say.
+
+        Args:
+            topic: The bus's topic.
+            bitrate: [bit/s], None where unknown.
+
+        Returns:
+            The bus's health.
+        """
+        timing = self._timing.result()
+        span_s = (timing.last_ns - timing.first_ns) / NS
+        load = peak = None
+        if bitrate and span_s > 0:
+            low, high = (sum(bits[k] for bits in self._bits.values()) for k in (0, 1))
+            load = low / span_s / bitrate, high / span_s / bitrate
+            low, high = (max(bits[k] for bits in self._bits.values()) for k in (0, 1))
+            peak = low / bitrate, high / bitrate
+        return BusHealth(
+            topic,
+            timing.count,
+            timing.rate_hz,
+            self._errors,
+            timing.longest_s,
+            timing.longest_at_ns,
+            load,
+            peak,
+        )

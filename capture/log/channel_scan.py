@@ -1,0 +1,355 @@
+"""The messages of one channel into tallies, many at a time.
+
+Messages are gathered to batches of a few thousand before they are looked at, so that the cost
+of a look is shared, and memory holds one batch a channel however long the session is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..errors import DataError
+from .bus_tally import BusTally
+from .cdr import Layout, layout_of
+from .chunk import Buffer
+from .frames import FRAME_DTYPE, FRAME_LAYOUT, empty_frames
+from .health import LIMIT_RAD
+from .rosmsg import MessageType
+from .tallies import NS, RangeTally, SequenceTally, TimingTally
+
+HEAD = np.dtype(
+    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8")]
+)
+"""Start of a message record; the publish time and the message follow."""
+
+_BODY_AT = 31
+_FIXED_SIZE = 22  # of the length, before the message itself
+_STAMP_AT = 4  # a leading Header or Time follows the encapsulation header at once
+_BATCH_ROWS = 4096
+_BATCH_BYTES = 1 << 21
+_MAX_LAYOUTS = 64
+_FIELDS = ("position", "velocity", "effort")
+
+Limits = dict[str, tuple[float, float]]
+Matrix = NDArray[np.uint8]
+
+
+@dataclass
+class Series:
+    """Tallies of the messages that carry the same names.
+
+    Attributes:
+        names: Joints or values; empty for other types.
+        timing: Of the stamps.
+        first_log_ns: First log time [Unix ns].
+        last_log_ns: Last log time [Unix ns].
+        numbers: Numbers looked at.
+        nan: NaN among them.
+        rows: Samples with values.
+        joint_nan: Samples that are NaN in some field, shape (k,).
+        at_limit: Angles at the joint's limits, shape (k,).
+        ranges: Angles by the second.
+    """
+
+    names: tuple[str, ...]
+    timing: TimingTally = field(default_factory=TimingTally)
+    first_log_ns: int = 2**63 - 1
+    last_log_ns: int = 0
+    numbers: int = 0
+    nan: int = 0
+    rows: int = 0
+    joint_nan: IntArray = field(init=False)
+    at_limit: IntArray = field(init=False)
+    ranges: RangeTally = field(default_factory=RangeTally)
+
+    def __post_init__(self) -> None:
+        """Size the counters."""
+        self.joint_nan = np.zeros(len(self.names), np.int64)
+        self.at_limit = np.zeros(len(self.names), np.int64)
+
+
+class ChannelScan:
+    """One channel."""
+
+    def __init__(
+        self, topic: str, kind: MessageType | None, *, joints: bool, limits: Limits | None
+    ) -> None:
+        """Start empty.
+
+        Args:
+            topic: Its topic.
+            kind: Its message type; None where it can't be read: log times are looked at then.
+            joints: Whether its messages are JointStates.
+            limits: Joint name to limits [rad]; None where its positions are not angles.
+        """
+        self.topic = topic
+        self.count = 0
+        self.unread = 0
+        self.sequence = SequenceTally()
+        self.series: dict[tuple[str, ...], Series] = {}
+        self.bus = BusTally() if kind is not None and _holds_frames(topic, kind) else None
+        self._kind = kind
+        self._joints = joints
+        self._limits = limits
+        self._stamped = kind is not None and _is_stamped(kind)
+        self._layouts: dict[int, list[Layout]] = {}
+        self._log: list[NDArray[np.uint64]] = []
+        self._sequence: list[NDArray[np.uint32]] = []
+        self._pending: list[tuple[IntArray, Matrix]] = []  # rows of the batch, their messages
+        self._rows = self._bytes = 0
+
+    def add(self, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
+        """Take the channel's messages of one block.
+
+        Args:
+            data: The block's payload.
+            offsets: Where their records start, in file order, shape (n,).
+            heads: The records' heads, of :data:`HEAD`, shape (n,).
+        """
+        self._log.append(heads["log"])
+        self._sequence.append(heads["sequence"])
+        if self._kind is not None:
+            lengths = heads["length"].astype(np.int64) - _FIXED_SIZE
+            first = int(lengths[0])
+            if (lengths == first).all():
+                self._take(data, offsets, np.arange(len(offsets)), first)
+            else:
+                sizes: list[int] = np.unique(lengths).tolist()
+                for size in sizes:
+                    rows = np.flatnonzero(lengths == size)
+                    self._take(data, offsets[rows], rows, size)
+        self._rows += len(offsets)
+        if self._rows >= _BATCH_ROWS or self._bytes >= _BATCH_BYTES:
+            self.flush()
+
+    def _take(self, data: Buffer, offsets: IntArray, rows: IntArray, size: int) -> None:
+        """Copy messages of one length; ``rows`` are their places in the block."""
+        records = _gather(data, offsets + _BODY_AT, np.dtype(f"V{max(size, 1)}"))
+        matrix = records.view(np.uint8).reshape(len(rows), -1)[:, :size]
+        self._pending.append((self._rows + rows, matrix))
+        self._bytes += matrix.size
+
+    def flush(self) -> None:
+        """Look at the messages gathered so far."""
+        if not self._rows:
+            return
+        log_ns = np.concatenate(self._log).astype(np.int64)
+        self.sequence.add(np.concatenate(self._sequence).astype(np.int64))
+        self.count += len(log_ns)
+        batch = self._pending
+        self._log, self._sequence, self._pending = [], [], []
+        self._rows = self._bytes = 0
+        by_length: dict[int, list[tuple[IntArray, Matrix]]] = {}
+        for rows, matrix in batch:
+            by_length.setdefault(matrix.shape[1], []).append((rows, matrix))
+        whole = [
+            (np.concatenate([r for r, _ in parts]), np.concatenate([m for _, m in parts]))
+            for parts in by_length.values()
+        ]
+        kind = self._kind
+        stamps = log_ns.copy()
+        if self._stamped:
+            for rows, matrix in whole:
+                _stamp(stamps, rows, matrix)
+        if kind is not None and self._joints:
+            self._add_joints(kind, whole, stamps, log_ns)
+            return
+        series = self._add_times((), stamps, log_ns)
+        if kind is not None and self.bus is not None:
+            self._add_frames(self.bus, kind, whole, len(log_ns))
+        elif kind is not None:
+            for rows, matrix in whole:
+                for _, _, layout, part in self._split(kind, rows, matrix):
+                    _count_nan(series, layout, part)
+
+    def _add_times(self, names: tuple[str, ...], stamps: IntArray, log_ns: IntArray) -> Series:
+        if names not in self.series:
+            self.series[names] = Series(names)
+        series = self.series[names]
+        series.timing.add(stamps)
+        series.first_log_ns = min(series.first_log_ns, int(log_ns.min()))
+        series.last_log_ns = max(series.last_log_ns, int(log_ns.max()))
+        return series
+
+    def _add_joints(
+        self,
+        kind: MessageType,
+        whole: list[tuple[IntArray, Matrix]],
+        stamps: IntArray,
+        log_ns: IntArray,
+    ) -> None:
+        places: dict[tuple[str, ...], list[IntArray]] = {}
+        for rows, matrix in whole:
+            for names, chosen, layout, part in self._split(kind, rows, matrix):
+                places.setdefault(names, []).append(chosen)
+                series = self.series.setdefault(names, Series(names))
+                _count_nan(series, layout, part)
+                self._add_values(series, layout, part, stamps[chosen])
+        for names, chosen in places.items():
+            ordered = np.sort(np.concatenate(chosen))
+            self._add_times(names, stamps[ordered], log_ns[ordered])
+
+    def _add_values(self, series: Series, layout: Layout, part: Matrix, stamps: IntArray) -> None:
+        fields = [_values(layout, name, part) for name in _FIELDS]
+        fields = [values for values in fields if values.shape[1] == len(series.names) > 0]
+        if not fields:
+            return
+        series.rows += len(part)
+        series.joint_nan += np.any([np.isnan(values) for values in fields], axis=0).sum(axis=0)
+        angles = _values(layout, "position", part)
+        if self._limits is None or angles.shape[1] != len(series.names):
+            return
+        series.ranges.add(stamps, angles)
+        none = (-np.inf, np.inf)
+        lower, upper = np.array([self._limits.get(name, none) for name in series.names]).T
+        at_limit = (angles <= lower + LIMIT_RAD) | (angles >= upper - LIMIT_RAD)
+        series.at_limit += at_limit.sum(axis=0)
+
+    def _add_frames(
+        self,
+        bus: BusTally,
+        kind: MessageType,
+        whole: list[tuple[IntArray, Matrix]],
+        count: int,
+    ) -> None:
+        sizes = np.zeros(count, np.int64)
+        found: list[tuple[IntArray, Matrix]] = []
+        for rows, matrix in whole:
+            try:
+                layout = layout_of(kind, matrix[0].tobytes())
+            except DataError:
+                self.unread += len(rows)
+                continue
+            leaf = layout.leaves.get("data")
+            if leaf is None:
+                continue
+            if FRAME_LAYOUT not in layout.strings.values() or leaf.count % FRAME_DTYPE.itemsize:
+                self.unread += len(rows)
+                continue
+            found.append((rows, matrix[:, leaf.offset : leaf.offset + leaf.count]))
+            sizes[rows] = leaf.count // FRAME_DTYPE.itemsize
+        starts = np.cumsum(sizes) - sizes
+        frames = empty_frames(int(sizes.sum()))
+        for rows, data in found:
+            records = np.ascontiguousarray(data).view(FRAME_DTYPE)
+            frames[starts[rows][:, None] + np.arange(records.shape[1])] = records
+        bus.add(frames)
+
+    def _split(
+        self, kind: MessageType, rows: IntArray, matrix: Matrix
+    ) -> list[tuple[tuple[str, ...], IntArray, Layout, Matrix]]:
+        """Messages of one length by layout: names, rows, layout, messages."""
+        known = self._layouts.setdefault(matrix.shape[1], [])
+        parts: list[tuple[tuple[str, ...], IntArray, Layout, Matrix]] = []
+        for layout in known:
+            fits = _fits(matrix, layout)
+            if fits.all():  # the usual case: nothing to pick
+                parts.append((_names(layout), rows, layout, matrix))
+                return parts
+            if fits.any():
+                parts.append((_names(layout), rows[fits], layout, matrix[fits]))
+                rows, matrix = rows[~fits], matrix[~fits]
+        while len(rows):
+            try:
+                layout = layout_of(kind, matrix[0].tobytes())
+            except DataError:
+                self.unread += 1
+                rows, matrix = rows[1:], matrix[1:]
+                continue
+            if len(known) < _MAX_LAYOUTS:
+                known.append(layout)
+            elif not self._joints:  # text: a layout a message, and no numbers worth a look
+                return parts
+            fits = _fits(matrix, layout)
+            parts.append((_names(layout), rows[fits], layout, matrix[fits]))
+            rows, matrix = rows[~fits], matrix[~fits]
+        return parts
+
+
+def read_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] | None:
+    """The heads of message records, if whole messages lie where an index says.
+
+    Args:
+        data: A block's payload.
+        offsets: Where they should start, shape (n,).
+        stop: One past the payload's last byte.
+
+    Returns:
+        Of :data:`HEAD`, shape (n,); None if any is not a whole message.
+    """
+    if not len(offsets):
+        return np.empty(0, HEAD)
+    if offsets.min() < 0 or offsets.max() + _BODY_AT > stop:
+        return None
+    heads = _gather(data, offsets, HEAD)
+    room = (stop - offsets - 9).astype(np.uint64)
+    lengths = heads["length"]
+    whole = (lengths >= _FIXED_SIZE) & (lengths <= room) & (heads["opcode"] == Opcode.MESSAGE)
+    return heads if whole.all() else None
+
+
+def _gather(data: Buffer, at: IntArray, kind: np.dtype[np.void]) -> NDArray[np.void]:
+    """Records of one type at any offsets: an overlapping view with a stride of one byte."""
+    size = max(len(data) - kind.itemsize + 1, 0)
+    return np.ndarray((size,), dtype=kind, buffer=data, strides=(1,))[at]
+
+
+def _fits(matrix: Matrix, layout: Layout) -> BoolArray:
+    """Which messages have the layout's strings and sequence lengths, shape (n,)."""
+    example = np.frombuffer(layout.example, dtype=np.uint8)
+    fits = np.ones(len(matrix), dtype=bool)
+    for start, stop in layout.hull:
+        fits &= (matrix[:, start:stop] == example[start:stop]).all(axis=1)
+    doubtful = np.flatnonzero(~fits)
+    if len(doubtful):  # the difference may lie in padding alone
+        static = layout.static
+        fits[doubtful] = (matrix[np.ix_(doubtful, static)] == example[static]).all(axis=1)
+    return fits
+
+
+def _names(layout: Layout) -> tuple[str, ...]:
+    return tuple(text for path, text in layout.strings.items() if path.startswith("name["))
+
+
+def _values(layout: Layout, path: str, part: Matrix) -> FloatArray:
+    leaf = layout.leaves.get(path)
+    if leaf is None:
+        return np.empty((len(part), 0))
+    width = leaf.count * np.dtype(leaf.dtype).itemsize
+    cut = np.ascontiguousarray(part[:, leaf.offset : leaf.offset + width])
+    return cut.view(leaf.dtype).astype(np.float64, copy=False)
+
+
+def _count_nan(series: Series, layout: Layout, part: Matrix) -> None:
+    for path, leaf in layout.leaves.items():
+        if leaf.dtype in ("<f4", "<f8"):
+            series.numbers += len(part) * leaf.count
+            series.nan += int(np.isnan(_values(layout, path, part)).sum())
+
+
+def _stamp(stamps: IntArray, rows: IntArray, matrix: Matrix) -> None:
+    """Put header stamps in place of log times, where a message has one that is not zero."""
+    if matrix.shape[1] < _STAMP_AT + 8:
+        return
+    parts = np.ascontiguousarray(matrix[:, _STAMP_AT : _STAMP_AT + 8])
+    seconds = parts[:, :4].copy().view("<i4")[:, 0].astype(np.int64)
+    stamp_ns = seconds * NS + parts[:, 4:].copy().view("<u4")[:, 0]
+    usable = (matrix[:, 1] == 1) & (stamp_ns != 0)  # little-endian
+    stamps[rows[usable]] = stamp_ns[usable]
+
+
+def _is_stamped(kind: MessageType) -> bool:
+    """Whether a message starts with a Header or a Time."""
+    first = kind.fields[0].nested if kind.fields else None
+    if first is not None and first.fields and first.fields[0].nested is not None:
+        first = first.fields[0].nested
+    return first is not None and [part.name for part in first.fields] == ["sec", "nanosec"]
+
+
+def _holds_frames(topic: str, kind: MessageType) -> bool:
+    return topic.startswith("/can/") and kind.name == "std_msgs/msg/UInt8MultiArray"

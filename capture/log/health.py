@@ -1,0 +1,334 @@
+"""The health of a recorded session: measures in, a verdict with its reasons out.
+
+The measures come from :mod:`capture.log.tallies`, so the same rules judge a file or the last
+seconds of a live recording. Every threshold stands here by name, with why it is what it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
+from .tallies import NS, PAUSE_PERIODS, PAUSE_S, Ranges, longest_run
+
+GOOD_LOSS = 1e-3
+"""Up to one sample in a thousand may be missing, not finite or repeated in a good session: less
+than one in a gait cycle of ten seconds at 100 Hz."""
+
+BAD_LOSS = 0.1
+"""From a tenth on the losses are seldom random: they follow bus load and hence the motion, and
+what is left is a biased picture of it."""
+
+LONG_GAP_S = 0.1
+"""A gap that a good session doesn't have. Linear interpolation across T misses up to
+1 - cos(pi f T) of the amplitude: 5 % for 0.1 s at 1 Hz, the quickest gaits of such robots."""
+
+BAD_PAUSE = 0.5
+"""With pauses over half of the time a session has more holes than data."""
+
+MAX_JITTER = 0.25
+"""Standard deviation of the intervals against their median: a quarter means that one sample in
+twenty is half an interval off, so the rhythm of the source is disturbed."""
+
+FROZEN_COMMAND_RAD = 0.05
+"""A joint is frozen in a second if its angle keeps one value, to the bit, while its command moves
+by more than this: ten steps of the coarsest common servo (0.29 degrees)."""
+
+FROZEN_SECONDS = 2
+"""Consecutive seconds that make a frozen joint; one alone may be a slow start of the motion."""
+
+FROZEN_SAMPLES = 5
+"""A second with fewer samples can't tell."""
+
+LIMIT_RAD = 1e-3
+"""Nearer to a limit than this is at it: below one step of a 12-bit encoder (1.5 mrad)."""
+
+MAX_AT_LIMIT = 0.1
+"""A sine that just touches both limits of 30 degrees is within 1 mrad of them for
+2 / pi arccos(1 - 1e-3 / 0.52) = 4 % of the time; beyond a tenth the joint is held there."""
+
+MAX_BUS_LOAD = 0.8
+"""From this part of the bitrate on, frames of low priority wait for many others."""
+
+BAD_JOINTS = 0.5
+"""With half of the joints dead the session no longer shows the robot's motion."""
+
+VERDICTS = ("good", "degraded", "bad")
+VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
+"""Never analysed, so never judged."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that was found.
+
+    Attributes:
+        weight: Index into :data:`VERDICTS`; 0 is worth knowing and no fault.
+        sentence: What, where, how much.
+    """
+
+    weight: int
+    sentence: str
+
+
+def frozen_time(measured: Ranges, joint: int, command: Ranges, commanded: int) -> tuple[int, int]:
+    """How long a joint stood, to the bit, while its command moved.
+
+    Args:
+        measured: Of the measured angles [rad].
+        joint: Column of the joint in ``measured``.
+        command: Of the commands [rad].
+        commanded: Column of the joint in ``command``.
+
+    Returns:
+        Longest run of such seconds [s] and its first second [Unix s].
+    """
+    seconds, here, there = np.intersect1d(measured.second, command.second, return_indices=True)
+    stood = measured.high[here, joint] == measured.low[here, joint]
+    stood &= measured.count[here] >= FROZEN_SAMPLES
+    moved = command.high[there, commanded] - command.low[there, commanded] > FROZEN_COMMAND_RAD
+    return longest_run((stood & moved).astype(np.int64), seconds)
+
+
+def judge_file(health: FileHealth) -> list[Finding]:
+    """Findings on the container.
+
+    Args:
+        health: Its measures.
+
+    Returns:
+        The findings.
+    """
+    found = [Finding(2, sentence) for sentence in health.damage]
+    if health.truncated:
+        found.append(Finding(1, "the file is cut short: what came after the cut is lost"))
+    elif not health.indexed:
+        found.append(Finding(1, "the file has no usable index and can only be read from the start"))
+    found += [Finding(0, sentence) for sentence in health.notes]
+    if health.without_crc:
+        found.append(
+            Finding(
+                0,
+                f"{health.without_crc} of {health.chunks} chunks carry no CRC: damage in them "
+                "can't be excluded",
+            )
+        )
+    return found
+
+
+def judge_channel(health: ChannelHealth) -> list[Finding]:
+    """Findings on one channel.
+
+    Args:
+        health: Its measures.
+
+    Returns:
+        The findings.
+    """
+    found: list[Finding] = []
+    expected = health.count + (health.sequence.dropped or 0)
+    if health.sequence.dropped:
+        part = health.sequence.dropped / expected
+        found.append(
+            Finding(
+                2 if part >= BAD_LOSS else 1,
+                f"{health.topic}: {health.sequence.dropped} of {expected} messages were dropped "
+                f"({part:.2%}), as its sequence numbers prove",
+            )
+        )
+    if health.sequence.reordered:
+        found.append(
+            Finding(0, f"{health.topic}: {health.sequence.reordered} messages are out of sequence")
+        )
+    if health.unread:
+        part = health.unread / health.count
+        found.append(
+            Finding(
+                2 if part >= BAD_LOSS else 1,
+                f"{health.topic}: {health.unread} of {health.count} messages can't be decoded",
+            )
+        )
+    return found
+
+
+def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Finding]:
+    """Findings on the rhythm of one series.
+
+    Args:
+        health: Its measures.
+        start_ns: Log time of the session's first message [Unix ns].
+        end_ns: Log time of its last message [Unix ns].
+
+    Returns:
+        The findings; none for view aids.
+    """
+    timing, label = health.timing, health.label
+    if health.topic in VIEW_AIDS or timing.median_s is None:
+        return []
+    found: list[Finding] = []
+    when = _at(timing.longest_at_ns, timing.first_ns)
+    joints = health.type_name.endswith("/JointState")
+    span_s = (timing.last_ns - timing.first_ns) / NS
+    mostly_paused = joints and timing.paused_s >= BAD_PAUSE * span_s
+    if timing.gaps:
+        long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * timing.median_s
+        weight = int(timing.missing_part > GOOD_LOSS or long)
+        scattered = timing.scattered / (timing.count + timing.scattered)
+        found.append(
+            Finding(
+                2 if scattered >= BAD_LOSS or mostly_paused else weight,
+                f"{label}: {timing.gaps} gaps, {timing.missing} samples missing "
+                f"({timing.missing_part:.2%}); the longest is {timing.longest_s:.3g} s, {when}",
+            )
+        )
+    elif joints and timing.paused_s:
+        sentence = f"{label}: silent for {timing.paused_s:.3g} s in all; the longest pause is "
+        sentence += f"{timing.longest_s:.3g} s, {when}"
+        found.append(Finding(1 + mostly_paused, sentence))
+    if timing.regular:
+        edge_s = max(PAUSE_S, PAUSE_PERIODS * timing.median_s)
+        late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
+        if late_s > edge_s:
+            found.append(Finding(1, f"{label}: starts {late_s:.3g} s after the session"))
+        if early_s > edge_s:
+            found.append(Finding(1, f"{label}: ends {early_s:.3g} s before the session"))
+        if timing.std_s is not None and timing.std_s > MAX_JITTER * timing.median_s:
+            found.append(
+                Finding(
+                    1,
+                    f"{label}: the intervals jitter by {timing.std_s / timing.median_s:.0%} of "
+                    "their median",
+                )
+            )
+    elif joints and timing.count > FROZEN_SAMPLES:
+        found.append(Finding(0, f"{label}: no steady rhythm, so single gaps can't be told"))
+    if timing.backward:
+        found.append(Finding(1, f"{label}: {timing.backward} stamps go back in time"))
+    if timing.duplicates:
+        weight = int(timing.duplicates > GOOD_LOSS * timing.count)
+        found.append(Finding(weight, f"{label}: {timing.duplicates} stamps are repeated"))
+    if health.nan and not joints:
+        weight = int(health.nan > GOOD_LOSS * health.numbers)
+        found.append(
+            Finding(weight, f"{label}: {health.nan} of {health.numbers} numbers are not a number")
+        )
+    return found
+
+
+def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Finding]:
+    """Findings on the joints.
+
+    Args:
+        joints: Measures of all joints of all topics.
+        start_ns: Start of the session [Unix ns].
+
+    Returns:
+        The findings.
+    """
+    found: list[Finding] = []
+    dead: set[str] = set()
+    for joint in joints:
+        where = f"{joint.topic}, {joint.name}"
+        if joint.nan:
+            found.append(
+                Finding(
+                    int(joint.nan > GOOD_LOSS * joint.samples),
+                    f"{where}: {joint.nan} of {joint.samples} samples are not a number",
+                )
+            )
+        frozen = (joint.frozen_s or 0) >= FROZEN_SECONDS
+        if frozen:
+            found.append(
+                Finding(
+                    1,
+                    f"{where}: frozen for {joint.frozen_s} s while its command moved, "
+                    f"{_at(joint.frozen_at_ns, start_ns)}",
+                )
+            )
+        if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
+            found.append(
+                Finding(1, f"{where}: at the robot's limits in {joint.at_limit:.0%} of the samples")
+            )
+        if joint.topic == "/joint_states" and (frozen or joint.nan > BAD_LOSS * joint.samples):
+            dead.add(joint.name)
+    measured = {joint.name for joint in joints if joint.topic == "/joint_states"}
+    if len(measured) > 1 and len(dead) >= BAD_JOINTS * len(measured):
+        found.append(Finding(2, f"{len(dead)} of {len(measured)} joints are frozen or missing"))
+    return found
+
+
+def judge_bus(health: BusHealth, start_ns: int) -> list[Finding]:
+    """Findings on a bus.
+
+    Args:
+        health: Its measures.
+        start_ns: Start of the session [Unix ns].
+
+    Returns:
+        The findings.
+    """
+    found: list[Finding] = []
+    if health.error_frames:
+        part = health.error_frames / health.frames
+        weight = 2 if part >= BAD_LOSS else int(part > GOOD_LOSS)
+        sentence = f"{health.topic}: {health.error_frames} of {health.frames} are error frames"
+        found.append(Finding(weight, sentence))
+    if health.longest_s > PAUSE_S:
+        when = _at(health.longest_at_ns, start_ns)
+        found.append(Finding(1, f"{health.topic}: silent for {health.longest_s:.3g} s, {when}"))
+    if health.peak_load is not None and health.peak_load[0] > MAX_BUS_LOAD:
+        sentence = f"{health.topic}: {health.peak_load[0]:.0%} of the bitrate in the busiest second"
+        found.append(Finding(1, sentence))
+    return found
+
+
+def judge_topics(
+    types: dict[str, str], joints: Sequence[str], seen: Iterable[str]
+) -> list[Finding]:
+    """Findings on what the log contract asks for and the session lacks.
+
+    Args:
+        types: Topic with messages to type.
+        joints: The robot's joints; empty without a robot.
+        seen: Joints that ``/joint_states`` carries.
+
+    Returns:
+        The findings.
+    """
+    found: list[Finding] = []
+    others = sorted(topic for topic, kind in types.items() if kind.endswith("/JointState"))
+    for topic in ("/joint_states", "/joint_commands"):
+        if topic in types:
+            continue
+        if others:
+            sentence = f"{topic} is missing; JointStates are on {', '.join(others)}"
+        elif any(topic.startswith("/can/") for topic in types):
+            sentence = f"{topic} is missing; there are raw CAN frames"
+        else:
+            sentence = f"{topic} is missing, and no other topic has joints"
+        nothing = not others and not any(topic.startswith("/can/") for topic in types)
+        found.append(Finding(2 if nothing else 1, sentence))
+    present = set(seen)
+    missing = [name for name in joints if name not in present]
+    if present and missing:
+        found.append(Finding(1, f"/joint_states never carries {', '.join(missing)}"))
+    return found
+
+
+def verdict_of(findings: Iterable[Finding]) -> str:
+    """The verdict: that of the heaviest finding, ``good`` without any.
+
+    Args:
+        findings: All findings.
+
+    Returns:
+        One of :data:`VERDICTS`.
+    """
+    return VERDICTS[max((finding.weight for finding in findings), default=0)]
+
+
+def _at(t_ns: int, start_ns: int) -> str:
+    return f"at {(t_ns - start_ns) / NS:.3f} s"

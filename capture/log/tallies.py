@@ -1,0 +1,331 @@
+"""Tallies of a stream: what its times, sequence numbers and values say about its health.
+
+Each tally takes arrays as they come (a block of a file, a second of a live recording), keeps a
+bounded summary, and gives a frozen result at any moment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray
+
+NS = 1_000_000_000
+
+GAP_PERIODS = 1.5
+"""An interval longer than this many median intervals is a gap: the nearest whole number of
+periods in it is two or more, so at least one sample is missing."""
+
+REGULAR_SPREAD = 0.5
+"""A series is regular if the middle half of its intervals spans no more than this part of the
+median. Only a regular series has a rhythm against which something can be missing."""
+
+PAUSE_S = 1.0
+"""A gap this long is a pause: it can be cut out, while losses scattered over the session can't.
+For slow series it is :data:`PAUSE_PERIODS`."""
+
+PAUSE_PERIODS = 10.0
+"""Median intervals that a pause has at least."""
+
+MIN_INTERVALS = 20
+"""Fewer intervals than this have no reliable median and 99 % point."""
+
+SEQUENCE_COUNTS = 0.5
+"""Sequence numbers count the channel's messages if at least this part of the steps is one; a
+constant, or a counter shared by all channels, does not."""
+
+_BINS_PER_OCTAVE = 64
+_OCTAVES = 48  # 1 ns to 78 h
+_BINS = _BINS_PER_OCTAVE * _OCTAVES
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The rhythm of one series.
+
+    Attributes:
+        count: Samples.
+        first_ns: Earliest time [Unix ns]; 0 without samples.
+        last_ns: Latest time [Unix ns]; 0 without samples.
+        median_s: Median interval [s], None where there is no interval forward.
+        std_s: Standard deviation of the intervals that are not gaps [s].
+        p99_s: 99 % point of all intervals [s].
+        regular: Whether gaps can be told from the rhythm.
+        gaps: Intervals longer than :data:`GAP_PERIODS` medians; 0 where irregular.
+        missing: Samples that would fill the gaps; 0 where irregular.
+        scattered: Those of them that are not in pauses.
+        paused_s: All pauses together [s]; also of an irregular series.
+        longest_s: Longest interval [s].
+        longest_at_ns: Where the longest interval starts [Unix ns].
+        duplicates: Samples with the time of the sample before.
+        backward: Samples earlier than the sample before.
+    """
+
+    count: int
+    first_ns: int
+    last_ns: int
+    median_s: float | None
+    std_s: float | None
+    p99_s: float | None
+    regular: bool
+    gaps: int
+    missing: int
+    scattered: int
+    paused_s: float
+    longest_s: float
+    longest_at_ns: int
+    duplicates: int
+    backward: int
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate over the series' own span [Hz]."""
+        span_s = (self.last_ns - self.first_ns) / NS
+        return (self.count - 1) / span_s if span_s > 0 else None
+
+    @property
+    def missing_part(self) -> float:
+        """Missing samples as a part of those expected."""
+        return self.missing / (self.count + self.missing) if self.count else 0.0
+
+
+class TimingTally:
+    """Intervals of one series in bins of equal ratio, 64 an octave.
+
+    Quantiles are bin means: exact where a bin holds one value, within 1.1 % otherwise.
+    """
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._count = 0
+        self._first = self._last = self._previous = 0
+        self._duplicates = self._backward = 0
+        self._longest = (0, 0)
+        self._bins = np.zeros((3, _BINS))  # number, sum and sum of squares of intervals [ns]
+
+    def add(self, t_ns: IntArray) -> None:
+        """Take the next samples.
+
+        Args:
+            t_ns: Their times in the order they came [Unix ns], shape (n,).
+        """
+        if not len(t_ns):
+            return
+        low, high = int(t_ns.min()), int(t_ns.max())
+        if self._count:
+            steps = np.diff(t_ns, prepend=self._previous)
+            starts = t_ns - steps
+            low, high = min(low, self._first), max(high, self._last)
+        else:
+            steps, starts = np.diff(t_ns), t_ns[:-1]
+        self._count += len(t_ns)
+        self._first, self._last, self._previous = low, high, int(t_ns[-1])
+        self._duplicates += int((steps == 0).sum())
+        self._backward += int((steps < 0).sum())
+        forward = steps > 0
+        if not forward.any():
+            return
+        steps, starts = steps[forward], starts[forward]
+        longest = int(steps.argmax())
+        self._longest = max(self._longest, (int(steps[longest]), int(starts[longest])))
+        size = steps.astype(np.float64)
+        bins = np.minimum((np.log2(size) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
+        sums = [np.bincount(bins, weight, _BINS) for weight in (None, size, size**2)]
+        self._bins += np.array(sums)
+
+    def result(self) -> Timing:
+        """What the samples so far say."""
+        number, total, squares = self._bins
+        intervals = int(number.sum())
+        median = std = p99 = None
+        regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0
+        if intervals:
+            median = _quantile(number, total, 0.5)
+            spread = _quantile(number, total, 0.75) - _quantile(number, total, 0.25)
+            regular = intervals >= MIN_INTERVALS and spread <= REGULAR_SPREAD * median
+            p99 = _quantile(number, total, 0.99)
+            mean = np.divide(total, number, out=np.zeros(_BINS), where=number > 0)
+            long = (mean > GAP_PERIODS * median) & regular
+            gaps = int(number[long].sum())
+            lost = number * np.rint(mean / median - 1) * long
+            pause = mean > max(PAUSE_S * NS, PAUSE_PERIODS * median)
+            missing, scattered = int(lost.sum()), int(lost[~pause].sum())
+            paused = float(total[pause].sum())
+            n = number[~long].sum()
+            centre = total[~long].sum() / n
+            std = float(np.sqrt(max(squares[~long].sum() / n - centre**2, 0.0)))
+        return Timing(
+            count=self._count,
+            first_ns=self._first,
+            last_ns=self._last,
+            median_s=None if median is None else median / NS,
+            std_s=None if std is None else std / NS,
+            p99_s=None if p99 is None else p99 / NS,
+            regular=regular,
+            gaps=gaps,
+            missing=missing,
+            scattered=scattered,
+            paused_s=paused / NS,
+            longest_s=self._longest[0] / NS,
+            longest_at_ns=self._longest[1],
+            duplicates=self._duplicates,
+            backward=self._backward,
+        )
+
+
+def _quantile(number: FloatArray, total: FloatArray, part: float) -> float:
+    """Mean of the bin that the quantile falls into."""
+    reached = np.cumsum(number)
+    at = int(np.searchsorted(reached, part * float(number.sum())))
+    return float(total[at] / number[at])
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """What a channel's MCAP sequence numbers prove.
+
+    Attributes:
+        kind: ``counted``; ``none`` where all are zero; ``not a count`` where they are constant or
+            shared by channels; ``too few`` where one message can't tell.
+        dropped: Messages missing between those present; None unless counted.
+        reordered: Messages numbered before the one they follow; None unless counted.
+    """
+
+    kind: str
+    dropped: int | None
+    reordered: int | None
+
+
+class SequenceTally:
+    """Sequence numbers of one channel; they wrap at 2^32."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._previous = 0
+        self._count = self._ones = self._repeated = self._reordered = 0
+        self._at = self._low = self._high = 0  # unwrapped, relative to the first
+        self._nonzero = False
+
+    def add(self, sequence: IntArray) -> None:
+        """Take the numbers of the next messages.
+
+        Args:
+            sequence: In the order of the file, shape (n,).
+        """
+        if not len(sequence):
+            return
+        before = self._previous if self._count else int(sequence[0])
+        steps = np.diff(sequence, prepend=before)
+        steps = (steps + 2**31) % 2**32 - 2**31  # the shorter way round
+        place = self._at + np.cumsum(steps)
+        steps = steps if self._count else steps[1:]
+        self._low = min(self._low, int(place.min()))
+        self._high = max(self._high, int(place.max()))
+        self._at, self._previous = int(place[-1]), int(sequence[-1])
+        self._nonzero = self._nonzero or bool(sequence.any())
+        self._count += len(sequence)
+        self._ones += int((steps == 1).sum())
+        self._repeated += int((steps == 0).sum())
+        self._reordered += int((steps < 0).sum())
+
+    def result(self) -> Sequence:
+        """What the numbers so far prove."""
+        if self._count < 2:
+            return Sequence("too few", None, None)
+        if not self._nonzero:
+            return Sequence("none", None, None)
+        if self._ones < SEQUENCE_COUNTS * (self._count - 1):
+            return Sequence("not a count", None, None)
+        span = self._high - self._low + 1
+        dropped = max(span - (self._count - self._repeated), 0)
+        return Sequence("counted", dropped, self._reordered)
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Smallest and largest value of each joint in each second.
+
+    Attributes:
+        second: Unix seconds, increasing, shape (s,).
+        count: Samples in each, shape (s,).
+        low: Shape (s, k); NaN where a second has nothing else.
+        high: Shape (s, k).
+    """
+
+    second: IntArray
+    count: IntArray
+    low: FloatArray
+    high: FloatArray
+
+
+class RangeTally:
+    """Ranges by the second: what tells a frozen joint from a still one. 400 byte a joint-minute."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._parts: list[Ranges] = []
+
+    def add(self, t_ns: IntArray, values: FloatArray) -> None:
+        """Take the next samples.
+
+        Args:
+            t_ns: Their times [Unix ns], shape (n,).
+            values: Shape (n, k).
+        """
+        if len(t_ns):
+            self._parts.append(_by_second(t_ns // NS, np.ones(len(t_ns), int), values, values))
+
+    def result(self, width: int) -> Ranges:
+        """The ranges so far.
+
+        Args:
+            width: Number of joints k, for a stream without samples.
+
+        Returns:
+            One row a second that has samples.
+        """
+        if not self._parts:
+            none = np.empty((0, width))
+            return Ranges(np.empty(0, np.int64), np.empty(0, np.int64), none, none)
+        whole = _by_second(
+            np.concatenate([part.second for part in self._parts]),
+            np.concatenate([part.count for part in self._parts]),
+            np.concatenate([part.low for part in self._parts]),
+            np.concatenate([part.high for part in self._parts]),
+        )
+        self._parts = [whole]
+        return whole
+
+
+def _by_second(second: IntArray, count: IntArray, low: FloatArray, high: FloatArray) -> Ranges:
+    if (np.diff(second) < 0).any():
+        order = np.argsort(second, kind="stable")
+        second, count, low, high = second[order], count[order], low[order], high[order]
+    first = np.flatnonzero(np.diff(second, prepend=second[:1] - 1))
+    return Ranges(
+        second[first],
+        np.add.reduceat(count, first),
+        np.fmin.reduceat(low, first, axis=0),
+        np.fmax.reduceat(high, first, axis=0),
+    )
+
+
+def longest_run(flags: IntArray, at: IntArray) -> tuple[int, int]:
+    """The longest run of flagged, consecutive seconds.
+
+    Args:
+        flags: 0 or 1, shape (s,).
+        at: Increasing seconds, shape (s,).
+
+    Returns:
+        Its length [s] and its first second; (0, 0) where none is flagged.
+    """
+    chosen = at[flags.astype(bool)]
+    if not len(chosen):
+        return 0, 0
+    cuts = np.flatnonzero(np.diff(chosen) != 1) + 1
+    runs = np.split(chosen, cuts)
+    best = max(runs, key=len)
+    return len(best), int(best[0])
