@@ -18,6 +18,10 @@ from capture.errors import MissingExtraError, UndulogError
 VERBS: dict[str, tuple[str, str]] = {
     "import": ("capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
     "log info": ("capture.log_info:log_info", "Say what a log holds."),
+    "log check": (
+        "capture.log_check:log_check",
+        "Say whether a session is good, degraded or bad, and why.",
+    ),
     "log cut": ("capture.log_tools:log_cut", "Write a part of a log to a new file."),
     "log merge": ("capture.log_tools:log_merge", "Put several logs into one new file."),
     "log export": ("capture.cli:export_log", "Write frames or joint columns for other tools."),
