@@ -9,7 +9,7 @@ segment ahead of need. How a session writer uses it::
     wal = WriteAheadLog(wal_folder(path))
     wal.define(Schema(...)), wal.define(Channel(...))  # at registration, before the MCAP writer
     position = wal.append(channel_id, log_time_ns, publish_time_ns, sequence, payload)
-    mcap_writer.add_message(...)                       # in the same order
+    mcap_writer.add_message(...)                       # in the same order; if it fails, the end
     ...
     reached = wal.position                             # once a second or a chunk
     mcap_writer.flush()
@@ -53,7 +53,7 @@ from .wal_format import (
     segment_files,
     segment_name,
 )
-from .wal_segment import SEGMENT_OVERHEAD, Segment, new_header
+from .wal_segment import SEGMENT_OVERHEAD, Segment, new_header, sync_folder
 
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS_SIZE = 1 << 18
@@ -302,7 +302,7 @@ class WriteAheadLog:
                 raise
             following = self._following(size)
         with self._files:
-            self._sealed.append(self._current)
+            self._sealed = [*self._sealed, self._current]
             self._current = following
         self._wake.set()
 
@@ -326,14 +326,18 @@ class WriteAheadLog:
 
     def _work(self) -> None:
         due = time.monotonic() + self._interval_s
-        while not self._closed:
-            self._ahead()
-            self._drop_released()
-            if time.monotonic() >= due:
-                self._sync()
-                due = time.monotonic() + self._interval_s
-            self._wake.wait(max(0.0, due - time.monotonic()))
-            self._wake.clear()
+        try:
+            while not self._closed:
+                self._ahead()
+                self._drop_released()
+                if time.monotonic() >= due:
+                    self._sync()
+                    due = time.monotonic() + self._interval_s
+                self._wake.wait(max(0.0, due - time.monotonic()))
+                self._wake.clear()
+        except BaseException as error:  # without this thread nothing would be synced any more
+            self._failure = LogWriteError(self.folder, f"the log can't be looked after: {error!r}")
+            raise
 
     def _ahead(self) -> None:
         """Reserve the next segment before it is needed."""
@@ -361,18 +365,28 @@ class WriteAheadLog:
         with self._disk:
             position = self._position
             with self._files:
-                segments = [*self._definitions, *self._sealed, self._current]
+                kept = [*self._definitions, self._current]
                 if self._spare is not None:
-                    segments.append(self._spare)
-            for segment in segments:
-                try:
+                    kept.append(self._spare)
+                sealed = self._sealed
+            path = self.folder
+            try:
+                named = all(segment.synced for segment in (*kept, *sealed))
+                for segment in kept:
+                    path = segment.path
                     segment.sync()
-                except OSError as error:
-                    # After a failed sync the kernel may drop the pages: a second try that
-                    # succeeds would prove nothing.
-                    reason = f"can't be brought to the disk: {os.strerror(error.errno or 0)}"
-                    self._failure = LogWriteError(segment.path, reason)
-                    return
+                for segment in sealed:
+                    path = segment.path
+                    if segment.last > self._released:  # looked at again: it goes on meanwhile
+                        segment.sync()
+                if not named:
+                    sync_folder(self.folder)
+            except OSError as error:
+                # After a failed sync the kernel may drop the pages: a second try that succeeds
+                # would prove nothing.
+                reason = f"can't be brought to the disk: {os.strerror(error.errno or 0)}"
+                self._failure = LogWriteError(path, reason)
+                return
             self._synced = position
 
 

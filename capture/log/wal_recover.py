@@ -135,7 +135,8 @@ class Recovery(Iterator[WalMessage]):
             elif opened is not None:
                 found.append(opened)
         if not found:
-            raise NotALogError(self.folder, "; ".join(self.warnings))
+            reasons = "; ".join(self.warnings) or "all segments vanished while they were read"
+            raise NotALogError(self.folder, reasons)
         return found
 
     def _read_header(self, stream: int, number: int, path: Path) -> _Found | None:
@@ -150,6 +151,8 @@ class Recovery(Iterator[WalMessage]):
                 else:
                     self.warnings.append(f"{path.name} has no readable header; left out")
                     return None
+        except FileNotFoundError:  # a log in use: released since it was listed
+            return None
         except OSError as error:
             self.warnings.append(f"{path.name} can't be read: {error.strerror}; left out")
             return None
@@ -206,6 +209,8 @@ class Recovery(Iterator[WalMessage]):
                 with segment.path.open("rb") as file:
                     reader = _SegmentReader(segment, file, last)
                     yield from reader.records()
+            except FileNotFoundError:  # a log in use: released since it was listed
+                continue
             except OSError as error:
                 self.warnings.append(
                     f"{segment.path.name} can't be read to its end: {error.strerror}"

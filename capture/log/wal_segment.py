@@ -138,6 +138,11 @@ class Segment:
         self.last = fields[0]
         return True
 
+    @property
+    def synced(self) -> bool:
+        """Whether it ever was; before, the folder has to be synced too, for its name."""
+        return self._synced_at > 0
+
     def sync(self) -> None:
         """Bring what was put so far to the disk; nothing to do if nothing was put since.
 
@@ -153,7 +158,6 @@ class Segment:
             os.fdatasync(self._file)
         else:
             os.fsync(self._file)
-            sync_folder(self.path.parent)
         self._synced_at = at
 
     def close(self, *, remove: bool) -> None:

@@ -299,6 +299,21 @@ def test_a_failing_disk_is_told_by_the_next_append_and_by_close(tmp_path, monkey
     assert check_messages(list(recover(tmp_path / "w"))) == list(range(1, accepted + 1))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_dead_background_thread_is_told_by_the_next_append(tmp_path, monkeypatch):
+    def broken(self):
+        raise RuntimeError("unforeseen")
+
+    monkeypatch.setattr(WriteAheadLog, "_drop_released", broken)
+    wal = WriteAheadLog(tmp_path / "w")
+    wal._thread.join(10)
+    with pytest.raises(LogWriteError, match=r"can't be looked after: RuntimeError\('unforeseen'\)"):
+        wal.append(*message(1))
+    monkeypatch.undo()
+    wal.release(0)
+    wal.close()
+
+
 def test_room_is_asked_for_beforehand(tmp_path):
     free = free_bytes(tmp_path / "not" / "yet.mcap")
     assert free > 0
