@@ -206,6 +206,9 @@ def test_asc_rounds_to_microseconds_and_says_so(tmp_path: Path):
         f"{counts[1]} remote frames lose their time below 1 us",
     ]
     text = (tmp_path / "x.asc").read_text()
+    first, base, events, trigger, *_ = text.splitlines()
+    assert first.replace("date", "Begin Triggerblock") == trigger
+    assert (base, events) == ("base hex  timestamps absolute", "internal events logged")
     export_log(source, tmp_path / "x.asc", force=True)
     assert (tmp_path / "x.asc").read_text() == text  # no clock of this machine in it
 
