@@ -87,8 +87,8 @@ def cut_log(
             _copy_records(source, log)
             for message in state if carry_state else []:
                 log.write(ids[message.channel_id], message, start_ns)
-            _copy_window(source, log, ids, (start_ns, stop_ns), stop)
-            if log.first_ns is None:
+            copied = _copy_window(source, log, ids, (start_ns, stop_ns), stop)
+            if log.first_ns is None or not copied:
                 raise DataError(_nothing(source, topics, start_s, stop_s))
             carried = {source.file.channels[m.channel_id].topic: m.log_time_ns for m in state}
             facts = {
@@ -219,12 +219,16 @@ def _copy_window(
     ids: dict[int, int],
     window_ns: tuple[int, int],
     stop: StopRequest,
-) -> None:
+) -> int:
+    """Copy the messages of the window; returns how many."""
     start_ns, stop_ns = window_ns
+    copied = 0
     total_s = (min(stop_ns, source.end_ns) - start_ns) / NS
     with progress(f"cutting {source.path.name}", total_s) as bar:
-        for k, message in enumerate(source.messages(ids, start_ns, stop_ns)):
+        for message in source.messages(ids, start_ns, stop_ns):
             log.write(ids[message.channel_id], message)
-            if k % _LOOK_EVERY == 0:
+            copied += 1
+            if copied % _LOOK_EVERY == 1:
                 refuse_stopped(stop)
                 bar.update((message.log_time_ns - start_ns) / NS)
+    return copied

@@ -310,6 +310,8 @@ WRONG_CUTS = [
     (2, ["--start=-1"], "0 or more"),
     (2, ["--start", "nan"], "0 or more"),
     (1, ["--start", "99"], "the log lasts 1.99 s"),
+    (1, ["--start", "99", "--carry-state"], "the log lasts 1.99 s"),
+    (1, ["--topics", "/a", "--start", "1.981"], "no message of /a at or after 1.981 s"),
     (1, ["--topics", "/c*"], "has no /c*; it has /a, /b"),
 ]
 
