@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -130,6 +130,7 @@ class _Check:
         file = self._read(on_part)
         for scan in self._scans.values():
             scan.flush()
+        file = self._against_summary(file)
         blocks = [block for block in self._file.blocks if block.end_ns]
         start_ns = min((block.start_ns for block in blocks), default=0)
         end_ns = max((block.end_ns for block in blocks), default=0)
@@ -218,6 +219,18 @@ class _Check:
             notes=(*notes, *self._notes),
         )
 
+    def _against_summary(self, file: FileHealth) -> FileHealth:
+        """The file's health with the summary's counts held against the messages read."""
+        if file.damage or file.truncated or not file.indexed:
+            return file  # then messages are missing anyway, and the reason is known
+        wrong = [
+            f"the summary counts {count} messages of {self._scans[key].topic}, "
+            f"{self._scans[key].count} are in the file"
+            for key, count in self._file.counts.items()
+            if key in self._scans and count != self._scans[key].count
+        ]
+        return replace(file, damage=tuple(wrong))
+
     def _read_block(self, block: Block, container: Container) -> bool:
         """Read one block; whether a CRC was there and fits."""
         data, base = self._file.payload(block)  # its CRC is checked where it is compressed
@@ -232,9 +245,11 @@ class _Check:
             keys = list(self._scans)
         found = [np.sort(self._file.offsets(block, key)) + base for key in keys]
         heads = read_heads(data, np.concatenate(found), stop)
-        if heads is None:
+        owners = np.repeat(keys, [len(offsets) for offsets in found])
+        twice = any((np.diff(offsets) == 0).any() for offsets in found)
+        if heads is None or twice or (heads["channel"] != owners).any():
             where = f"the message index of the chunk at byte {block.start}"
-            raise LogError(self._file.path, f"{where} points to something that is not a message")
+            raise LogError(self._file.path, f"{where} does not list its messages")
         begin = 0
         for key, offsets in zip(keys, found, strict=True):
             if len(offsets) and key in self._scans:

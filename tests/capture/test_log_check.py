@@ -382,6 +382,30 @@ def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
     assert health.file.indexed is indexed
 
 
+def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "s.mcap", list(range(100)))
+    data = bytearray(path.read_bytes())
+    _, start, _ = next(span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 7)
+    data[start + 14 : start + 22] = data[start + 30 : start + 38]  # no CRC covers it
+    path.write_bytes(data)
+    health = check_session(path)
+    assert health.verdict == "bad"
+    assert "does not list its messages" in health.file.damage[0]
+
+
+def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "s.mcap", list(range(100)), enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    counts = struct.pack("<HQHQ", 1, 100, 2, 100)
+    assert data.count(counts) == 1
+    at_count = data.index(counts) + 2
+    data[at_count : at_count + 8] = struct.pack("<Q", 107)
+    path.write_bytes(data)
+    assert check_session(path).file.damage == (
+        "the summary counts 107 messages of /joint_commands, 100 are in the file",
+    )
+
+
 def test_a_flipped_bit_in_an_attachment_is_found(clean: Path, tmp_path: Path) -> None:
     data = bytearray(clean.read_bytes())
     data[data.index(b"+-30 degrees")] ^= 1
