@@ -59,6 +59,7 @@ format: $(READY)  ## mend what lint and format can mend
 
 bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/read_jointstate.py
+	$(BIN)/python bench/wal.py
 	$(BIN)/python bench/twin_step.py
 	$(BIN)/python bench/replay_convert.py 5
 

@@ -12,6 +12,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "sim": ("pybullet",),
     "replay": ("rerun-sdk",),
     "report": ("jinja2", "matplotlib"),
+    "parquet": ("pyarrow",),
     "cluster": ("dask", "distributed"),
 }
 

@@ -184,7 +184,7 @@ def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
         import pyarrow as pa
         from pyarrow.parquet import ParquetWriter
     except ImportError as error:
-        raise MissingExtraError("a .parquet table", "replay", "pyarrow") from error
+        raise MissingExtraError("a .parquet table", "parquet", "pyarrow") from error
     module: Any = pa  # its types are incomplete
     text = module.dictionary(module.int32(), module.string())
     fields: list[Any] = [("t_ns", module.int64()), ("topic", text), ("joint", text)]
