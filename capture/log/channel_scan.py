@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
@@ -19,16 +18,10 @@ from .cdr import Layout, layout_of
 from .chunk import Buffer
 from .frames import FRAME_DTYPE, FRAME_LAYOUT, empty_frames
 from .health import LIMIT_RAD
+from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType
 from .tallies import NS, RangeTally, SequenceTally, TimingTally
 
-HEAD = np.dtype(
-    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8")]
-)
-"""Start of a message record; the publish time and the message follow."""
-
-_BODY_AT = 31
-_FIXED_SIZE = 22  # of the length, before the message itself
 _STAMP_AT = 4  # a leading Header or Time follows the encapsulation header at once
 _BATCH_ROWS = 4096
 _BATCH_BYTES = 1 << 21
@@ -114,7 +107,7 @@ class ChannelScan:
         self._log.append(heads["log"])
         self._sequence.append(heads["sequence"])
         if self._kind is not None:
-            lengths = heads["length"].astype(np.int64) - _FIXED_SIZE
+            lengths = heads["length"].astype(np.int64) - FIXED_SIZE
             first = int(lengths[0])
             if (lengths == first).all():
                 self._take(data, offsets, np.arange(len(offsets)), first)
@@ -129,7 +122,7 @@ class ChannelScan:
 
     def _take(self, data: Buffer, offsets: IntArray, rows: IntArray, size: int) -> None:
         """Copy messages of one length; ``rows`` are their places in the block."""
-        records = _gather(data, offsets + _BODY_AT, np.dtype(f"V{max(size, 1)}"))
+        records = gather(data, offsets + BODY_AT, np.dtype(f"V{max(size, 1)}"))
         matrix = records.view(np.uint8).reshape(len(rows), -1)[:, :size]
         self._pending.append((self._rows + rows, matrix))
         self._bytes += matrix.size
@@ -269,34 +262,6 @@ class ChannelScan:
             parts.append((_names(layout), rows[fits], layout, matrix[fits]))
             rows, matrix = rows[~fits], matrix[~fits]
         return parts
-
-
-def read_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] | None:
-    """The heads of message records, if whole messages lie where an index says.
-
-    Args:
-        data: A block's payload.
-        offsets: Where they should start, shape (n,).
-        stop: One past the payload's last byte.
-
-    Returns:
-        Of :data:`HEAD`, shape (n,); None if any is not a whole message.
-    """
-    if not len(offsets):
-        return np.empty(0, HEAD)
-    if offsets.min() < 0 or offsets.max() + _BODY_AT > stop:
-        return None
-    heads = _gather(data, offsets, HEAD)
-    room = (stop - offsets - 9).astype(np.uint64)
-    lengths = heads["length"]
-    whole = (lengths >= _FIXED_SIZE) & (lengths <= room) & (heads["opcode"] == Opcode.MESSAGE)
-    return heads if whole.all() else None
-
-
-def _gather(data: Buffer, at: IntArray, kind: np.dtype[np.void]) -> NDArray[np.void]:
-    """Records of one type at any offsets: an overlapping view with a stride of one byte."""
-    size = max(len(data) - kind.itemsize + 1, 0)
-    return np.ndarray((size,), dtype=kind, buffer=data, strides=(1,))[at]
 
 
 def _fits(matrix: Matrix, layout: Layout) -> BoolArray:

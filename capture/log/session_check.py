@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import DataError, LogError, RobotFileError
 from ..robot import Robot
 from ..robot.description import parse_robot
-from .channel_scan import ChannelScan, Limits, Series, read_heads
+from .channel_scan import ChannelScan, Limits, Series
 from .chunk import Block
 from .container_check import Container, check_chunk, check_container
 from .health import (
@@ -29,6 +29,7 @@ from .health import (
     verdict_of,
 )
 from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
+from .message_heads import read_heads
 from .storage import LogFile
 from .tallies import NS
 from .topics import Topics

@@ -261,7 +261,7 @@ class Ranges:
 
 
 class RangeTally:
-    """Ranges by the second: what tells a frozen joint from a still one. 400 byte a joint-minute."""
+    """Ranges by the second: what tells a frozen joint from a still one. 16 byte a joint-second."""
 
     def __init__(self) -> None:
         """Start empty."""
