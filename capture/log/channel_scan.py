@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..errors import DataError
 from .bus_tally import BusTally
 from .cdr import Layout, layout_of
 from .chunk import Buffer
+from .columns import fits_layout
 from .frames import FRAME_DTYPE, FRAME_LAYOUT, empty_frames
 from .health import LIMIT_RAD
 from .message_heads import BODY_AT, FIXED_SIZE, gather
@@ -240,7 +241,7 @@ class ChannelScan:
         known = self._layouts.setdefault(matrix.shape[1], [])
         parts: list[tuple[tuple[str, ...], IntArray, Layout, Matrix]] = []
         for layout in known:
-            fits = _fits(matrix, layout)
+            fits = fits_layout(matrix, layout)
             if fits.all():  # the usual case: nothing to pick
                 parts.append((_names(layout), rows, layout, matrix))
                 return parts
@@ -258,23 +259,10 @@ class ChannelScan:
                 known.append(layout)
             elif not self._joints:  # text: a layout a message, and no numbers worth a look
                 return parts
-            fits = _fits(matrix, layout)
+            fits = fits_layout(matrix, layout)
             parts.append((_names(layout), rows[fits], layout, matrix[fits]))
             rows, matrix = rows[~fits], matrix[~fits]
         return parts
-
-
-def _fits(matrix: Matrix, layout: Layout) -> BoolArray:
-    """Which messages have the layout's strings and sequence lengths, shape (n,)."""
-    example = np.frombuffer(layout.example, dtype=np.uint8)
-    fits = np.ones(len(matrix), dtype=bool)
-    for start, stop in layout.hull:
-        fits &= (matrix[:, start:stop] == example[start:stop]).all(axis=1)
-    doubtful = np.flatnonzero(~fits)
-    if len(doubtful):  # the difference may lie in padding alone
-        static = layout.static
-        fits[doubtful] = (matrix[np.ix_(doubtful, static)] == example[static]).all(axis=1)
-    return fits
 
 
 def _names(layout: Layout) -> tuple[str, ...]:

@@ -20,12 +20,12 @@ from ..arrays import IntArray
 from ..errors import DataError, LogError
 from .cdr import Layout, layout_of
 from .chunk import Buffer
+from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType
 from .storage import LogFile
 
 # A message record: opcode u8, length u64, channel u16, sequence u32, log time u64, publish u64.
-_LENGTH_AT, _LOG_TIME_AT, _BODY_AT = 1, 15, 31
-_FIXED_SIZE = 22  # of the length, before the message itself
+_LENGTH_AT, _LOG_TIME_AT = 1, 15
 _MAX_LAYOUTS = 64
 
 Matrix = NDArray[np.uint8]
@@ -184,9 +184,9 @@ def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
     Returns:
         Log time [Unix ns] and the message's bytes.
     """
-    length = int.from_bytes(data[offset + _LENGTH_AT : offset + 9], "little") - _FIXED_SIZE
+    length = int.from_bytes(data[offset + _LENGTH_AT : offset + 9], "little") - FIXED_SIZE
     log_ns = int.from_bytes(data[offset + _LOG_TIME_AT : offset + 23], "little")
-    return log_ns, data[offset + _BODY_AT : offset + _BODY_AT + length]
+    return log_ns, data[offset + BODY_AT : offset + BODY_AT + length]
 
 
 class _GroupReader:
@@ -203,7 +203,7 @@ class _GroupReader:
     def add(
         self, data: Buffer, offsets: IntArray, window_ns: tuple[int | None, int | None]
     ) -> None:
-        log_ns = _gather(data, offsets + _LOG_TIME_AT, "<u8").astype(np.int64)
+        log_ns = gather(data, offsets + _LOG_TIME_AT, "<u8").astype(np.int64)
         if window_ns != (None, None):
             start, stop = window_ns
             keep = np.ones(len(offsets), dtype=bool)
@@ -212,18 +212,18 @@ class _GroupReader:
             offsets, log_ns = offsets[keep], log_ns[keep]
         order = self._count + np.arange(len(offsets))
         self._count += len(offsets)
-        lengths = _gather(data, offsets + _LENGTH_AT, "<u8").astype(np.int64) - _FIXED_SIZE
+        lengths = gather(data, offsets + _LENGTH_AT, "<u8").astype(np.int64) - FIXED_SIZE
         one_length = bool((lengths == lengths[0]).all()) if len(lengths) else False
         for length in lengths[:1].tolist() if one_length else np.unique(lengths).tolist():
             rows = slice(None) if one_length else np.flatnonzero(lengths == length)
-            records = _gather(data, offsets[rows] + _BODY_AT, f"V{max(length, 1)}")
+            records = gather(data, offsets[rows] + BODY_AT, f"V{max(length, 1)}")
             matrix = records.view(np.uint8).reshape(len(records), -1)
             self._add_matrix(matrix[:, :length], log_ns[rows], order[rows])
 
     def _add_matrix(self, matrix: Matrix, log_ns: IntArray, order: IntArray) -> None:
         known = self._by_length.setdefault(matrix.shape[1], [])
         for group in known:
-            fits = _fits(matrix, group.layout)
+            fits = fits_layout(matrix, group.layout)
             if fits.all():
                 self._take(group, matrix, log_ns, order)
                 return
@@ -242,7 +242,7 @@ class _GroupReader:
             fits = np.zeros(len(matrix), dtype=bool)
             fits[0] = True
             if len(known) < _MAX_LAYOUTS:
-                fits = _fits(matrix, group.layout)
+                fits = fits_layout(matrix, group.layout)
                 known.append(group)
             self.groups.append(group)
             self._take(group, matrix[fits], log_ns[fits], order[fits])
@@ -259,8 +259,16 @@ class _GroupReader:
             group.columns.setdefault(path, []).append(cut.view(leaf.dtype))
 
 
-def _fits(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
-    """Which messages have the layout's strings and sequence lengths, shape (n,)."""
+def fits_layout(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
+    """Which messages have a layout's strings and sequence lengths.
+
+    Args:
+        matrix: Messages of the layout's length, shape (n, length).
+        layout: The layout.
+
+    Returns:
+        Shape (n,).
+    """
     example = np.frombuffer(layout.example, dtype=np.uint8)
     equal = [matrix[:, start:stop] == example[start:stop] for start, stop in layout.hull]
     fits = np.ones(len(matrix), dtype=bool)
@@ -275,21 +283,13 @@ def _fits(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
     return fits
 
 
-def _gather(data: Buffer, at: IntArray, dtype: str) -> NDArray[Any]:
-    """Values of one type at any offsets: an overlapping view with a stride of one byte."""
-    kind = np.dtype(dtype)
-    count = len(data) - kind.itemsize + 1
-    view = np.ndarray((max(count, 0),), dtype=kind, buffer=data, strides=(1,))
-    return view[at]
-
-
 def _check(data: Buffer, offsets: IntArray) -> None:
     """Raise LogError-compatible complaints before numpy reads beyond the records."""
     size = len(data)
-    if offsets.size and (offsets.min() < 0 or offsets.max() + _BODY_AT > size):
+    if offsets.size and (offsets.min() < 0 or offsets.max() + BODY_AT > size):
         raise LogError("message index", "points outside its chunk")
-    opcodes = _gather(data, offsets, "u1")
-    lengths = _gather(data, offsets + _LENGTH_AT, "<u8")
+    opcodes = gather(data, offsets, "u1")
+    lengths = gather(data, offsets + _LENGTH_AT, "<u8")
     room = (size - offsets - 9).astype(np.uint64)
-    if np.any(opcodes != Opcode.MESSAGE) or np.any((lengths < _FIXED_SIZE) | (lengths > room)):
+    if np.any(opcodes != Opcode.MESSAGE) or np.any((lengths < FIXED_SIZE) | (lengths > room)):
         raise LogError("message index", "points to something that is not a message")

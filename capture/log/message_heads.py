@@ -5,6 +5,8 @@ Format: https://mcap.dev/spec#message-op0x05.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
@@ -45,7 +47,7 @@ def read_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] |
     return heads if whole.all() else None
 
 
-def gather(data: Buffer, at: IntArray, kind: np.dtype[np.void]) -> NDArray[np.void]:
+def gather(data: Buffer, at: IntArray, kind: np.dtype[Any] | str) -> NDArray[Any]:
     """Records of one type at any offsets: an overlapping view with a stride of one byte.
 
     Args:
@@ -56,5 +58,6 @@ def gather(data: Buffer, at: IntArray, kind: np.dtype[np.void]) -> NDArray[np.vo
     Returns:
         A copy, shape (n,).
     """
-    size = max(len(data) - kind.itemsize + 1, 0)
-    return np.ndarray((size,), dtype=kind, buffer=data, strides=(1,))[at]
+    record = np.dtype(kind)
+    size = max(len(data) - record.itemsize + 1, 0)
+    return np.ndarray((size,), dtype=record, buffer=data, strides=(1,))[at]
