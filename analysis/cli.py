@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_text
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ from cyclopts import Parameter
 
 from capture.console import emit_json, progress, refuse_existing
 from capture.errors import UsageError
+from capture.part_file import part_file
 
 if TYPE_CHECKING:
     from .result import Analysis
@@ -68,7 +68,9 @@ def analyse(
     plain = [result.to_dict() for result in results]
     whole: Any = plain[0] if len(plain) == 1 else plain
     if output is not None:
-        _write_json(output, whole)
+        text = json_text.dumps(whole, indent=2, allow_nan=False) + "\n"
+        with part_file(output) as part:
+            part.write_text(text, encoding="utf-8")
     if json:
         emit_json(whole)
         return
@@ -81,13 +83,3 @@ def analyse(
     print("\n".join(texts), end="")
     if output is not None:
         print(f"Result: {output}")
-
-
-def _write_json(path: Path, value: Any) -> None:
-    """Write the file whole or not at all."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(json_text.dumps(value, indent=2, allow_nan=False) + "\n")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

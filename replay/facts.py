@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 
 import rerun as rr
 
 from analysis.answer import answer
+from analysis.formats import utc
 from analysis.result import Analysis
 from capture import Session
 
@@ -39,7 +39,7 @@ def markdown(
         f"`{session.session_id}`",
         _robot(session),
         f"{session.duration_s:.1f} s",
-        _utc(session.start_ns),
+        utc(session.start_ns),
         *_gait(analysis),
         *_health(session.metadata),
         *_versions(session.metadata),
@@ -71,10 +71,6 @@ def _robot(session: Session) -> str:
         return "no description in the session"
     count = len(session.robot.joints)
     return f"{session.robot.name}, {count} joint{'s' if count != 1 else ''}"
-
-
-def _utc(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 def _gait(analysis: Analysis | None) -> list[str]:

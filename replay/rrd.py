@@ -6,10 +6,9 @@ same recording id, so that a rebuilt recording takes the old one's place in the 
 
 from __future__ import annotations
 
-import contextlib
 import uuid
 import warnings
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from rerun.chunk import RrdReader
 from analysis.result import Analysis
 from capture import Session
 from capture.errors import DataError, LogWriteError
+from capture.part_file import part_file
 from capture.robot.kinematics import rotation_from_quaternion
 
 from . import body, facts, gait, joints, markers, power, ranges, trail
@@ -109,7 +109,7 @@ def write_recording(
     rhythm = gait.rhythm_of(sources.columns.get(("/gait", "position"), ()))
     clock = Clock(session.start_ns, rhythm)
     identity = recording_id(session.session_id)
-    with _replacing(path) as draft:
+    with part_file(path) as draft:
         rec = rr.RecordingStream(APPLICATION, recording_id=identity, send_properties=False)
         try:
             rec.set_log_time_enabled(False)
@@ -286,14 +286,3 @@ def _require_whole(draft: Path, path: Path) -> None:
             RrdReader(draft).store()
     except (RuntimeError, ValueError, Warning) as error:
         raise LogWriteError(path, "couldn't be written whole; is the disk full?") from error
-
-
-@contextlib.contextmanager
-def _replacing(path: Path) -> Generator[Path]:
-    """A file beside ``path`` that takes its place when the block is left without an error."""
-    draft = path.with_name(f"{path.name}.part")
-    try:
-        yield draft
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +10,7 @@ from cyclopts import Parameter
 
 from capture.console import emit_json, progress, refuse_existing
 from capture.errors import UsageError
+from capture.part_file import part_file
 
 if TYPE_CHECKING:
     from ..result import Analysis
@@ -68,7 +68,8 @@ def report(
             sessions.append(session)
         bar.update(len(files), note="page")
         page = render(analyses, sessions)
-    _write(output, page)
+    with part_file(output) as part:
+        part.write_text(page, encoding="utf-8")
     answers = [answer(analysis) for analysis in analyses]
     if json:
         emit_json(
@@ -92,13 +93,3 @@ def report(
     warnings = sum(len(analysis.warnings) for analysis in analyses)
     said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
     print(f"{output}: {output.stat().st_size / 1e3:.0f} kB{said}")
-
-
-def _write(path: Path, page: str) -> None:
-    """Write beside and rename, so that nobody ever opens half a page."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

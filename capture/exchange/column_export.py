@@ -26,9 +26,9 @@ from ..interruption import StopRequest
 from ..log.joint_reader import JOINT_STATE, UNITS
 from ..log.session import Session
 from ..log.signals import JointSignals
+from ..part_file import check_stop, part_file
 from .decoded_topics import JOINT_TOPIC
 from .log_export import refuse_same
-from .part_file import check_stop, part_file
 
 DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())
 """The topics written unless others are named, those of them that the session has."""
@@ -139,7 +139,7 @@ def export_columns(
         columns = [name for found in wanted.values() for name in found.values()]
         report = ColumnReport(source, output, ["t_ns", "topic", "joint", *columns])
         with (
-            part_file(output, force=force) as part,
+            part_file(output) as part,
             progress(f"export {output.name}", len(wanted)) as bar,
             open_table(part, columns) as write,
         ):

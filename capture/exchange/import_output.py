@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..console import refuse_existing
-from ..errors import LogWriteError
 from ..log.writer import SessionWriter
+from ..part_file import part_file
 from ..robot import Robot
 
 _NS = 1_000_000_000
@@ -116,10 +116,10 @@ def imported_session(
     """
     refuse_existing(output, force=force)
     digest = file_digest(source)
-    part = output.with_name(f"{output.name}.part")
     metadata = {"source": source.name, "source.sha256": digest, **facts}
-    try:
-        with SessionWriter(
+    with (
+        part_file(output) as part,
+        SessionWriter(
             part,
             session_id=f"import-{digest[:16]}",
             epoch_ns=epoch_ns,
@@ -127,15 +127,6 @@ def imported_session(
             clock={"log": str(robot.clock)},
             metadata=metadata,
             force=True,
-        ) as writer:
-            yield writer
-        _rename(part, output)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _rename(part: Path, output: Path) -> None:
-    try:
-        part.replace(output)
-    except OSError as error:
-        raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
+        ) as writer,
+    ):
+        yield writer

@@ -9,10 +9,10 @@ from ..console import progress, refuse_existing
 from ..errors import UsageError
 from ..interruption import StopRequest
 from ..log.session import Session
+from ..part_file import check_stop, part_file
 from .frame_blocks import chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS
 from .frame_losses import LossTally
-from .part_file import check_stop, part_file
 
 
 @dataclass
@@ -77,7 +77,7 @@ def export_log(
     with Session.open(source) as session:
         facts = frame_facts(session, chosen_buses(session, bus))
         with (
-            part_file(output, force=force) as part,
+            part_file(output) as part,
             progress(f"export {output.name}", 1.0) as bar,
             chosen.open(part, facts) as write,
         ):

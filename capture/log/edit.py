@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Generator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -17,8 +17,9 @@ from mcap.records import Attachment, Channel
 from mcap.writer import Writer
 
 from ..console import refuse_existing
-from ..errors import LogWriteError, UndulogError, UsageError
+from ..errors import UndulogError, UsageError
 from ..interruption import StopRequest
+from ..part_file import part_file
 from .raw_log import RawLog, RawMessage
 
 EDIT_RECORD = "undulog.edit"
@@ -185,21 +186,12 @@ def edited_log(
     """
     refuse_output(output, [source.path for source in sources], force=force)
     profiles = {source.file.profile for source in sources}
-    part = output.with_name(f"{output.name}.part")
-    try:
+    with part_file(output) as part:
         with part.open("wb") as stream:
             log = EditedLog(stream, profiles.pop() if len(profiles) == 1 else "")
             yield log
             log.finish()
         refuse_stopped(stop)
-        part.replace(output)
-    except UndulogError:
-        raise
-    except OSError as error:
-        raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def refuse_output(output: Path, sources: Sequence[Path], *, force: bool) -> None:

@@ -3,40 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..console import refuse_existing
-from ..errors import LogWriteError
-from ..interruption import StopRequest
+from .errors import LogWriteError, UndulogError
+from .interruption import StopRequest
 
 
 @contextmanager
-def part_file(output: Path, *, force: bool) -> Generator[Path]:
+def part_file(output: Path) -> Generator[Path]:
     """Write ``OUTPUT.part``, and rename it on leaving without an exception.
 
     Args:
-        output: The file wanted.
-        force: Replace an existing file.
+        output: The file wanted; one of that name is replaced, so callers that must not replace it
+            ask :func:`capture.console.refuse_existing` before they start.
 
     Yields:
         Where to write.
 
     Raises:
-        OutputExistsError: If the output is there and ``force`` is not given.
         LogWriteError: If it can't be written; nothing is left behind then.
     """
-    refuse_existing(output, force=force)
     part = output.with_name(f"{output.name}.part")
     try:
         yield part
         part.replace(output)
     except OSError as error:
-        if isinstance(error, LogWriteError):
+        if isinstance(error, UndulogError):
             raise
         raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # what stopped the writing may stop this too
+            part.unlink(missing_ok=True)
 
 
 def check_stop(output: Path, stop: StopRequest | None) -> None:
