@@ -167,6 +167,20 @@ class MissingChannelError(LogError, KeyError):
         return str(self.args[0])
 
 
+class SourceError(UndulogError):
+    """A source of a recording that can't be opened or used."""
+
+    def __init__(self, source: str, message: str) -> None:
+        """Build the message.
+
+        Args:
+            source: The source as the command line names it.
+            message: What is wrong and what to do.
+        """
+        self.source = source
+        super().__init__(f"{source}: {message}")
+
+
 class ImportFormatError(LogError, ValueError):
     """A foreign log that cannot be imported."""
 

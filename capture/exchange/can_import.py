@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..bus.decoded_topics import DecodedTopics, Message
 from ..bus.decoding import BusDecoder, FrameTally
 from ..bus.frame_log import FrameLog, LogBlock
 from ..console import progress
@@ -18,7 +19,6 @@ from ..log.frames import FrameArray
 from ..log.writer import SessionWriter
 from ..robot import Robot
 from .can_logs import log_suffix, open_frame_log
-from .decoded_topics import DecodedTopics, Message
 from .import_output import ImportReport, imported_session
 
 FRAME_TOPIC_PREFIX = "/can/"
@@ -43,7 +43,7 @@ def import_can(
 
     Every classic frame is kept raw on ``/can/<bus>``. The frames of one bus are decoded by the
     robot's databases and bus map onto the topics of the log contract
-    (:mod:`capture.exchange.decoded_topics`); each sample keeps the time of its frame.
+    (:mod:`capture.bus.decoded_topics`); each sample keeps the time of its frame.
 
     Args:
         source: The log: candump, ASC, BLF, TRC, python-can CSV or SQLite, MF4.

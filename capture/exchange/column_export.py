@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
+from ..bus.decoded_topics import JOINT_TOPIC
 from ..console import progress, refuse_existing
 from ..errors import MissingChannelError, MissingExtraError, UsageError
 from ..interruption import StopRequest
@@ -27,7 +28,6 @@ from ..log.joint_reader import JOINT_STATE, UNITS
 from ..log.session import Session
 from ..log.signals import JointSignals
 from ..part_file import check_stop, part_file
-from .decoded_topics import JOINT_TOPIC
 from .log_export import refuse_same
 
 DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())

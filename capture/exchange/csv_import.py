@@ -14,6 +14,7 @@ from typing import TextIO
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
+from ..bus.decoded_topics import JOINT_TOPIC
 from ..console import progress
 from ..errors import ImportFormatError
 from ..interruption import StopRequest
@@ -23,7 +24,6 @@ from ..strict_table import listed
 from ..units import SESSION_UNIT, TIME_UNITS, unit_for
 from .can_logs import CSV_HEADER, RELATIVE_EPOCH_NS
 from .column_map import Column, ColumnMap
-from .decoded_topics import JOINT_TOPIC
 from .import_output import ImportReport, imported_session
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start

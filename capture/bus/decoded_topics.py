@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
-from ..bus.cycles import RoundGatherer, Rounds
-from ..bus.decoding import BusDecoder, DecodedSignal
 from ..log.channels import JointStateChannel
 from ..log.writer import SessionWriter
 from ..robot import Quantity, Robot, Sensor, SensorKind
 from ..units import SESSION_UNIT
+from .cycles import RoundGatherer, Rounds
+from .decoding import BusDecoder, DecodedSignal
 
 SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"
 """Sample time minus stamp of what the joints measure [s]."""

@@ -1,0 +1,170 @@
+"""What a source is: something that is asked, many times a second, for what has come since.
+
+A source is found by the scheme of its address (``can:socketcan:can0``, ``unix:/run/snake.sock``,
+``twin:flat``) among the entry points of the group :data:`ENTRY_POINTS`; each names a function that
+takes a :class:`SourceAddress` and gives a :class:`Source`. All methods are called from the
+recorder's one thread, and none may block: whatever has to wait (a connect, a device that only
+offers a blocking read) waits in a thread of the source's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from ..log.frames import FrameArray
+from ..robot import ClockDomain, Robot
+
+if TYPE_CHECKING:
+    from ..log.writer import SessionWriter
+
+ENTRY_POINTS = "undulog.sources"
+"""Entry point group: the name is the scheme, the object opens a source."""
+
+
+@dataclass(frozen=True)
+class SourceAddress:
+    """A source as the command line names it: ``[NAME=]SCHEME:REST[?KEY=VALUE&...]``.
+
+    Attributes:
+        text: As it was given, for messages.
+        name: What the session calls the source, e.g. the bus ``can0`` of ``/can/can0``.
+        scheme: Which kind of source, e.g. ``can``.
+        rest: What follows the scheme, without the options.
+        options: The options, e.g. ``{"bitrate": "1000000"}``.
+    """
+
+    text: str
+    name: str
+    scheme: str
+    rest: str
+    options: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class SourceEvent:
+    """Something that happened to a source: it goes to ``/rosout``.
+
+    Attributes:
+        t_ns: When [ns], on the session's clock.
+        level: ``info``, ``warn`` or ``error``.
+        text: One sentence.
+    """
+
+    t_ns: int
+    level: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Polled:
+    """What came since the last poll.
+
+    Attributes:
+        frames: Arrays of records of :data:`capture.log.frames.FRAME_DTYPE`, in the order they
+            came. ``t_host_ns`` is the arrival on the session's clock, ``t_device_ns`` the device's
+            own time, on the device's own clock, or equal to ``t_host_ns`` where it gives none.
+        events: What happened.
+    """
+
+    frames: tuple[FrameArray, ...] = ()
+    events: tuple[SourceEvent, ...] = ()
+
+
+@dataclass
+class SourceCounts:
+    """What became of a source's frames, since the start.
+
+    Attributes:
+        frames: Frames taken.
+        dropped: Frames that the source's own sequence numbers or counters prove lost before us;
+            None where the source has no such thing.
+        malformed: Packets or lines that could not be read.
+        error_frames: Frames that report a bus error.
+        reconnects: How often the connection came back.
+    """
+
+    frames: int = 0
+    dropped: int | None = None
+    malformed: int = 0
+    error_frames: int = 0
+    reconnects: int = 0
+
+
+@dataclass(frozen=True)
+class SourceContext:
+    """What a recording gives its sources.
+
+    Attributes:
+        now_ns: The session's clock: Unix time at the start plus monotonic time since [ns].
+        writer: The session, for a source that has channels of its own (the twin); frames are
+            written by the recorder.
+        facts: Extra facts, e.g. ``fast`` for a twin that runs as fast as it can.
+    """
+
+    now_ns: Callable[[], int]
+    writer: SessionWriter
+    facts: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+class Source(Protocol):
+    """A source of a recording."""
+
+    @property
+    def name(self) -> str:
+        """What the session calls it."""
+        ...
+
+    @property
+    def clock(self) -> ClockDomain:
+        """Whose clock ``t_device_ns`` is on."""
+        ...
+
+    @property
+    def robot(self) -> Robot | None:
+        """The robot that it brings, or None."""
+        ...
+
+    @property
+    def facts(self) -> Mapping[str, str]:
+        """What the session's metadata should say of it, e.g. the bitrate; no secrets."""
+        ...
+
+    @property
+    def counts(self) -> SourceCounts:
+        """What became of its frames so far."""
+        ...
+
+    @property
+    def connected(self) -> bool:
+        """Whether data can come at the moment."""
+        ...
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing will come any more (a scenario that has ended)."""
+        ...
+
+    def start(self, context: SourceContext) -> None:
+        """Begin: connect, or begin to try.
+
+        Args:
+            context: The recording.
+
+        Raises:
+            SourceError: If it can never work: no such device type, a path that is not ours.
+        """
+        ...
+
+    def poll(self) -> Polled:
+        """Take what has come; returns at once.
+
+        Returns:
+            Frames and events.
+        """
+        ...
+
+    def stop(self) -> None:
+        """End and release everything; safe to call twice. Never raises for a dead device."""
+        ...
