@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,82 +14,33 @@ import numpy as np
 from ..errors import DataError, LogError, RobotFileError
 from ..robot import Robot
 from ..robot.description import parse_robot
-from .channel_scan import ChannelScan, Limits, Series
 from .chunk import Block
 from .container_check import Container, check_chunk, check_container
-from .health import (
-    Finding,
-    frozen_time,
-    judge_bus,
-    judge_channel,
-    judge_file,
-    judge_joints,
-    judge_series,
-    judge_topics,
-    verdict_of,
-)
-from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
+from .health import judge_file
+from .measures import FileHealth
 from .message_heads import read_heads
+from .session_scan import SessionMeasures, SessionScan
 from .storage import LogFile
-from .tallies import NS
 from .topics import Topics
-
-COMMANDS, STATES = "/joint_commands", "/joint_states"
 
 
 @dataclass(frozen=True)
-class SessionHealth:
-    """The health of a session.
+class SessionHealth(SessionMeasures):
+    """The health of a session in a file.
 
     Attributes:
         path: The file.
         session_id: Its id, or the file's name.
-        robot: Name of the robot; None without a usable description.
-        start_ns: Log time of the first message [Unix ns]; 0 without messages.
-        end_ns: Log time of the last.
-        findings: All that was found, heaviest first.
         stored: The verdict stored by whoever recorded it, or None.
         stored_reasons: The reasons stored with it.
         file: The container.
-        channels: By topic.
-        series: By topic and names.
-        joints: By topic, in the order of the messages.
-        buses: By topic.
     """
 
     path: Path
     session_id: str
-    robot: str | None
-    start_ns: int
-    end_ns: int
-    findings: tuple[Finding, ...]
     stored: str | None
     stored_reasons: tuple[str, ...]
     file: FileHealth
-    channels: tuple[ChannelHealth, ...]
-    series: tuple[SeriesHealth, ...]
-    joints: tuple[JointHealth, ...]
-    buses: tuple[BusHealth, ...]
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last message [s]."""
-        return (self.end_ns - self.start_ns) / NS
-
-    @property
-    def verdict(self) -> str:
-        """``good``, ``degraded`` or ``bad``."""
-        return verdict_of(self.findings)
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why it is not better, heaviest first."""
-        return tuple(finding.sentence for finding in self.findings if finding.weight)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is worth knowing and no fault."""
-        return tuple(finding.sentence for finding in self.findings if not finding.weight)
 
 
 def check_session(
@@ -124,62 +75,26 @@ class _Check:
         self._notes: list[str] = []
         self._topics = Topics(log_file, self._notes.append)
         self._robot = self._read_robot()
-        self._scans = {key: self._scan(key) for key in log_file.channels}
+        self._scan = SessionScan(self._robot)
+        for key in log_file.channels:
+            self._define(key)
 
     def run(self, on_part: Callable[[float], None]) -> SessionHealth:
         """Read, then judge."""
-        file = self._read(on_part)
-        for scan in self._scans.values():
-            scan.flush()
-        file = self._against_summary(file)
+        file = self._against_summary(self._read(on_part))
         blocks = [block for block in self._file.blocks if block.end_ns]
         start_ns = min((block.start_ns for block in blocks), default=0)
         end_ns = max((block.end_ns for block in blocks), default=0)
-        found = [(key, scan) for key, scan in self._scans.items() if scan.count]
-        found.sort(key=lambda item: item[1].topic)
-        channels = tuple(self._channel(key, scan) for key, scan in found)
-        series = tuple(
-            self._series(key, scan.topic, tally)
-            for key, scan in found
-            for tally in scan.series.values()
-        )
-        joints = self._joints([scan for _, scan in found])
-        bitrate = self._bitrate([scan for _, scan in found if scan.bus is not None])
-        buses = tuple(
-            scan.bus.result(scan.topic, bitrate) for _, scan in found if scan.bus is not None
-        )
-        findings = judge_file(file)
-        types = {channel.topic: channel.type_name for channel in channels}
-        chain = self._robot.joint_names if self._robot is not None else ()
-        seen = [joint.name for joint in joints if joint.topic == STATES]
-        findings += judge_topics(types, chain, seen)
-        for channel in channels:
-            findings += judge_channel(channel)
-        # Messages of frames come when a batch is full; the frames themselves are judged.
-        framed = {bus.topic for bus in buses}
-        for each in series:
-            if each.topic not in framed:
-                findings += judge_series(each, start_ns, end_ns)
-        findings += judge_joints(joints, start_ns)
-        for bus in buses:
-            findings += judge_bus(bus, start_ns)
-        findings.sort(key=lambda finding: -finding.weight)
+        found = self._scan.result(start_ns, end_ns, judge_file(file))
         stored = self._file.metadata.get("undulog.health", {})
         return SessionHealth(
+            **{each.name: getattr(found, each.name) for each in fields(found)},
             path=self._file.path,
             session_id=self._file.metadata.get("undulog", {}).get("session_id")
             or self._file.path.stem,
-            robot=self._robot.name if self._robot is not None else None,
-            start_ns=start_ns,
-            end_ns=end_ns,
-            findings=tuple(dict.fromkeys(findings)),
             stored=stored.get("verdict"),
             stored_reasons=_reasons(stored.get("reasons", "[]")),
             file=file,
-            channels=channels,
-            series=series,
-            joints=joints,
-            buses=buses,
         )
 
     # -- reading ---------------------------------------------------------------------------
@@ -225,10 +140,10 @@ class _Check:
         if file.damage or file.truncated or not file.indexed:
             return file  # then messages are missing anyway, and the reason is known
         wrong = [
-            f"the summary counts {count} messages of {self._scans[key].topic}, "
-            f"{self._scans[key].count} are in the file"
+            f"the summary counts {count} messages of {self._scan.topic(key)}, "
+            f"{self._scan.count(key)} are in the file"
             for key, count in self._file.counts.items()
-            if key in self._scans and count != self._scans[key].count
+            if key in self._scan.keys and count != self._scan.count(key)
         ]
         return replace(file, damage=tuple(wrong))
 
@@ -243,7 +158,7 @@ class _Check:
             raise LogError(self._file.path, f"{where} is corrupt (its CRC doesn't fit)")
         keys = list(block.offsets if block.offsets is not None else block.index_at)
         if not keys:
-            keys = list(self._scans)
+            keys = list(self._scan.keys)
         found = [np.sort(self._file.offsets(block, key)) + base for key in keys]
         heads = read_heads(data, np.concatenate(found), stop)
         owners = np.repeat(keys, [len(offsets) for offsets in found])
@@ -253,8 +168,8 @@ class _Check:
             raise LogError(self._file.path, f"{where} does not list its messages")
         begin = 0
         for key, offsets in zip(keys, found, strict=True):
-            if len(offsets) and key in self._scans:
-                self._scans[key].add(data, offsets, heads[begin : begin + len(offsets)])
+            if len(offsets) and key in self._scan.keys:
+                self._scan.add(key, data, offsets, heads[begin : begin + len(offsets)])
             begin += len(offsets)
         return chunk is not None and bool(chunk.crc)
 
@@ -274,83 +189,18 @@ class _Check:
             self._notes.append(f"the attached robot description can't be used: {error}")
             return None
 
-    def _scan(self, key: int) -> ChannelScan:
+    def _define(self, key: int) -> None:
         channel = self._file.channels[key]
         try:
             kind = self._topics.message_type(channel.topic)
         except DataError as error:
             self._notes.append(str(error).removeprefix(f"{self._file.path}: "))
             kind = None
-        type_name = self._type_name(key)
+        schema = self._file.schemas.get(channel.schema_id)
+        type_name = schema.name if schema is not None else ""
         if kind is not None and kind.name != type_name:  # a second type on one topic
             kind = None
-        angles = channel.topic in (COMMANDS, STATES)
-        angles = angles and channel.metadata.get("unit", "rad") == "rad"
-        limits: Limits | None = {} if angles else None
-        if angles and self._robot is not None:
-            limits = {joint.name: (joint.lower, joint.upper) for joint in self._robot.joints}
-        joints = kind is not None and type_name == "sensor_msgs/msg/JointState"
-        return ChannelScan(channel.topic, kind, joints=joints, limits=limits)
-
-    def _type_name(self, key: int) -> str:
-        schema = self._file.schemas.get(self._file.channels[key].schema_id)
-        return schema.name if schema is not None else ""
-
-    # -- results ---------------------------------------------------------------------------
-
-    def _channel(self, key: int, scan: ChannelScan) -> ChannelHealth:
-        sequence = scan.sequence.result()
-        return ChannelHealth(scan.topic, self._type_name(key), scan.count, scan.unread, sequence)
-
-    def _series(self, key: int, topic: str, tally: Series) -> SeriesHealth:
-        return SeriesHealth(
-            topic=topic,
-            type_name=self._type_name(key),
-            names=tally.names,
-            timing=tally.timing.result(),
-            first_log_ns=tally.first_log_ns,
-            last_log_ns=tally.last_log_ns,
-            numbers=tally.numbers,
-            nan=tally.nan,
-        )
-
-    def _joints(self, scans: list[ChannelScan]) -> tuple[JointHealth, ...]:
-        tallies = [(scan.topic, series) for scan in scans for series in scan.series.values()]
-        commands = [
-            (series.names, series.ranges.result(len(series.names)))
-            for topic, series in tallies
-            if topic == COMMANDS
-        ]
-        limited = set(self._robot.joint_names) if self._robot is not None else set[str]()
-        found: dict[tuple[str, str], JointHealth] = {}
-        for topic, series in tallies:
-            measured = series.ranges.result(len(series.names))
-            for k, name in enumerate(series.names):
-                runs = [
-                    frozen_time(measured, k, command, names.index(name))
-                    for names, command in commands
-                    if topic == STATES and name in names
-                ]
-                bounded = name in limited and topic in (COMMANDS, STATES) and series.rows
-                longest = max(runs, default=None)
-                joint = JointHealth(
-                    topic=topic,
-                    name=name,
-                    samples=series.rows,
-                    nan=int(series.joint_nan[k]),
-                    at_limit=float(series.at_limit[k] / series.rows) if bounded else None,
-                    frozen_s=None if longest is None else longest[0],
-                    frozen_at_ns=0 if longest is None else longest[1] * NS,
-                )
-                had = found.get((topic, name))
-                found[topic, name] = joint if had is None else had.with_more(joint)
-        return tuple(found.values())
-
-    def _bitrate(self, buses: list[ChannelScan]) -> int | None:
-        """The described bus's bitrate, where it is clear which one that is."""
-        if self._robot is None or self._robot.bus is None or len(buses) != 1:
-            return None
-        return self._robot.bus.bitrate
+        self._scan.define(key, channel.topic, type_name, kind, channel.metadata)
 
 
 def _reasons(text: str) -> tuple[str, ...]:

@@ -1,0 +1,282 @@
+"""A session's messages to one statement of health, wherever they come from.
+
+The same scan is fed from the chunks of a file (:mod:`capture.log.session_check`) and from the
+messages of a running recording, so both come to the same verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+from ..robot import Robot
+from .channel_scan import ChannelScan, Limits, Series
+from .chunk import Buffer
+from .health import (
+    Finding,
+    frozen_time,
+    judge_bus,
+    judge_channel,
+    judge_joints,
+    judge_series,
+    judge_topics,
+    verdict_of,
+)
+from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
+from .rosmsg import MessageType
+from .tallies import NS
+
+COMMANDS, STATES = "/joint_commands", "/joint_states"
+
+
+@dataclass(frozen=True)
+class SessionMeasures:
+    """What the messages of a session say of its health.
+
+    Attributes:
+        robot: Name of the robot; None without a usable description.
+        start_ns: Log time of the first message [Unix ns]; 0 without messages.
+        end_ns: Log time of the last.
+        findings: All that was found, heaviest first.
+        channels: By topic.
+        series: By topic and names.
+        joints: By topic, in the order of the messages.
+        buses: By topic.
+    """
+
+    robot: str | None
+    start_ns: int
+    end_ns: int
+    findings: tuple[Finding, ...]
+    channels: tuple[ChannelHealth, ...]
+    series: tuple[SeriesHealth, ...]
+    joints: tuple[JointHealth, ...]
+    buses: tuple[BusHealth, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return (self.end_ns - self.start_ns) / NS
+
+    @property
+    def verdict(self) -> str:
+        """``good``, ``degraded`` or ``bad``."""
+        return verdict_of(self.findings)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is not better, heaviest first."""
+        return tuple(finding.sentence for finding in self.findings if finding.weight)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is worth knowing and no fault."""
+        return tuple(finding.sentence for finding in self.findings if not finding.weight)
+
+
+@dataclass(frozen=True)
+class ChannelMeasures:
+    """What one channel's messages say.
+
+    Attributes:
+        channel: Counts and sequence numbers.
+        series: One for each set of names.
+    """
+
+    channel: ChannelHealth
+    series: tuple[SeriesHealth, ...]
+
+
+class SessionScan:
+    """The scan of one session, channel by channel."""
+
+    def __init__(self, robot: Robot | None) -> None:
+        """Start without channels.
+
+        Args:
+            robot: The robot that the session describes; None without a usable description.
+        """
+        self._robot = robot
+        self._scans: dict[int, ChannelScan] = {}
+        self._types: dict[int, str] = {}
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The channels defined so far."""
+        return tuple(self._scans)
+
+    def define(
+        self,
+        key: int,
+        topic: str,
+        type_name: str,
+        kind: MessageType | None,
+        metadata: Mapping[str, str],
+    ) -> None:
+        """Take a channel, before its messages.
+
+        Args:
+            key: The channel's id.
+            topic: Its topic.
+            type_name: Its type, by name.
+            kind: Its type; None where it can't be read: only times are looked at then.
+            metadata: Of the channel, e.g. ``unit``.
+        """
+        angles = topic in (COMMANDS, STATES) and metadata.get("unit", "rad") == "rad"
+        limits: Limits | None = {} if angles else None
+        if angles and self._robot is not None:
+            limits = {joint.name: (joint.lower, joint.upper) for joint in self._robot.joints}
+        joints = kind is not None and type_name == "sensor_msgs/msg/JointState"
+        self._scans[key] = ChannelScan(topic, kind, joints=joints, limits=limits)
+        self._types[key] = type_name
+
+    def add(self, key: int, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
+        """Take messages of one channel.
+
+        Args:
+            key: The channel.
+            data: Bytes that hold their records.
+            offsets: Where the records start, in the order of the session, shape (n,).
+            heads: The records' heads, of :data:`capture.log.message_heads.HEAD`, shape (n,).
+        """
+        self._scans[key].add(data, offsets, heads)
+
+    def count(self, key: int) -> int:
+        """Messages of a channel so far.
+
+        Args:
+            key: The channel.
+        """
+        self._scans[key].flush()
+        return self._scans[key].count
+
+    def topic(self, key: int) -> str:
+        """Topic of a channel.
+
+        Args:
+            key: The channel.
+        """
+        return self._scans[key].topic
+
+    def measure(self, key: int) -> ChannelMeasures:
+        """What a channel's messages say so far.
+
+        Args:
+            key: The channel.
+        """
+        scan, type_name = self._scans[key], self._types[key]
+        scan.flush()
+        return ChannelMeasures(
+            ChannelHealth(scan.topic, type_name, scan.count, scan.unread, scan.sequence.result()),
+            tuple(_series(scan.topic, type_name, tally) for tally in scan.series.values()),
+        )
+
+    def result(
+        self,
+        start_ns: int,
+        end_ns: int,
+        before: Iterable[Finding] = (),
+        measured: Mapping[int, ChannelMeasures] | None = None,
+    ) -> SessionMeasures:
+        """Judge what has come so far.
+
+        Args:
+            start_ns: Log time of the first message [Unix ns]; 0 without messages.
+            end_ns: Log time of the last.
+            before: Findings of another kind, e.g. on the container.
+            measured: Measures of channels that were taken already.
+
+        Returns:
+            The measures and what they mean.
+        """
+        taken = measured or {}
+        found = [(key, scan) for key, scan in self._scans.items() if self.count(key)]
+        found.sort(key=lambda item: item[1].topic)
+        every = [taken.get(key) or self.measure(key) for key, _ in found]
+        channels = tuple(each.channel for each in every)
+        series = tuple(one for each in every for one in each.series)
+        joints = self._joints([scan for _, scan in found])
+        bitrate = self._bitrate([scan for _, scan in found if scan.bus is not None])
+        buses = tuple(
+            scan.bus.result(scan.topic, bitrate) for _, scan in found if scan.bus is not None
+        )
+        types = {channel.topic: channel.type_name for channel in channels}
+        chain = self._robot.joint_names if self._robot is not None else ()
+        seen = [joint.name for joint in joints if joint.topic == STATES]
+        findings = [*before, *judge_topics(types, chain, seen)]
+        for channel in channels:
+            findings += judge_channel(channel)
+        # Messages of frames come when a batch is full; the frames themselves are judged.
+        framed = {bus.topic for bus in buses}
+        for each in series:
+            if each.topic not in framed:
+                findings += judge_series(each, start_ns, end_ns)
+        findings += judge_joints(joints, start_ns)
+        for bus in buses:
+            findings += judge_bus(bus, start_ns)
+        findings.sort(key=lambda finding: -finding.weight)
+        return SessionMeasures(
+            robot=self._robot.name if self._robot is not None else None,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            findings=tuple(dict.fromkeys(findings)),
+            channels=channels,
+            series=series,
+            joints=joints,
+            buses=buses,
+        )
+
+    def _joints(self, scans: list[ChannelScan]) -> tuple[JointHealth, ...]:
+        tallies = [(scan.topic, series) for scan in scans for series in scan.series.values()]
+        commands = [
+            (series.names, series.ranges.result(len(series.names)))
+            for topic, series in tallies
+            if topic == COMMANDS
+        ]
+        limited = set(self._robot.joint_names) if self._robot is not None else set[str]()
+        found: dict[tuple[str, str], JointHealth] = {}
+        for topic, series in tallies:
+            measured = series.ranges.result(len(series.names))
+            for k, name in enumerate(series.names):
+                runs = [
+                    frozen_time(measured, k, command, names.index(name))
+                    for names, command in commands
+                    if topic == STATES and name in names
+                ]
+                bounded = name in limited and topic in (COMMANDS, STATES) and series.rows
+                longest = max(runs, default=None)
+                joint = JointHealth(
+                    topic=topic,
+                    name=name,
+                    samples=series.rows,
+                    nan=int(series.joint_nan[k]),
+                    at_limit=float(series.at_limit[k] / series.rows) if bounded else None,
+                    frozen_s=None if longest is None else longest[0],
+                    frozen_at_ns=0 if longest is None else longest[1] * NS,
+                )
+                had = found.get((topic, name))
+                found[topic, name] = joint if had is None else had.with_more(joint)
+        return tuple(found.values())
+
+    def _bitrate(self, buses: list[ChannelScan]) -> int | None:
+        """The described bus's bitrate, where it is clear which one that is."""
+        if self._robot is None or self._robot.bus is None or len(buses) != 1:
+            return None
+        return self._robot.bus.bitrate
+
+
+def _series(topic: str, type_name: str, tally: Series) -> SeriesHealth:
+    return SeriesHealth(
+        topic=topic,
+        type_name=type_name,
+        names=tally.names,
+        timing=tally.timing.result(),
+        first_log_ns=tally.first_log_ns,
+        last_log_ns=tally.last_log_ns,
+        numbers=tally.numbers,
+        nan=tally.nan,
+    )
