@@ -52,6 +52,15 @@ _BODIES: dict[str, str] = {
         "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n"
         "float64[9] magnetic_field_covariance\n"
     ),
+    "sensor_msgs/TimeReference": (
+        "std_msgs/Header header\nbuiltin_interfaces/Time time_ref\nstring source\n"
+    ),
+    "diagnostic_msgs/KeyValue": "string key\nstring value\n",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n"
+        "byte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values\n"
+    ),
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\nDiagnosticStatus[] status\n",
     "rcl_interfaces/Log": (
         "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\n"
         "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
