@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
+from importlib import import_module
 from importlib.metadata import version
 
 from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
@@ -34,7 +35,11 @@ VERBS: dict[str, tuple[str, str]] = {
 }
 """Verb to the function behind it and its line in the list of verbs."""
 
-_GROUPS = {"log": "Look after sessions.", "sim": "The twin: simulate and record."}
+_GROUPS = {
+    "record": "Record a robot; look after a running recording.",
+    "log": "Look after sessions.",
+    "sim": "The twin: simulate and record.",
+}
 
 _EXTRAS = {
     "pybullet": "sim",
@@ -67,15 +72,32 @@ def build(arguments: Sequence[str] = ()) -> App:
         default_parameter=Parameter(negative=()),
         result_action="return_value",
     )
-    groups = {name: App(name=name, help=text, help_epilogue="") for name, text in _GROUPS.items()}
+    groups = {name: _group(name, arguments) for name in _GROUPS}
     for group in groups.values():
         app.command(group)
     for verb, (target, summary) in VERBS.items():
+        if verb in groups:
+            continue
         *group, name = verb.split()
         asked = list(arguments[: len(group) + 1]) == [*group, name]
         parent = groups[group[0]] if group else app
         parent.command(target, name=name, help=None if asked else summary, help_epilogue="")
     return app
+
+
+def _group(name: str, arguments: Sequence[str]) -> App:
+    """A group of verbs; where it is a verb itself, that is imported when the group is asked for.
+
+    ``undulog record can:...`` records, ``undulog record stop`` ends a recording: a word that names
+    a verb of the group is that verb, anything else goes to the group's own.
+    """
+    if name not in VERBS or list(arguments[:1]) != [name]:
+        summary = VERBS[name][1] if name in VERBS else _GROUPS[name]
+        return App(name=name, help=summary, help_epilogue="")
+    module, function = VERBS[name][0].split(":")
+    group = App(name=name, help_epilogue="")
+    group.default(getattr(import_module(module), function))
+    return group
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -130,7 +152,7 @@ def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtra
     while cause is not None:
         package = (getattr(cause, "name", None) or "").partition(".")[0]
         if package in _EXTRAS:
-            verb = next(verb for verb in VERBS if " ".join(arguments).startswith(verb))
+            verb = max((v for v in VERBS if " ".join(arguments).startswith(v)), key=len)
             return MissingExtraError(f"'undulog {verb}'", _EXTRAS[package], package)
         cause = cause.__cause__
     return None
