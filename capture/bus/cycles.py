@@ -8,7 +8,6 @@ sample is moved in time. A round ends when a joint comes round again, or after
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,12 +62,12 @@ class RoundGatherer:
             The rounds that are complete now; the last one may still grow and is kept back.
         """
         self._append(t_ns, joint, values)
-        starts = list(_round_starts(self._t_ns, self._joint))
+        starts = _round_starts(self._t_ns, self._joint, self._joints)
         return self._take(starts[:-1], starts[-1] if starts else 0)
 
     def finish(self) -> Rounds:
         """The last round, complete or not."""
-        starts = list(_round_starts(self._t_ns, self._joint))
+        starts = _round_starts(self._t_ns, self._joint, self._joints)
         return self._take(starts, len(self._t_ns))
 
     def _append(self, t_ns: IntArray, joint: IntArray, values: FloatArray) -> None:
@@ -93,13 +92,26 @@ class RoundGatherer:
         return Rounds(stamp_ns, last_ns, offset_s, gathered)
 
 
-def _round_starts(t_ns: IntArray, joint: IntArray) -> Iterator[int]:
-    """Index of the first sample of each round."""
-    seen: set[int] = set()
-    begun = 0
-    for i, (t, j) in enumerate(zip(t_ns.tolist(), joint.tolist(), strict=True)):
-        if not seen or j in seen or abs(t - begun) > LONGEST_ROUND_NS:
-            seen.clear()
-            begun = t
-            yield i
-        seen.add(j)
+def _round_starts(t_ns: IntArray, joint: IntArray, joints: int) -> list[int]:
+    """Index of the first sample of each round.
+
+    A round that starts at s ends at the first sample i whose joint was last seen at s or later, or
+    that is too far from s in time. Of more samples than there are joints one must be such a one,
+    so each look is short.
+    """
+    if not len(joint):
+        return []
+    order = np.argsort(joint, kind="stable")
+    earlier = np.full(len(joint), -1)
+    again = np.diff(joint[order], prepend=-1) == 0
+    earlier[order[1:]] = np.where(again[1:], order[:-1], -1)
+    starts = [0]
+    while True:
+        start = starts[-1]
+        look = slice(start + 1, start + 2 + joints)
+        ends = earlier[look] >= start
+        ends |= np.abs(t_ns[look] - t_ns[start]) > LONGEST_ROUND_NS
+        step = int(ends.argmax()) if len(ends) else 0
+        if not len(ends) or not ends[step]:
+            return starts
+        starts.append(start + 1 + step)

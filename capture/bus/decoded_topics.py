@@ -12,18 +12,19 @@ times are logged beside it, as sample time minus stamp, on the topic's offset to
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..log.channels import JointStateChannel
 from ..log.writer import SessionWriter
-from ..robot import Quantity, Robot, Sensor, SensorKind
+from ..robot import BusSignal, Quantity, Robot, Sensor, SensorKind
 from ..units import SESSION_UNIT
 from .cycles import RoundGatherer, Rounds
-from .decoding import BusDecoder, DecodedSignal
+from .decoding import BusDecoder, DecodedSignals
 
 SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"
 """Sample time minus stamp of what the joints measure [s]."""
@@ -53,13 +54,13 @@ class Message:
 
     Attributes:
         topic: Where it goes.
-        log_ns: Its log time [Unix ns].
-        write: Writes it.
+        sampled_ns: Time of its last sample [Unix ns].
+        write: Writes it; takes the log time [Unix ns].
     """
 
     topic: str
-    log_ns: int
-    write: Callable[[], None]
+    sampled_ns: int
+    write: Callable[[int], None]
 
 
 class DecodedTopics:
@@ -73,19 +74,27 @@ class DecodedTopics:
             robot: The robot.
             decoder: Its compiled bus.
         """
-        self._writer = writer
-        self._sensors = {sensor.name: sensor for sensor in robot.sensors}
-        self._joints = robot.joint_names
-        self._offsets = {
-            topic: _OffsetTopic(writer, topic, self._joints)
+        joints = robot.joint_names
+        offsets = {
+            topic: _OffsetTopic(writer, topic, joints)
             for topic in (SAMPLE_OFFSET_TOPIC, COMMAND_OFFSET_TOPIC)
         }
-        self._topics = [
-            self._joint_topic(quantities) for quantities in _topics_of(decoder, self._joints)
+        self._groups = [
+            _JointGroup(
+                writer,
+                joints,
+                topics,
+                offsets[
+                    COMMAND_OFFSET_TOPIC
+                    if topics[0][0] is Quantity.COMMAND
+                    else SAMPLE_OFFSET_TOPIC
+                ],
+            )
+            for topics in _groups_of(decoder, joints)
         ]
-        self._sensor_writers: dict[str, Callable[[int, FloatArray], None]] = {}
+        self._sensors = [_SensorTopic(writer, sensor) for sensor in robot.sensors]
 
-    def add(self, samples: Sequence[DecodedSignal]) -> list[Message]:
+    def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
         """Take the samples of one block of frames.
 
         Args:
@@ -95,33 +104,35 @@ class DecodedTopics:
             The messages that are complete now, in no order.
         """
         messages: list[Message] = []
-        for topic in self._topics:
-            messages += topic.add(samples)
-        for sensor in self._sensors.values():
-            own = [sample for sample in samples if sample.signal.target == sensor.name]
-            if own:
-                messages += self._sensor_messages(sensor, own)
+        for group in self._groups:
+            messages += group.add(samples)
+        for sensor in self._sensors:
+            messages += sensor.add(samples)
         return messages
 
     def finish(self) -> list[Message]:
         """The messages that waited for more samples."""
-        return [message for topic in self._topics for message in topic.finish()]
+        return [message for group in self._groups for message in group.finish()]
 
-    def _joint_topic(self, quantities: tuple[Quantity, ...]) -> _JointTopic:
-        is_command = quantities[0] is Quantity.COMMAND
-        offsets = self._offsets[COMMAND_OFFSET_TOPIC if is_command else SAMPLE_OFFSET_TOPIC]
-        return _JointTopic(self._writer, self._joints, quantities, offsets)
 
-    def _sensor_messages(self, sensor: Sensor, samples: list[DecodedSignal]) -> list[Message]:
-        if sensor.name not in self._sensor_writers:
-            self._sensor_writers[sensor.name] = _open_sensor(self._writer, sensor)
-        write = self._sensor_writers[sensor.name]
-        columns = ["xyz".index(sample.signal.axis or "x") for sample in samples]
-        t_ns, values = _side_by_side(samples, columns, 3)
-        return [
-            Message(sensor.topic, t, lambda t=t, row=row: write(t, row))
-            for t, row in zip(t_ns.tolist(), values, strict=True)
-        ]
+class _Targets:
+    """Which of our targets the members of decoded signals are."""
+
+    def __init__(self, targets: Sequence[str]) -> None:
+        self._index = {target: k for k, target in enumerate(targets)}
+        self._known: dict[int, tuple[tuple[BusSignal, ...], IntArray]] = {}
+
+    def of(self, decoded: DecodedSignals) -> IntArray:
+        """Index of each sample's target, -1 for others, shape (n,)."""
+        return self.index(decoded.signals)[decoded.member]
+
+    def index(self, signals: tuple[BusSignal, ...]) -> IntArray:
+        """Index of each entry's target, -1 for others."""
+        known = self._known.get(id(signals))  # kept with its key, so that the id stays its own
+        if known is None:
+            index = [self._index.get(signal.target, -1) for signal in signals]
+            known = self._known[id(signals)] = (signals, np.array(index, dtype=np.int64))
+        return known[1]
 
 
 class _OffsetTopic:
@@ -132,7 +143,9 @@ class _OffsetTopic:
         self._channel: JointStateChannel | None = None
         self._written: OrderedDict[int, bytes] = OrderedDict()
 
-    def place(self, stamp_ns: int, log_ns: int, offset_s: FloatArray) -> tuple[int, list[Message]]:
+    def place(
+        self, stamp_ns: int, sampled_ns: int, offset_s: FloatArray
+    ) -> tuple[int, list[Message]]:
         """Find a stamp for a round; returns it with the offset message, unless written already.
 
         Rounds of several topics that come in the same frames share a stamp and its offsets. A
@@ -153,90 +166,151 @@ class _OffsetTopic:
             self._channel = self._writer.joint_state(self._topic, self._joints, unit="s")
         channel = self._channel
 
-        def write() -> None:
+        def write(log_ns: int) -> None:
             channel.write(stamp_ns, offset_s, log_time_ns=log_ns)
 
-        return stamp_ns, [Message(self._topic, log_ns, write)]
+        return stamp_ns, [Message(self._topic, sampled_ns, write)]
+
+
+class _JointGroup:
+    """JointState topics whose samples come in the same frames, hence in the same rounds."""
+
+    def __init__(
+        self,
+        writer: SessionWriter,
+        joints: tuple[str, ...],
+        topics: Sequence[tuple[Quantity, ...]],
+        offsets: _OffsetTopic,
+    ) -> None:
+        self._joints, self._offsets = joints, offsets
+        self._targets = _Targets(joints)
+        self._columns = [quantity for topic in topics for quantity in topic]
+        self._gatherer = RoundGatherer(len(joints), len(self._columns))
+        self._topics: list[_JointTopic] = []
+        for quantities in topics:
+            first = self._columns.index(quantities[0])
+            columns = slice(first, first + len(quantities))
+            self._topics.append(_JointTopic(writer, joints, quantities, columns))
+
+    def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
+        blocks = self._blocks(samples)
+        if not blocks:
+            return []
+        if len(blocks) > 1:
+            blocks = [self._together(blocks)]
+        return self._messages(self._gatherer.add(*blocks[0][1:]))
+
+    def finish(self) -> list[Message]:
+        return self._messages(self._gatherer.finish())
+
+    def _blocks(
+        self, samples: Sequence[DecodedSignals]
+    ) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
+        """Rows, times, joints, values; signals that come in the same frames side by side."""
+        blocks: dict[int, tuple[IntArray, IntArray, IntArray, FloatArray]] = {}
+        for decoded in samples:
+            quantity = decoded.signals[0].quantity
+            if quantity not in self._columns or (self._targets.index(decoded.signals) < 0).all():
+                continue
+            block = blocks.get(id(decoded.rows))
+            joint = self._targets.of(decoded)
+            if block is None or (block[2] != joint).any():
+                values = np.full((len(joint), len(self._columns)), np.nan)
+                block = (decoded.rows, decoded.t_ns, joint, values)
+                key = id(decoded.rows) if id(decoded.rows) not in blocks else -len(blocks) - 1
+                blocks[key] = block
+            block[3][:, self._columns.index(quantity)] = decoded.values
+        kept = [block for block in blocks.values() if (block[2] >= 0).all()]
+        mixed = [block for block in blocks.values() if (block[2] < 0).any()]
+        for rows, t_ns, joint, values in mixed:
+            own = joint >= 0
+            kept.append((rows[own], t_ns[own], joint[own], values[own]))
+        return kept
+
+    def _together(
+        self, blocks: Sequence[tuple[IntArray, IntArray, IntArray, FloatArray]]
+    ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+        """One block; samples of one joint in one frame share a row."""
+        rows = np.concatenate([block[0] for block in blocks])
+        t_ns = np.concatenate([block[1] for block in blocks])
+        joint = np.concatenate([block[2] for block in blocks])
+        values = np.concatenate([block[3] for block in blocks])
+        keys, place = np.unique(rows * len(self._joints) + joint, return_inverse=True)
+        merged = np.full((len(keys), values.shape[1]), np.nan)
+        for column in range(values.shape[1]):
+            known = ~np.isnan(values[:, column])
+            merged[place[known], column] = values[known, column]
+        merged_t = np.empty(len(keys), dtype=np.int64)
+        merged_t[place] = t_ns
+        return keys // len(self._joints), merged_t, keys % len(self._joints), merged
+
+    def _messages(self, rounds: Rounds) -> list[Message]:
+        messages: list[Message] = []
+        for k, (stamp_ns, sampled_ns) in enumerate(
+            zip(rounds.stamp_ns.tolist(), rounds.last_ns.tolist(), strict=True)
+        ):
+            own_ns, offset_messages = self._offsets.place(stamp_ns, sampled_ns, rounds.offset_s[k])
+            messages += offset_messages
+            for topic in self._topics:
+                messages += topic.messages(own_ns, sampled_ns, rounds.values[k])
+        return messages
 
 
 class _JointTopic:
-    """One JointState topic."""
+    """One JointState topic: some columns of a group."""
 
     def __init__(
         self,
         writer: SessionWriter,
         joints: tuple[str, ...],
         quantities: tuple[Quantity, ...],
-        offsets: _OffsetTopic,
+        columns: slice,
     ) -> None:
-        self._writer, self._joints, self._offsets = writer, joints, offsets
-        self._quantities = quantities
-        self._gatherer = RoundGatherer(len(joints), len(quantities))
+        self._writer, self._joints = writer, joints
+        self._quantities, self._columns = quantities, columns
         self._channel: JointStateChannel | None = None
 
-    def add(self, samples: Sequence[DecodedSignal]) -> list[Message]:
-        t_ns, joint, rows, values = [_NO_TIMES], [_NO_TIMES], [_NO_TIMES], [self._no_values()]
-        for j, name in enumerate(self._joints):
-            own = [
-                sample
-                for sample in samples
-                if sample.signal.target == name and sample.signal.quantity in self._quantities
-            ]
-            if own:
-                columns = [self._quantities.index(sample.signal.quantity) for sample in own]
-                own_t, own_values = _side_by_side(own, columns, len(self._quantities))
-                t_ns.append(own_t)
-                rows.append(_rows(own))
-                joint.append(np.full(len(own_t), j, dtype=np.int64))
-                values.append(own_values)
-        order = np.argsort(np.concatenate(rows), kind="stable")
-        return self._messages(
-            self._gatherer.add(
-                np.concatenate(t_ns)[order],
-                np.concatenate(joint)[order],
-                np.concatenate(values)[order],
-            )
-        )
-
-    def finish(self) -> list[Message]:
-        return self._messages(self._gatherer.finish())
-
-    def _no_values(self) -> FloatArray:
-        return np.empty((0, len(self._quantities)), dtype=np.float64)
-
-    def _messages(self, rounds: Rounds) -> list[Message]:
-        messages: list[Message] = []
-        for k in range(len(rounds.stamp_ns)):
-            log_ns = int(rounds.last_ns[k])
-            stamp_ns, offset_message = self._offsets.place(
-                int(rounds.stamp_ns[k]), log_ns, rounds.offset_s[k]
-            )
-            messages += offset_message
-            messages.append(self._message(stamp_ns, log_ns, rounds.values[k]))
-        return messages
-
-    def _message(self, stamp_ns: int, log_ns: int, values: FloatArray) -> Message:
+    def messages(self, stamp_ns: int, sampled_ns: int, row: FloatArray) -> list[Message]:
+        """The message of one round, unless nothing of this topic was in it; row: (joints, all)."""
+        values = row[:, self._columns]
+        if np.isnan(values).all():
+            return []
+        topic = JOINT_TOPIC[self._quantities[0]]
         if self._channel is None:
             self._channel = self._writer.joint_state(
-                JOINT_TOPIC[self._quantities[0]],
+                topic,
                 self._joints,
                 unit=SESSION_UNIT[self._quantities[0]],
                 velocity=Quantity.VELOCITY in self._quantities[1:],
                 effort=Quantity.EFFORT in self._quantities[1:],
             )
         channel = self._channel
-        fields = {quantity: values[:, q] for q, quantity in enumerate(self._quantities)}
+        fields = dict(zip(self._quantities, values.T, strict=True))
         first = fields.pop(self._quantities[0])
         velocity = fields.get(Quantity.VELOCITY, ())
         effort = fields.get(Quantity.EFFORT, ())
 
-        def write() -> None:
+        def write(log_ns: int) -> None:
             channel.write(stamp_ns, first, velocity, effort, log_time_ns=log_ns)
 
-        return Message(JOINT_TOPIC[self._quantities[0]], log_ns, write)
+        return [Message(topic, sampled_ns, write)]
 
 
-_NO_TIMES: IntArray = np.empty(0, dtype=np.int64)
+def _groups_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[list[tuple[Quantity, ...]]]:
+    """The JointState topics, as their quantities, grouped by the frames that bring them.
+
+    Position comes first where velocity or effort come with it.
+    """
+    groups: list[list[tuple[Quantity, ...]]] = []
+    for topic in _topics_of(decoder, joints):
+        for group in groups:
+            if _comes_with(decoder, joints, topic[0], group[0][0]):
+                group.append(topic)
+                break
+        else:
+            if any(decoder.carriers(joint, topic[0]) for joint in joints):
+                groups.append([topic])
+    return groups
 
 
 def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quantity, ...]]:
@@ -244,12 +318,7 @@ def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quant
     with_position = [
         quantity
         for quantity in _BESIDE_POSITION
-        if all(
-            not decoder.carriers(joint, quantity)
-            or decoder.carriers(joint, quantity) == decoder.carriers(joint, Quantity.POSITION)
-            for joint in joints
-        )
-        and any(decoder.carriers(joint, quantity) for joint in joints)
+        if _comes_with(decoder, joints, quantity, Quantity.POSITION)
     ]
     alone = [quantity for quantity in JOINT_TOPIC if quantity not in with_position]
     return [
@@ -258,42 +327,71 @@ def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quant
     ]
 
 
-def _rows(samples: Sequence[DecodedSignal]) -> IntArray:
-    """Frame rows that carry any of the samples, increasing."""
-    return np.unique(np.concatenate([sample.rows for sample in samples]))
+def _comes_with(
+    decoder: BusDecoder, joints: tuple[str, ...], quantity: Quantity, other: Quantity
+) -> bool:
+    """Whether every joint that has the quantity has it in the frames of the other one."""
+    own = [(joint, decoder.carriers(joint, quantity)) for joint in joints]
+    return any(carriers for _, carriers in own) and all(
+        not carriers or carriers == decoder.carriers(joint, other) for joint, carriers in own
+    )
+
+
+class _SensorTopic:
+    """The topic of one sensor."""
+
+    def __init__(self, writer: SessionWriter, sensor: Sensor) -> None:
+        self._writer, self._sensor = writer, sensor
+        self._targets = _Targets([sensor.name])
+        self._write: Callable[[FloatArray, int, int], None] | None = None
+
+    def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
+        """Values of one frame side by side, one message a frame."""
+        pieces: list[tuple[int, IntArray, IntArray, FloatArray]] = []
+        for decoded in samples:
+            index = self._targets.index(decoded.signals)
+            if (index < 0).all():
+                continue
+            own = index[decoded.member] >= 0
+            if own.any():
+                column = "xyz".index(decoded.signals[0].axis or "x")
+                pieces.append((column, decoded.rows[own], decoded.t_ns[own], decoded.values[own]))
+        if not pieces:
+            return []
+        if self._write is None:
+            self._write = _open_sensor(self._writer, self._sensor)
+        write, topic = self._write, self._sensor.topic
+        t_ns, values = _side_by_side(pieces)
+        return [
+            Message(topic, t, partial(write, row, t))
+            for t, row in zip(t_ns.tolist(), values, strict=True)
+        ]
 
 
 def _side_by_side(
-    samples: Sequence[DecodedSignal], columns: Iterable[int], width: int
+    pieces: Sequence[tuple[int, IntArray, IntArray, FloatArray]],
 ) -> tuple[IntArray, FloatArray]:
-    """Samples of one target, those of one frame in one row.
-
-    Args:
-        samples: The samples.
-        columns: Column of each.
-        width: Number of columns.
-
-    Returns:
-        Time of each row [Unix ns], shape (n,), and values, NaN where missing, shape (n, width).
-    """
-    rows = _rows(samples)
+    """Times [Unix ns], shape (n,), and values, NaN where missing, shape (n, 3), one row a frame."""
+    first = pieces[0][1]
+    shared = all(np.array_equal(rows, first) for _, rows, _, _ in pieces[1:])
+    rows = first if shared else np.unique(np.concatenate([rows for _, rows, _, _ in pieces]))
     t_ns = np.empty(len(rows), dtype=np.int64)
-    values = np.full((len(rows), width), np.nan)
-    for sample, column in zip(samples, columns, strict=True):
-        at = np.searchsorted(rows, sample.rows)
-        t_ns[at] = sample.t_ns
-        values[at, column] = sample.values
+    values = np.full((len(rows), 3), np.nan)
+    for column, own_rows, own_t, own_values in pieces:
+        at = slice(None) if shared else np.searchsorted(rows, own_rows)
+        t_ns[at] = own_t
+        values[at, column] = own_values
     return t_ns, values
 
 
-def _open_sensor(writer: SessionWriter, sensor: Sensor) -> Callable[[int, FloatArray], None]:
-    """Open a sensor's topic; returns what writes one row of its values."""
+def _open_sensor(writer: SessionWriter, sensor: Sensor) -> Callable[[FloatArray, int, int], None]:
+    """Open a sensor's topic; returns what writes a row of values, sample time and log time."""
     if sensor.kind is SensorKind.ACCELEROMETER:
         imu = writer.imu(sensor.topic, frame=sensor.name)
-        return imu.write
+        return lambda row, t_ns, log_ns: imu.write(t_ns, row, log_time_ns=log_ns)
     if sensor.kind is SensorKind.COMPASS:
         compass = writer.magnetic_field(sensor.topic, frame=sensor.name)
-        return compass.write
+        return lambda row, t_ns, log_ns: compass.write(t_ns, row, log_time_ns=log_ns)
     distance = writer.range(
         sensor.topic,
         frame=sensor.name,
@@ -302,4 +400,4 @@ def _open_sensor(writer: SessionWriter, sensor: Sensor) -> Callable[[int, FloatA
         field_of_view=sensor.field_of_view or 0.0,
         infrared=sensor.kind is SensorKind.IR,
     )
-    return lambda t_ns, row: distance.write(t_ns, float(row[0]))
+    return lambda row, t_ns, log_ns: distance.write(t_ns, float(row[0]), log_time_ns=log_ns)

@@ -43,20 +43,22 @@ _BODY = np.uint32(EXTENDED_FLAG | ID_MASK)
 
 
 @dataclass(frozen=True)
-class DecodedSignal:
-    """The samples of one entry of the bus map.
+class DecodedSignals:
+    """The samples of map entries that lie alike in their frames, such as the angles of all joints.
 
     Attributes:
-        signal: The entry.
-        unit: The session's unit of its quantity.
-        rows: Rows of the frames that carry it, increasing, shape (n,).
+        signals: The entries, m of them; they have one quantity and one axis.
+        unit: The session's unit of that quantity.
+        rows: Rows of the frames that carry them, increasing, shape (n,).
+        member: Index into ``signals`` of each sample, shape (n,).
         t_ns: Host time of these frames [Unix ns], shape (n,).
         values: In ``unit``, shape (n,).
     """
 
-    signal: BusSignal
+    signals: tuple[BusSignal, ...]
     unit: str
     rows: IntArray
+    member: IntArray
     t_ns: IntArray
     values: FloatArray
 
@@ -157,18 +159,40 @@ def identifier_text(id_flags: int) -> str:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A map entry, compiled."""
+    """Where a map entry lies in its frame and what its bits mean, compiled."""
 
-    signal: BusSignal
-    label: str
+    quantity: Quantity
+    axis: str | None
     bits: BitField
     unit: Unit
-    conditions: tuple[tuple[BitField, NDArray[np.uint64]], ...]  # multiplexers that select it
+    scale: float
+    offset: float
+    conditions: tuple[tuple[BitField, tuple[int, ...]], ...]  # multiplexers that select it
     size: int  # data bytes needed, multiplexers included
 
     @property
     def selection(self) -> tuple[tuple[int, ...], ...]:
-        return tuple(tuple(identifiers.tolist()) for _, identifiers in self.conditions)
+        return tuple(identifiers for _, identifiers in self.conditions)
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Kinds of frame with the same entries, of different targets: decoded in one go.
+
+    Attributes:
+        entries: What their frames carry, e of them.
+        signals: The map entries behind them: for each entry, one a member.
+        labels: The same, as ``message.signal``.
+        names: Identifier of each member.
+    """
+
+    entries: tuple[_Entry, ...]
+    signals: tuple[tuple[BusSignal, ...], ...]
+    labels: tuple[tuple[str, ...], ...]
+    names: tuple[str, ...]
+
+
+_SILENT, _UNDIRECTED = -1, -2
 
 
 class BusDecoder:
@@ -190,21 +214,30 @@ class BusDecoder:
         messages = database_messages(dict(robot.databases), Faults()) or {}
         if missing := {signal.message for signal in robot.bus.signals} - set(messages):
             raise DataError(f"no database of {robot.name} has {', '.join(sorted(missing))}")
-        self._entries: dict[int, list[_Entry]] = {}
+        self._carried: dict[int, list[tuple[BusSignal, _Entry]]] = {}
         for signal in robot.bus.signals:
             message = messages[signal.message]
             key = _key(message) | (_TX_BIT if signal.direction is Direction.TX else 0)
-            self._entries.setdefault(key, []).append(_compile(message, signal))
-        self._known = {_key(message) for message in messages.values()}
-        self._undirected: set[int] = set()
+            self._carried.setdefault(key, []).append((signal, _compile(message, signal)))
+        known = {_key(message) for message in messages.values()}
+        undirected: set[int] = set()
         if not directions:
-            for identifier in self._known:
-                ways = [key for key in (identifier, identifier | _TX_BIT) if key in self._entries]
+            for identifier in known:
+                ways = [key for key in (identifier, identifier | _TX_BIT) if key in self._carried]
                 if len(ways) == 1:
-                    self._entries[identifier] = self._entries[ways[0]]
+                    self._carried[identifier] = self._carried[ways[0]]
                 elif ways:
-                    self._undirected.add(identifier)
+                    undirected.add(identifier)
         self._directions = directions
+        self._families, places = _families(self._carried)
+        keys = sorted(known | {identifier | _TX_BIT for identifier in known})
+        self._keys = np.array(keys, dtype=np.int64)
+        found = [places.get(key, (_SILENT, 0)) for key in keys]
+        found = [
+            (_UNDIRECTED, 0) if key & ~_TX_BIT in undirected else place
+            for key, place in zip(keys, found, strict=True)
+        ]
+        self._family, self._member = np.array(found, dtype=np.int64).reshape(-1, 2).T
 
     def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
         """What kinds of frame bring a quantity; equal sets mean the same frames.
@@ -218,71 +251,106 @@ class BusDecoder:
         """
         return frozenset(
             (key, entry.selection)
-            for key, entries in self._entries.items()
-            for entry in entries
-            if entry.signal.target == target and entry.signal.quantity is quantity
+            for key, carried in self._carried.items()
+            for signal, entry in carried
+            if signal.target == target and signal.quantity is quantity
         )
 
-    def decode(self, frames: FrameArray) -> tuple[tuple[DecodedSignal, ...], FrameTally]:
+    def decode(self, frames: FrameArray) -> tuple[tuple[DecodedSignals, ...], FrameTally]:
         """Decode frames.
 
         Args:
             frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
 
         Returns:
-            The samples of each map entry that occurs, and what became of the frames.
+            The samples of the map entries that occur, and what became of the frames.
         """
         id_flags = frames["id_flags"]
         is_error = (id_flags & np.uint32(ERROR_FLAG)) != 0
         is_remote = ~is_error & ((id_flags & np.uint32(REMOTE_FLAG)) != 0)
         tally = FrameTally(len(frames), 0, int(is_error.sum()), int(is_remote.sum()))
-        data_rows = np.flatnonzero(~is_error & ~is_remote)
-        keys = (id_flags[data_rows] & _BODY).astype(np.int64)
+        rows = np.flatnonzero(~(is_error | is_remote))
+        keys = (id_flags[rows] & _BODY).astype(np.int64)
         if self._directions:
-            keys |= np.where(frames["dir"][data_rows] == DIR_TX, _TX_BIT, 0)
-        order = np.argsort(keys, kind="stable")
-        keys, first = np.unique(keys[order], return_index=True)
-        samples: list[DecodedSignal] = []
-        for key, rows in zip(keys.tolist(), np.split(data_rows[order], first[1:]), strict=True):
-            identifier = key & ~_TX_BIT
-            name = identifier_text(identifier)
-            if identifier in self._undirected:
-                tally.undirected[name] += len(rows)
-            elif key in self._entries:
-                samples += self._decode_group(frames[rows], rows, self._entries[key], tally, name)
-            elif identifier in self._known:
-                tally.silent[name] += len(rows)
-            else:
-                tally.unknown[name] += len(rows)
+            keys |= np.where(frames["dir"][rows] == DIR_TX, _TX_BIT, 0)
+        if not len(self._keys):
+            tally.unknown.update(map(_name, keys.tolist()))
+            return (), tally
+        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        is_known = self._keys[place] == keys
+        family = np.where(is_known, self._family[place], _SILENT)
+        for counter, chosen in (
+            (tally.unknown, ~is_known),
+            (tally.silent, is_known & (family == _SILENT)),
+            (tally.undirected, family == _UNDIRECTED),
+        ):
+            counter.update(map(_name, keys[chosen].tolist()))
+        samples: list[DecodedSignals] = []
+        for number in np.flatnonzero(np.bincount(family[family >= 0])).tolist():
+            chosen = family == number
+            member = self._member[place[chosen]]
+            samples += _decode(frames, rows[chosen], member, self._families[number], tally)
         return tuple(samples), tally
 
-    @staticmethod
-    def _decode_group(
-        frames: FrameArray, rows: IntArray, entries: list[_Entry], tally: FrameTally, name: str
-    ) -> list[DecodedSignal]:
-        """Decode the frames of one identifier and direction; ``rows`` are their rows in all."""
-        data: NDArray[np.uint8] = np.ascontiguousarray(frames["data"])
-        size = np.minimum(frames["dlc"], 8)
-        t_ns = frames["t_host_ns"].astype(np.int64)
-        carries = np.zeros(len(frames), dtype=np.bool_)
-        mentioned = np.zeros(len(frames), dtype=np.bool_)
-        samples: list[DecodedSignal] = []
-        for entry in entries:
-            selected = _selected(data, size, entry)
-            whole = selected & (size >= entry.size)
-            mentioned |= selected
-            carries |= whole
-            if missing := int(selected.sum() - whole.sum()):
-                tally.short[entry.label] += missing
-            if whole.any():
-                decoded = entry.bits.values(data[whole])
-                values = entry.unit.convert(entry.signal.scale * decoded + entry.signal.offset)
-                unit = SESSION_UNIT[entry.signal.quantity]
-                samples.append(DecodedSignal(entry.signal, unit, rows[whole], t_ns[whole], values))
-        tally.decoded += int(carries.sum())
-        if silent := int((~mentioned).sum()):
-            tally.silent[name] += silent
-        return samples
+
+def _families(
+    carried: dict[int, list[tuple[BusSignal, _Entry]]],
+) -> tuple[list[_Family], dict[int, tuple[int, int]]]:
+    """Frames with equal entries together; and the family and member number of each key."""
+    members: dict[tuple[_Entry, ...], list[int]] = {}
+    for key, pairs in carried.items():
+        members.setdefault(tuple(entry for _, entry in pairs), []).append(key)
+    families: list[_Family] = []
+    places: dict[int, tuple[int, int]] = {}
+    for entries, keys in members.items():
+        places |= {key: (len(families), k) for k, key in enumerate(keys)}
+        signals = [tuple(carried[key][e][0] for key in keys) for e in range(len(entries))]
+        labels = [tuple(f"{each.message}.{each.signal}" for each in row) for row in signals]
+        names = tuple(_name(key) for key in keys)
+        families.append(_Family(entries, tuple(signals), tuple(labels), names))
+    return families, places
+
+
+def _decode(
+    frames: FrameArray, rows: IntArray, member: IntArray, family: _Family, tally: FrameTally
+) -> list[DecodedSignals]:
+    """Decode the frames of one family; ``rows`` are their rows in all frames."""
+    data: NDArray[np.uint8] = frames["data"][rows]
+    size = np.minimum(frames["dlc"][rows], 8)
+    t_ns = frames["t_host_ns"][rows].astype(np.int64)
+    shortest = int(size.min())
+    carries = np.zeros(len(rows), dtype=np.bool_)
+    mentioned = np.zeros(len(rows), dtype=np.bool_)
+    samples: list[DecodedSignals] = []
+    for entry, signals, labels in zip(family.entries, family.signals, family.labels, strict=True):
+        unit = SESSION_UNIT[entry.quantity]
+        if not entry.conditions and shortest >= entry.size:  # nearly always
+            carries[:] = mentioned[:] = True
+            values = _values(entry, data)
+            samples.append(DecodedSignals(signals, unit, rows, member, t_ns, values))
+            continue
+        selected = _selected(data, size, entry)
+        whole = selected & (size >= entry.size)
+        mentioned |= selected
+        carries |= whole
+        short = selected & ~whole
+        tally.short.update(labels[k] for k in _numbers(member[short]))
+        if whole.any():
+            values = _values(entry, data[whole])
+            samples.append(
+                DecodedSignals(signals, unit, rows[whole], member[whole], t_ns[whole], values)
+            )
+    tally.decoded += int(carries.sum())
+    tally.silent.update(family.names[k] for k in _numbers(member[~mentioned]))
+    return samples
+
+
+def _numbers(member: IntArray) -> list[int]:
+    return member.tolist()
+
+
+def _values(entry: _Entry, data: NDArray[np.uint8]) -> FloatArray:
+    return entry.unit.convert(entry.scale * entry.bits.values(data) + entry.offset)
 
 
 def _selected(data: NDArray[np.uint8], size: NDArray[np.uint8], entry: _Entry) -> BoolArray:
@@ -293,9 +361,14 @@ def _selected(data: NDArray[np.uint8], size: NDArray[np.uint8], entry: _Entry) -
     selected = np.ones(len(data), dtype=np.bool_)
     for multiplexer, identifiers in entry.conditions:
         if multiplexer.size <= data.shape[1]:
-            fits = np.isin(multiplexer.raw(data).astype(np.uint64), identifiers)
+            chosen = np.array(identifiers, dtype=np.uint64)
+            fits = np.isin(multiplexer.raw(data).astype(np.uint64), chosen)
             selected &= fits | (size < multiplexer.size)
     return selected
+
+
+def _name(key: int) -> str:
+    return identifier_text(key & ~_TX_BIT)
 
 
 def _key(message: Message) -> int:
@@ -307,18 +380,20 @@ def _compile(message: Message, signal: BusSignal) -> _Entry:
     wanted = by_name[signal.signal]
     bits = BitField.of(wanted)
     size = bits.size
-    conditions: list[tuple[BitField, NDArray[np.uint64]]] = []
+    conditions: list[tuple[BitField, tuple[int, ...]]] = []
     while wanted.multiplexer_signal is not None:
-        identifiers = np.array(wanted.multiplexer_ids or [], dtype=np.uint64)
+        identifiers = tuple(wanted.multiplexer_ids or ())
         wanted = by_name[wanted.multiplexer_signal]
         multiplexer = BitField.of(wanted)
         conditions.append((multiplexer, identifiers))
         size = max(size, multiplexer.size)
     return _Entry(
-        signal=signal,
-        label=f"{signal.message}.{signal.signal}",
+        quantity=signal.quantity,
+        axis=signal.axis,
         bits=bits,
         unit=unit_for(signal.unit, signal.quantity),
+        scale=signal.scale,
+        offset=signal.offset,
         conditions=tuple(conditions),
         size=size,
     )

@@ -141,8 +141,8 @@ class _Import:
             report.notes.append("the log has no directions: all frames count as received")
 
     def _write(self, messages: list[Message]) -> None:
-        for message in sorted(messages, key=lambda message: message.log_ns):
-            message.write()
+        for message in sorted(messages, key=lambda message: message.sampled_ns):
+            message.write(message.sampled_ns)
             samples = self._report.samples
             samples[message.topic] = samples.get(message.topic, 0) + 1
 
@@ -165,8 +165,8 @@ class _Import:
         for batch in np.split(np.arange(len(frames)), ends):
             latest_ns = max(self._latest_ns.get(name, 0) + 1, int(t_ns[batch[-1]]))
             self._latest_ns[name] = latest_ns
-            yield Message(topic, latest_ns, _writing(channel, latest_ns, frames[batch]))
+            yield Message(topic, latest_ns, _writing(channel, frames[batch]))
 
 
-def _writing(channel: FrameChannel, log_ns: int, frames: FrameArray) -> Callable[[], None]:
-    return lambda: channel.write(log_ns, frames)
+def _writing(channel: FrameChannel, frames: FrameArray) -> Callable[[int], None]:
+    return lambda log_ns: channel.write(log_ns, frames)

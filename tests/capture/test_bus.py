@@ -24,6 +24,7 @@ from capture.log.frames import (
     empty_frames,
 )
 from capture.robot.description import parse_robot
+from capture.units import UNITS
 
 
 @pytest.fixture
@@ -163,13 +164,45 @@ def test_nested_multiplexing(muxed, seed):
             decoded = {"always": raw[7] * 0.5}
         for name, value in decoded.items():
             expected.setdefault(name, {})[row] = value
-    found = {sample.signal.signal: sample for sample in samples}
+    found = {sample.signals[0].signal: sample for sample in samples}
     assert set(found) == set(expected) - {"outer", "inner"}
     for name, sample in found.items():
         values = sample.values if name != "two" else (sample.values - 1) / 2
         assert dict(zip(sample.rows.tolist(), values.tolist(), strict=True)) == expected[name]
         assert sample.t_ns.tolist() == [row * 1000 + 7 for row in expected[name]]
     assert (tally.frames, tally.decoded, tally.problems()) == (200, 200, [])
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_frames_of_many_joints_and_sensors_at_once(seed):
+    robot = load_robot("snake25")
+    database = cantools.database.load_string(dict(robot.databases)["snake25.dbc"], "dbc")
+    way = {signal.message: signal.direction for signal in robot.bus.signals}
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(database.messages, 300)
+    frames = some_frames(300, [message.frame_id for message in chosen])
+    frames["dlc"] = [message.length for message in chosen]
+    frames["dir"] = [DIR_TX if way[message.name] == "tx" else DIR_RX for message in chosen]
+    frames["data"] = rng.integers(0, 256, (300, 8))
+    expected = {}
+    for row, (message, frame) in enumerate(zip(chosen, frames, strict=True)):
+        data = frame["data"][: message.length].tobytes()
+        values = message.decode(data, decode_choices=False)
+        for entry in robot.bus.signals:
+            if entry.message == message.name:
+                raw = values[entry.signal] * entry.scale + entry.offset
+                expected[row, entry] = raw * UNITS[entry.unit].factor
+    samples, tally = BusDecoder(robot).decode(frames)
+    found = {
+        (row, decoded.signals[k]): value
+        for decoded in samples
+        for row, k, value in zip(
+            decoded.rows.tolist(), decoded.member.tolist(), decoded.values.tolist(), strict=True
+        )
+    }
+    assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    assert (tally.decoded, tally.problems(), tally.notes()) == (300, [], [])
 
 
 def test_a_float_signal_of_a_database(muxed):
@@ -228,7 +261,9 @@ def test_the_direction_tells_a_request_from_its_reply():
     ]
     frames["dir"] = [DIR_TX, DIR_RX, DIR_TX, DIR_RX, DIR_RX]
     samples, tally = decoder.decode(frames)
-    found = {sample.signal.quantity: (sample.rows.tolist(), sample.values) for sample in samples}
+    found = {
+        sample.signals[0].quantity: (sample.rows.tolist(), sample.values) for sample in samples
+    }
     assert {quantity: rows for quantity, (rows, _) in found.items()} == {
         "command": [0],
         "position": [3],
