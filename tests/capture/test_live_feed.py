@@ -1,0 +1,510 @@
+"""The live feed against real sockets: bound late, full, gone, replaced."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.records import Attachment, Channel, Metadata, Schema
+
+from capture.daemon import live_feed
+from capture.daemon.live_feed import LiveFeed
+from capture.daemon.live_tap import LiveTap
+from capture.daemon.live_wire import (
+    MAX_DATAGRAM,
+    MAX_MESSAGE,
+    DatagramHead,
+    Kind,
+    LiveMessage,
+    pack_datagram,
+    pack_description,
+    pack_message,
+    read_head,
+    read_records,
+)
+from capture.errors import DataError
+
+EPOCH_NS = 1_735_689_600_000_000_000
+STEP_NS = 10_000_000
+SCHEMA = Schema(id=1, name="sensor_msgs/msg/JointState", encoding="ros2msg", data=b"float64 x")
+EVENTS = Schema(id=2, name="rcl_interfaces/msg/Log", encoding="ros2msg", data=b"string x")
+STATES = Channel(id=1, topic="/joint_states", message_encoding="cdr", metadata={}, schema_id=1)
+ROSOUT = Channel(id=2, topic="/rosout", message_encoding="cdr", metadata={}, schema_id=2)
+RAW = Channel(id=3, topic="/can/can0", message_encoding="cdr", metadata={}, schema_id=2)
+FACTS = Metadata(name="undulog", metadata={"session_id": "s"})
+ROBOT = Attachment(
+    name="robot.toml", media_type="application/toml", data=b"x" * 200_000, create_time=0, log_time=0
+)
+DEFINITIONS = [SCHEMA, EVENTS, STATES, ROSOUT, RAW, FACTS, ROBOT]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "live.sock"
+
+
+@pytest.fixture
+def listen(path):
+    """Binds the path, as a relay would; closed at the end."""
+    open_sockets = []
+
+    def bind():
+        path.unlink(missing_ok=True)
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        link.bind(str(path))
+        link.setblocking(False)
+        open_sockets.append(link)
+        return link
+
+    yield bind
+    for link in open_sockets:
+        link.close()
+
+
+@pytest.fixture
+def make(path):
+    """Makes feeds with all definitions; closed at the end."""
+    feeds = []
+
+    def make_feed(**options):
+        feed = LiveFeed(path, **options)
+        for record in DEFINITIONS:
+            feed.define(record)
+        feeds.append(feed)
+        return feed
+
+    yield make_feed
+    for feed in feeds:
+        feed.close()
+
+
+def received(link):
+    """What lies in the socket: heads, and records in order."""
+    heads, records = [], []
+    while True:
+        try:
+            data = link.recv(MAX_DATAGRAM)
+        except BlockingIOError:
+            return heads, records
+        heads.append(read_head(data))
+        records += read_records(data)
+
+
+def pump_until(feed, condition):
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        feed.pump()
+        time.sleep(0.002)
+
+
+def offer(feed, number, channel=1, payload=b"data", step_ns=STEP_NS):
+    t_ns = EPOCH_NS + number * step_ns
+    feed.offer(channel, t_ns, t_ns - 5, number, payload)
+
+
+def messages(records):
+    return [record for record in records if isinstance(record, LiveMessage)]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 2**16 - 1),
+            st.integers(0, 2**32 - 1),
+            st.integers(0, 2**64 - 1),
+            st.integers(0, 2**64 - 1),
+            st.integers(0, 2**64 - 1),
+            st.binary(max_size=300),
+        ),
+        max_size=20,
+    ),
+    st.integers(0, 2**64 - 1),
+)
+def test_datagram_comes_back_as_it_was(fields, dropped):
+    head = DatagramHead(Kind.MESSAGES, len(fields), 7, dropped)
+    data = pack_datagram(head, map(pack_message, fields))
+    assert read_head(data) == head
+    assert read_records(data) == [LiveMessage(*one) for one in fields]
+
+
+@pytest.mark.parametrize("record", DEFINITIONS)
+def test_definition_comes_back_as_it_was(record):
+    head = DatagramHead(Kind.DEFINITIONS, 0, 7, 0)
+    data = pack_datagram(head, [pack_description(record)])
+    assert read_records(data) == [record]
+
+
+@given(st.binary(max_size=200))
+def test_noise_is_refused_not_believed(noise):
+    with pytest.raises(DataError):
+        read_head(noise)
+
+
+@given(st.data())
+def test_any_cut_or_flipped_datagram_is_read_or_refused(data):
+    head = DatagramHead(Kind.DEFINITIONS, 0, 7, 0)
+    whole = pack_datagram(head, [pack_description(one) for one in DEFINITIONS[:4]])
+    at = data.draw(st.integers(24, len(whole) - 1))
+    if data.draw(st.booleans()):
+        damaged = whole[:at]
+    else:
+        damaged = whole[:at] + bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
+    with contextlib.suppress(DataError):
+        read_records(damaged)
+
+
+def test_nothing_is_kept_while_nobody_watches(make):
+    feed = make()
+    for number in range(10_000):
+        offer(feed, number)
+        feed.pump()
+    assert not feed.connected
+    assert feed.queued == 0
+    assert vars(feed.counts) == {
+        "sent": 0,
+        "dropped": 0,
+        "thinned": 0,
+        "too_big": 0,
+        "connections": 0,
+    }
+
+
+def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(make, listen):
+    feed = make()
+    for number in range(100):
+        offer(feed, number)
+        feed.pump()
+    link = listen()
+    pump_until(feed, lambda: feed.connected)
+    heads, records = received(link)
+    assert records == DEFINITIONS
+    assert {head.kind for head in heads} == {Kind.DEFINITIONS}
+    for number in range(100, 300):
+        offer(feed, number)
+    pump_until(feed, lambda: feed.queued == 0)
+    _, records = received(link)
+    assert [one.sequence for one in messages(records)] == list(range(100, 300))
+    assert messages(records)[0][2:4] == (EPOCH_NS + 100 * STEP_NS, EPOCH_NS + 100 * STEP_NS - 5)
+    assert feed.counts.sent == 200
+    assert feed.counts.dropped == 0
+
+
+def test_offered_time_is_this_machines_monotonic_clock(make, listen):
+    feed, link = make(), listen()
+    pump_until(feed, lambda: feed.connected)
+    before = time.monotonic_ns()
+    feed.pump()
+    offer(feed, 0)
+    pump_until(feed, lambda: feed.queued == 0)
+    (message,) = messages(received(link)[1])
+    assert before <= message.offered_ns <= time.monotonic_ns()
+
+
+def test_definitions_of_later_channels_come_before_their_messages(make, listen):
+    feed, link = make(), listen()
+    pump_until(feed, lambda: feed.connected)
+    received(link)
+    late = Channel(id=9, topic="/odom", message_encoding="cdr", metadata={}, schema_id=1)
+    feed.define(late)
+    offer(feed, 0, channel=9)
+    pump_until(feed, lambda: feed.queued == 0)
+    _, records = received(link)
+    assert records[0] == late
+    assert records[1].channel_id == 9
+
+
+def test_definitions_are_repeated(make, listen, monkeypatch):
+    monkeypatch.setattr(live_feed, "RENEW_NS", 20_000_000)
+    feed, link = make(), listen()
+    seen = []
+
+    def told_thrice():
+        seen.extend(received(link)[1])
+        return seen.count(STATES) >= 3
+
+    pump_until(feed, told_thrice)
+    assert feed.counts.connections == 1
+
+
+def test_raw_frames_are_not_sent_unless_asked_for(make, listen):
+    for raw, expected in ((False, []), (True, [3])):
+        link, feed = listen(), make(raw_frames=raw)
+        pump_until(feed, lambda feed=feed: feed.connected)
+        offer(feed, 0, channel=3)
+        feed.pump()
+        time.sleep(0.03)
+        pump_until(feed, lambda feed=feed: feed.queued == 0)
+        assert [one.channel_id for one in messages(received(link)[1])] == expected
+
+
+def test_samples_are_thinned_and_events_are_not(make, listen):
+    feed, link = make(max_rate_hz=100.0), listen()
+    pump_until(feed, lambda: feed.connected)
+    for number in range(1000):  # one second at 1 kHz
+        offer(feed, number, channel=1, step_ns=1_000_000)
+        offer(feed, number, channel=2, step_ns=1_000_000)
+    seen = []
+
+    def all_sent():
+        seen.extend(messages(received(link)[1]))
+        return feed.queued == 0
+
+    pump_until(feed, all_sent)
+    seen.extend(messages(received(link)[1]))
+    by_channel = {n: [m for m in seen if m.channel_id == n] for n in (1, 2)}
+    assert len(by_channel[2]) == 1000
+    assert 100 <= len(by_channel[1]) <= 102
+    assert feed.counts.thinned == 1000 - len(by_channel[1])
+
+
+def test_a_jittering_channel_at_the_highest_rate_is_not_thinned(make, listen):
+    feed = make(max_rate_hz=100.0)
+    listen()
+    pump_until(feed, lambda: feed.connected)
+    for number in range(1000):
+        jitter = 3_000_000 if number % 2 else -3_000_000
+        feed.offer(1, EPOCH_NS + number * STEP_NS + jitter, 0, number, b"")
+    assert feed.counts.thinned <= 1
+
+
+def test_a_message_beyond_a_datagram_is_left_out_and_counted(make, listen):
+    feed, link = make(), listen()
+    pump_until(feed, lambda: feed.connected)
+    received(link)
+    offer(feed, 0, payload=bytes(MAX_MESSAGE + 1))
+    offer(feed, 1, payload=bytes(MAX_MESSAGE))
+    offer(feed, 2)
+    pump_until(feed, lambda: feed.queued == 0)
+    assert [one.sequence for one in messages(received(link)[1])] == [1, 2]
+    assert feed.counts.too_big == 1
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    count=st.integers(1, 400),
+    max_messages=st.integers(1, 50),
+    sizes=st.lists(st.integers(0, 3000), min_size=1, max_size=10),
+)
+def test_what_is_dropped_is_always_the_oldest(tmp_path_factory, count, max_messages, sizes):
+    path = tmp_path_factory.mktemp("drop") / "s"
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    link.bind(str(path))
+    link.setblocking(False)
+    feed = LiveFeed(path, max_messages=max_messages, max_bytes=20_000)
+    try:
+        for record in DEFINITIONS:
+            feed.define(record)
+        pump_until(feed, lambda: feed.connected)
+        for number in range(count):
+            offer(feed, number, payload=bytes(sizes[number % len(sizes)]))
+        assert feed.queued <= max_messages
+        seen = []
+
+        def all_sent():
+            seen.extend(messages(received(link)[1]))
+            return feed.queued == 0
+
+        pump_until(feed, all_sent)
+        seen.extend(messages(received(link)[1]))
+    finally:
+        feed.close()
+        link.close()
+    numbers = [one.sequence for one in seen]
+    assert numbers == list(range(count - len(numbers), count))
+    assert len(numbers) + feed.counts.dropped == count
+    assert numbers
+
+
+def test_a_full_socket_drops_the_oldest_and_every_tick_completes(make, listen):
+    feed, link = make(max_messages=100), listen()
+    pump_until(feed, lambda: feed.connected)
+    received(link)
+    ticks = 0
+    for number in range(20_000):  # nobody reads
+        offer(feed, number, payload=bytes(500))
+        if number % 10 == 0:
+            feed.pump()
+            ticks += 1
+    assert ticks == 2000
+    assert feed.queued <= 100 + (32 << 10) // 500  # and one datagram
+    seen = []
+
+    def all_sent():
+        seen.extend(messages(received(link)[1]))
+        return feed.queued == 0
+
+    pump_until(feed, all_sent)
+    seen.extend(messages(received(link)[1]))
+    numbers = [one.sequence for one in seen]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] == 19_999
+    assert len(numbers) + feed.counts.dropped == 20_000
+    assert read_head(pack_datagram(feed._head(Kind.END, 0), ())).dropped == feed.counts.dropped
+
+
+def test_a_relay_that_is_replaced_is_found_and_told_everything(make, listen, monkeypatch):
+    monkeypatch.setattr(live_feed, "RENEW_NS", 50_000_000)
+    feed, first = make(), listen()
+    pump_until(feed, lambda: feed.connected)
+    second = listen()  # the first is still there, bound to nothing any more
+    seen = []
+
+    def told():
+        offer(feed, feed.counts.sent)
+        seen.extend(received(second)[1])
+        return ROBOT in seen and bool(messages(seen))
+
+    pump_until(feed, told)
+    first.close()
+
+
+def test_a_relay_that_goes_and_comes_again_is_found(make, listen, path, monkeypatch):
+    monkeypatch.setattr(live_feed, "RETRY_NS", 10_000_000)
+    feed, link = make(), listen()
+    pump_until(feed, lambda: feed.connected)
+    link.close()
+
+    def lost():
+        offer(feed, 0)
+        return not feed.connected
+
+    pump_until(feed, lost)
+    assert feed.queued == 0
+    link = listen()
+    pump_until(feed, lambda: feed.connected)
+    assert received(link)[1] == DEFINITIONS
+    assert feed.counts.connections == 2
+
+
+def test_the_end_is_told(make, listen):
+    feed, link = make(), listen()
+    pump_until(feed, lambda: feed.connected)
+    offer(feed, 0)
+    feed.close()
+    feed.close()
+    heads, records = received(link)
+    assert [one.sequence for one in messages(records)] == [0]
+    assert heads[-1].kind is Kind.END
+    offer(feed, 1)
+    feed.pump()
+    assert not feed.connected
+
+
+def test_closing_does_not_wait_for_a_relay_that_takes_nothing(make, listen):
+    feed = make()
+    listen()
+    pump_until(feed, lambda: feed.connected)
+    for number in range(3000):
+        offer(feed, number, payload=bytes(1000))
+        feed.pump()
+    feed.close()
+    assert not feed.connected
+
+
+_READER = """
+import socket, sys
+link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+link.bind(sys.argv[1])
+print("bound", flush=True)
+count = 0
+while True:
+    count += len(link.recv(65536)) > 0
+"""
+
+
+@pytest.fixture
+def reader(path):
+    """Starts a process that reads the socket; ended at the end."""
+    started = []
+
+    def start():
+        path.unlink(missing_ok=True)
+        process = subprocess.Popen([sys.executable, "-c", _READER, path], stdout=subprocess.PIPE)
+        started.append(process)
+        assert process.stdout.readline() == b"bound\n"
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_reader_frozen_killed_and_started_again_never_holds_a_tick(make, reader, monkeypatch):
+    monkeypatch.setattr(live_feed, "RETRY_NS", 10_000_000)
+    feed = make()
+    number = ticks = 0
+
+    def run(count, pause_s=0.0):
+        nonlocal number, ticks
+        for _ in range(count):
+            for _ in range(20):
+                offer(feed, number, payload=bytes(500))
+                number += 1
+            feed.pump()
+            ticks += 1
+            time.sleep(pause_s)
+
+    first = reader()
+    pump_until(feed, lambda: feed.connected)
+    run(50, 0.002)
+    sent = feed.counts.sent
+    assert sent > 0
+    os.kill(first.pid, signal.SIGSTOP)
+    run(2000)
+    frozen = feed.counts.sent
+    run(2000)
+    assert feed.counts.sent == frozen  # nothing more goes in
+    assert feed.counts.dropped > 0
+    os.kill(first.pid, signal.SIGCONT)
+    pump_until(feed, lambda: feed.queued == 0)
+    assert feed.counts.sent > frozen
+    first.kill()
+    first.wait()
+    run(2000)
+    assert not feed.connected
+    reader()
+    pump_until(feed, lambda: feed.connected)
+    run(50, 0.002)
+    pump_until(feed, lambda: feed.queued == 0)
+    assert feed.counts.connections == 2
+    assert ticks == 6100
+
+
+class Kept:
+    """Takes everything and remembers it."""
+
+    def __init__(self):
+        self.defined, self.written, self.closed = [], [], None
+
+    def define(self, record):
+        self.defined.append(record)
+
+    def write(self, *message):
+        self.written.append(message)
+
+    def close(self, last):
+        self.closed = last
+
+
+def test_tap_keeps_all_and_offers_all(make, listen):
+    feed, link, sink = make(), listen(), Kept()
+    tap = LiveTap(sink, feed)
+    tap.define(STATES)
+    pump_until(feed, lambda: feed.connected)
+    received(link)
+    tap.write(1, EPOCH_NS, EPOCH_NS, 4, b"payload")
+    pump_until(feed, lambda: feed.queued == 0)
+    tap.close((FACTS,))
+    assert sink.defined == [STATES]
+    assert sink.written == [(1, EPOCH_NS, EPOCH_NS, 4, b"payload")]
+    assert sink.closed == (FACTS,)
+    assert [one.payload for one in messages(received(link)[1])] == [b"payload"]
