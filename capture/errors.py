@@ -5,11 +5,14 @@
     UndulogError
     |- UsageError (ValueError)              wrong options or arguments; exit code 2
     |  |- MissingExtraError (ImportError)   a verb whose extra is not installed
-    |  `- OutputExistsError (FileExistsError)
+    |  |- OutputExistsError (FileExistsError)
+    |  `- SettingsError                    settings of a recording, all faults listed
     |- RobotFileError (ValueError)          a robot description with faults, all listed
     |- ScenarioError (ValueError)           a scenario file with faults, all listed
     |- SimulationError (ArithmeticError)    the twin blew up: time, link and likely cause
     |- DataError (ValueError)               samples unfit for what was asked
+    |- SourceError                          a source that can't be opened or used
+    |- ControlError                         a running recorder that can't be reached, or refuses
     `- LogError                             a log that cannot be read or written
        |- NotALogError                      not an MCAP file, or none of it readable
        |- MissingChannelError (KeyError)    the topic is not there; lists those that are
@@ -120,6 +123,22 @@ class ScenarioError(FaultyFileError):
     kind = "scenario"
 
 
+class SettingsError(UsageError):
+    """The settings of a recording have faults, wherever they come from."""
+
+    def __init__(self, faults: Iterable[Fault]) -> None:
+        """Build the message.
+
+        Args:
+            faults: All faults, at least one; their keys say where: ``--ring``,
+                ``UNDULOG_RECORD_RING`` or ``snake.toml: record.ring``.
+        """
+        self.faults: tuple[Fault, ...] = tuple(faults)
+        count = len(self.faults)
+        head = f"{count} fault{'s' if count != 1 else ''} in the settings of this recording"
+        super().__init__("\n".join([head, *(f"  {fault}" for fault in self.faults)]))
+
+
 class SimulationError(UndulogError, ArithmeticError):
     """The twin's state became impossible: says when, which link, and the likely cause."""
 
@@ -179,6 +198,10 @@ class SourceError(UndulogError):
         """
         self.source = source
         super().__init__(f"{source}: {message}")
+
+
+class ControlError(UndulogError):
+    """A running recorder can't be reached, or refuses what it was asked."""
 
 
 class ImportFormatError(LogError, ValueError):
