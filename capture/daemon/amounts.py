@@ -117,7 +117,7 @@ def format_size(size: int) -> str:
         E.g. ``12.3 MB``; decimal units.
     """
     for unit in ("TB", "GB", "MB", "kB"):
-        if size >= SIZE_UNITS[unit]:
+        if size >= 0.9995 * SIZE_UNITS[unit]:  # 999.6 kB would show as 1e+03 kB
             return f"{size / SIZE_UNITS[unit]:.3g} {unit}"
     return f"{size} B"
 
