@@ -54,14 +54,16 @@ def session_facts(scenario: Scenario) -> Mapping[str, str]:
 class SessionLog:
     """Writes one run into an open session."""
 
-    def __init__(self, writer: SessionWriter, twin: Twin) -> None:
+    def __init__(self, writer: SessionWriter, twin: Twin, *, epoch_ns: int | None = None) -> None:
         """Open the channels and store what explains the run.
 
         Args:
             writer: The session; the log does not close it.
             twin: What will be run.
+            epoch_ns: Unix time of the first sample [ns]; that of the scenario by default.
         """
         scenario = self._scenario = twin.scenario
+        self._epoch_ns = scenario.epoch_ns if epoch_ns is None else epoch_ns
         robot = scenario.robot
         names, head = robot.joint_names, robot.links[0].name
         description = urdf(robot)
@@ -89,7 +91,7 @@ class SessionLog:
         )
         self._last_mode = ""
         self._said: set[str] = set()
-        self._t_ns = scenario.epoch_ns
+        self._t_ns = self._epoch_ns
         writer.string("/robot_description").write(self._t_ns, description)
         for text in warnings(scenario):
             self.say("warn", text)
@@ -112,7 +114,7 @@ class SessionLog:
         Args:
             sample: The twin's sample.
         """
-        t_ns = self._t_ns = self._scenario.epoch_ns + sample.tick * _TICK_NS
+        t_ns = self._t_ns = self._epoch_ns + sample.tick * _TICK_NS
         body, drive = sample.step.body, sample.drive
         truth = np.array([body.angle, body.rate, drive.torque])
         reported = truth + self._noise * self._random.standard_normal(truth.shape)

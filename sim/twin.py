@@ -112,6 +112,10 @@ class Twin:
         trace: TracebackType | None,
     ) -> None:
         """Free the physics world."""
+        self.close()
+
+    def close(self) -> None:
+        """Free the physics world; the twin can't be run any more."""
         self._body.close()
 
     def samples(self) -> Iterator[Sample]:

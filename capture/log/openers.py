@@ -26,6 +26,10 @@ from .schemas import message_type
 class ChannelOpeners:
     """Opens channels, at any time; a subclass says where their messages go."""
 
+    def __init__(self) -> None:
+        """Start without channels."""
+        self._logs: dict[str, LogChannel] = {}
+
     def _sender(
         self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
     ) -> Send:
@@ -189,18 +193,20 @@ class ChannelOpeners:
         return StringChannel(self._sender(topic, "std_msgs/msg/String"))
 
     def log(self, topic: str = "/rosout") -> LogChannel:
-        """Open a Log channel for events and faults.
+        """Open a Log channel for events and faults; asked for again, it is the same one.
 
         Args:
             topic: E.g. ``/rosout``.
 
         Returns:
-            The channel.
+            The channel, shared by all that have events to tell.
 
         Raises:
-            DataError: If the topic is open already.
+            DataError: If the topic is open already with another type.
         """
-        return LogChannel(self._sender(topic, "rcl_interfaces/msg/Log"))
+        if topic not in self._logs:
+            self._logs[topic] = LogChannel(self._sender(topic, "rcl_interfaces/msg/Log"))
+        return self._logs[topic]
 
     def frames(self, topic: str) -> FrameChannel:
         """Open a channel of raw CAN frames, many frames a message.

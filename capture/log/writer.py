@@ -59,6 +59,7 @@ class SessionWriter(ChannelOpeners):
             OutputExistsError: If the file is there and ``force`` is not given.
             LogWriteError: If it can't be created or written.
         """
+        super().__init__()
         self.path = Path(path)
         self._epoch_ns = epoch_ns
         self._open = True

@@ -1,0 +1,127 @@
+"""One bus of a recording: its raw frames at once, and what they mean a little later.
+
+A raw frame is safe as soon as it is written; decoding can wait, since it can be done again from
+the raw frames at any time. So a burst fills the queue of frames to decode and delays nothing else.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from ..bus.decoded_topics import DecodedTopics, Message
+from ..bus.decoding import BusDecoder, FrameTally
+from ..log.frames import FrameArray
+from ..log.writer import SessionWriter
+from ..robot import Robot
+from .source_clock import SourceClock
+
+FRAME_TOPIC_PREFIX = "/can/"
+"""Raw frames of source ``can0`` are on ``/can/can0``."""
+
+_FRAMES_PER_MESSAGE = 8192
+_FRAMES_PER_SLICE = 4096
+
+
+class BusRecorder:
+    """Writes the frames of one source."""
+
+    def __init__(
+        self, name: str, writer: SessionWriter, clock: SourceClock, robot: Robot | None
+    ) -> None:
+        """Open the bus.
+
+        Args:
+            name: Name of the source.
+            writer: The session.
+            clock: Maps the device's times onto the session's clock.
+            robot: Whose bus this is: its frames are decoded. None: they are only kept.
+
+        Raises:
+            DataError: If the robot has no bus map.
+        """
+        self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
+        self._clock = clock
+        self._decoder = BusDecoder(robot) if robot is not None else None
+        self._topics = (
+            DecodedTopics(writer, robot, self._decoder)
+            if robot is not None and self._decoder is not None
+            else None
+        )
+        self._fresh: list[FrameArray] = []
+        self._waiting: deque[FrameArray] = deque()
+        self.tally = FrameTally()
+        self.backlog = 0
+
+    def add(self, frames: FrameArray) -> None:
+        """Take frames; they are not written yet.
+
+        Args:
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+        """
+        self._fresh.append(frames)
+
+    def write_raw(self, now_ns: Callable[[], int]) -> None:
+        """Write the frames taken since the last call.
+
+        Args:
+            now_ns: The session's clock.
+
+        Raises:
+            LogWriteError: If they can't be written.
+        """
+        if not self._fresh:
+            return
+        fresh, self._fresh = self._fresh, []
+        frames = fresh[0] if len(fresh) == 1 else np.concatenate(fresh)
+        for start in range(0, len(frames), _FRAMES_PER_MESSAGE):
+            batch = frames[start : start + _FRAMES_PER_MESSAGE]
+            self._raw.write(now_ns(), batch)
+            self._waiting.append(batch)
+            self.backlog += len(batch)
+
+    def decode(self, now_ns: Callable[[], int], until_ns: int) -> None:
+        """Decode what waits, slice by slice.
+
+        Args:
+            now_ns: The session's clock.
+            until_ns: No slice is begun after this time [Unix ns].
+
+        Raises:
+            LogWriteError: If the messages can't be written.
+        """
+        while self._waiting and now_ns() < until_ns:
+            slices = [self._waiting.popleft()]
+            count = len(slices[0])
+            while self._waiting and count + len(self._waiting[0]) <= _FRAMES_PER_SLICE:
+                slices.append(self._waiting.popleft())
+                count += len(slices[-1])
+            self.backlog -= count
+            frames = np.concatenate(slices)
+            frames["t_host_ns"] = self._clock.add(frames["t_device_ns"], frames["t_host_ns"])
+            if self._decoder is not None and self._topics is not None:
+                samples, tally = self._decoder.decode(frames)
+                self.tally.add(tally)
+                self._write(self._topics.add(samples), now_ns)
+
+    def finish(self, now_ns: Callable[[], int]) -> None:
+        """Write everything that is left.
+
+        Args:
+            now_ns: The session's clock.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        self.write_raw(now_ns)
+        self.decode(now_ns, 1 << 63)
+        if self._topics is not None:
+            self._write(self._topics.finish(), now_ns)
+
+    @staticmethod
+    def _write(messages: list[Message], now_ns: Callable[[], int]) -> None:
+        messages.sort(key=lambda message: message.sampled_ns)
+        for message in messages:
+            message.write(now_ns())
