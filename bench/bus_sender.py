@@ -17,6 +17,7 @@ import socket
 import struct
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,7 @@ class UnixPeer:
     """Packets of up to 256 records, each with the running number of its first frame."""
 
     def __init__(self, path: str) -> None:
+        """Connect to a recorder that may still be starting."""
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         deadline = time.monotonic() + 60
         while True:
@@ -80,6 +82,7 @@ class UnixPeer:
         self.refused = 0
 
     def send(self, frames: np.ndarray, first: int) -> int:
+        """Offer frames; returns how many were taken."""
         sent = 0
         for start in range(0, len(frames), PER_PACKET):
             part = frames[start : start + PER_PACKET]
@@ -93,6 +96,7 @@ class UnixPeer:
         return sent
 
     def close(self) -> None:
+        """Hang up."""
         self.socket.close()
 
 
@@ -100,6 +104,7 @@ class SocketcandPeer:
     """The server's end of the socketcand protocol in raw mode."""
 
     def __init__(self, port: int) -> None:
+        """Serve one client; the first line of the output says on which port."""
         server = socket.create_server(("127.0.0.1", port))
         print(json.dumps({"port": server.getsockname()[1]}), flush=True)
         server.settimeout(60)
@@ -123,6 +128,7 @@ class SocketcandPeer:
         self.refused = 0
 
     def send(self, frames: np.ndarray, first: int) -> int:
+        """Offer frames; returns how many were taken, the ones in our own buffer included."""
         del first
         if self.rest and not self._push():
             self.refused += len(frames)
@@ -143,13 +149,12 @@ class SocketcandPeer:
         return len(frames)  # what is begun will be finished: a partial frame breaks the stream
 
     def _push(self) -> bool:
-        try:
+        with suppress(BlockingIOError):
             self.rest = self.rest[self.socket.send(self.rest) :]
-        except BlockingIOError:
-            pass
         return not self.rest
 
     def close(self) -> None:
+        """Hang up when the client has read everything; counts what it didn't."""
         deadline = time.monotonic() + 5
         while self.rest and time.monotonic() < deadline:
             select.select([], [self.socket], [], 0.1)
@@ -162,6 +167,7 @@ class SocketcandPeer:
 
 
 def main() -> None:
+    """Send, and say what was sent."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kind", choices=["unix", "socketcand"])
     parser.add_argument("where")

@@ -40,6 +40,7 @@ class TwinSource:
         """
         self.name = address.name
         self.clock = ClockDomain.SIMULATED
+        self.directions = False
         self.robot: Robot | None = scenario.robot
         self.counts = SourceCounts()
         self._address = address

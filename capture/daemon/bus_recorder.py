@@ -29,7 +29,13 @@ class BusRecorder:
     """Writes the frames of one source."""
 
     def __init__(
-        self, name: str, writer: SessionWriter, clock: SourceClock, robot: Robot | None
+        self,
+        name: str,
+        writer: SessionWriter,
+        clock: SourceClock,
+        robot: Robot | None,
+        *,
+        directions: bool,
     ) -> None:
         """Open the bus.
 
@@ -38,13 +44,14 @@ class BusRecorder:
             writer: The session.
             clock: Maps the device's times onto the session's clock.
             robot: Whose bus this is: its frames are decoded. None: they are only kept.
+            directions: Whether the frames tell sent from received.
 
         Raises:
             DataError: If the robot has no bus map.
         """
         self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
         self._clock = clock
-        self._decoder = BusDecoder(robot) if robot is not None else None
+        self._decoder = BusDecoder(robot, directions=directions) if robot is not None else None
         self._topics = (
             DecodedTopics(writer, robot, self._decoder)
             if robot is not None and self._decoder is not None

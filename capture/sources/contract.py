@@ -127,6 +127,14 @@ class Source(Protocol):
         ...
 
     @property
+    def directions(self) -> bool:
+        """Whether its frames tell those that the robot's computer sent from those it received.
+
+        A node that only listens can't tell: to it, all frames are received.
+        """
+        ...
+
+    @property
     def facts(self) -> Mapping[str, str]:
         """What the session's metadata should say of it, e.g. the bitrate; no secrets."""
         ...
