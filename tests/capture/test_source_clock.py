@@ -1,0 +1,311 @@
+"""The mapping of device clocks against clocks and delays that were made, so the truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture.arrays import IntArray
+from capture.daemon.envelope import Envelope
+from capture.daemon.source_clock import ClockEstimate, SourceClock
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NS = 1_000_000_000
+TICK_NS = 5_000_000
+
+
+@dataclass(frozen=True)
+class Made:
+    """Samples whose true times are known, all in ns, shape (n,)."""
+
+    true: IntArray
+    device: IntArray
+    host: IntArray
+
+    @property
+    def after_s(self) -> IntArray:
+        return (self.true - EPOCH_NS) / NS
+
+
+def make(
+    *,
+    rate_hz: float = 500.0,
+    duration_s: float = 60.0,
+    drift_ppm: float = 0.0,
+    mean_s: float = 0.002,
+    least_s: float = 0.0003,
+    polled: bool = True,
+    seed: int = 0,
+) -> Made:
+    """A quartz that is off by ``drift_ppm``, exponential delays in order, seen every 5 ms."""
+    rng = np.random.default_rng(seed)
+    count = int(rate_hz * duration_s)
+    true = EPOCH_NS + (np.arange(count) / rate_hz * NS).astype(np.int64)
+    true += rng.integers(0, int(0.02 * NS / rate_hz), count)
+    device = 12_345 + np.rint((true - EPOCH_NS) * (1 + drift_ppm * 1e-6)).astype(np.int64)
+    delay = least_s * NS + rng.exponential(mean_s * NS, count)
+    host = np.maximum.accumulate(true + delay.astype(np.int64))
+    if polled:  # a tick is never quite on time
+        tick = -(-host // TICK_NS)
+        late = rng.integers(0, 200_000, int(tick[-1] - tick[0]) + 1)
+        host = tick * TICK_NS + late[tick - tick[0]]
+    return Made(true, device, host)
+
+
+def batches(made: Made) -> list[tuple[IntArray, IntArray]]:
+    cuts = np.flatnonzero(np.diff(made.host // TICK_NS)) + 1
+    return list(zip(np.split(made.device, cuts), np.split(made.host, cuts), strict=True))
+
+
+def mapped(clock: SourceClock, made: Made) -> IntArray:
+    return np.concatenate([clock.add(device, host) for device, host in batches(made)])
+
+
+def holds(t_ns: IntArray, host: IntArray) -> None:
+    assert (np.diff(t_ns) >= 0).all()
+    assert (t_ns <= host).all()
+
+
+# -- convergence -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drift_ppm", [-100.0, -20.0, 0.0, 100.0])
+@pytest.mark.parametrize("rate_hz", [100.0, 1000.0])
+def test_after_half_a_minute_only_the_least_delay_is_left(drift_ppm: float, rate_hz: float) -> None:
+    made = make(drift_ppm=drift_ppm, rate_hz=rate_hz, polled=False)
+    clock = SourceClock()
+    t_ns = mapped(clock, made)
+    holds(t_ns, made.host)
+    late_s = (t_ns - made.true)[made.after_s > 30] / NS
+    assert late_s.min() > 0.0003 - 50e-6
+    assert late_s.max() < 0.0003 + 50e-6
+    found = clock.result()
+    assert found.drift_ppm == pytest.approx(drift_ppm, abs=1.0)
+    assert abs(found.drift_ppm - drift_ppm) < 4 * found.drift_uncertainty_ppm + 0.05
+    # Exponential delays: the standard deviation is their mean, 1 % are over ln(100) means. In
+    # order, so frames behind a late one are late with it, which at 100 Hz hardly ever happens.
+    if rate_hz == 100.0:
+        assert found.jitter_s == pytest.approx(0.002, rel=0.1)
+        assert found.delay_p99_s == pytest.approx(0.002 * np.log(100), rel=0.15)
+    assert (found.own_clock, found.samples, found.resets) == (True, len(made.true), 0)
+
+
+@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 100.0])
+def test_polling_costs_no_more_than_the_newest_frame_waits(drift_ppm: float) -> None:
+    made = make(drift_ppm=drift_ppm, rate_hz=1000.0)
+    clock = SourceClock()
+    t_ns = mapped(clock, made)
+    holds(t_ns, made.host)
+    late_s = (t_ns - made.true)[made.after_s > 30] / NS
+    assert late_s.max() < 0.0003 + 0.001  # frames come every ms, one is just before the tick
+    assert late_s.min() > 0.0
+    assert late_s.max() - late_s.min() < 100e-6  # what is left is the same for all
+    assert clock.result().drift_ppm == pytest.approx(drift_ppm, abs=1.0)
+
+
+def test_a_line_of_least_squares_would_be_late_by_the_mean_delay() -> None:
+    """The reason for an envelope: the same points, the textbook's line."""
+    made = make(drift_ppm=50.0, polled=False)
+    x = (made.device - made.device[0]).astype(float)
+    y = (made.host - made.device - EPOCH_NS).astype(float)
+    line = np.polynomial.Polynomial.fit(x, y, 1)
+    fitted_s = np.median(made.device + EPOCH_NS + line(x) - made.true) / NS
+    ours_s = np.median(mapped(SourceClock(), made) - made.true) / NS
+    assert fitted_s > 0.0023
+    assert ours_s < 0.0004
+
+
+def test_the_intervals_are_the_device_s_and_no_stamp_is_repeated() -> None:
+    made = make(drift_ppm=30.0, rate_hz=1000.0)
+    t_ns = mapped(SourceClock(), made)
+    steps = np.diff(t_ns)
+    settled = made.after_s[1:] > 10
+    assert (steps > 0).all()
+    assert np.abs(steps - np.diff(made.true))[settled].max() < 50_000
+    assert np.diff(made.host).std() > 20 * (steps - np.diff(made.true))[settled].std()
+
+
+def test_an_hour_of_a_quartz_in_the_sun_is_followed() -> None:
+    """The rate wanders by 20 ppm within the hour; memory holds one minute of it."""
+    rng = np.random.default_rng(5)
+    true = EPOCH_NS + np.arange(36_000) * 100_000_000
+    t_s = (true - EPOCH_NS) / NS
+    wandered_s = 20e-6 * 3600 / (2 * np.pi) * np.sin(2 * np.pi * t_s / 3600)
+    device = np.rint(t_s * NS + wandered_s * NS).astype(np.int64)
+    host = true + 500_000 + rng.exponential(1e6, len(true)).astype(np.int64)
+    made = Made(true, device, np.maximum.accumulate(host))
+    clock = SourceClock()
+    t_ns = mapped(clock, made)
+    holds(t_ns, made.host)
+    late_s = (t_ns - true)[t_s > 30] / NS
+    assert late_s.min() > 0.0002
+    assert late_s.max() < 0.0009
+    assert clock.result().resets == 0
+
+
+# -- clocks that are none, and clocks that are set ---------------------------------------------
+
+
+def test_a_source_without_a_clock_keeps_the_host_s_times() -> None:
+    made = make(duration_s=2.0)
+    clock = SourceClock()
+    t_ns = np.concatenate([clock.add(host, host) for _, host in batches(made)])
+    assert np.array_equal(t_ns, made.host)
+    assert clock.result() == ClockEstimate(False, None, None, None, 0.0, 0.0, len(t_ns), 0)
+    assert clock.pair() == (made.host[-1], made.host[-1])
+
+
+def test_samples_without_a_device_time_among_others_are_stamped_by_their_arrival() -> None:
+    made = make(duration_s=20.0, drift_ppm=40.0)
+    echoed = np.arange(len(made.true)) % 7 == 3
+    device = np.where(echoed, made.host, made.device)
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(made.true, device, made.host))
+    holds(t_ns, made.host)
+    assert np.array_equal(t_ns[echoed], made.host[echoed])
+    assert clock.result().drift_ppm == pytest.approx(40.0, abs=5.0)
+
+
+@pytest.mark.parametrize("first", ["restarts at zero", "is set an hour ahead", "is set back"])
+def test_a_clock_that_is_set_is_measured_anew(first: str) -> None:
+    made = make(duration_s=80.0, drift_ppm=80.0)
+    change = {"restarts at zero": 0, "is set an hour ahead": 3600 * NS, "is set back": -2 * NS}
+    device = made.device.copy()
+    after = made.after_s >= 40
+    shift = change[first] or -int(device[after][0])
+    device[after] += shift
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(made.true, device, made.host))
+    holds(t_ns, made.host)
+    late_s = (t_ns - made.true) / NS
+    settled = (made.after_s > 30) & ((made.after_s < 40) | (made.after_s > 70))
+    assert late_s[settled].max() < 0.0025
+    assert late_s.max() < 0.02  # also just after the change: the arrival bounds it
+    found = clock.result()
+    assert found.resets == 1
+    assert found.drift_ppm == pytest.approx(80.0, abs=1.0)
+    (event,) = clock.take_events()
+    assert ("jumped ahead by" if shift > 0 else "went back by") in event
+    assert float(event.split("by ")[1].split(" s")[0]) == pytest.approx(abs(shift) / NS, abs=0.1)
+    assert clock.take_events() == []
+
+
+def test_a_backlog_at_the_start_is_no_reset_and_does_not_stay() -> None:
+    made = make(duration_s=20.0)
+    host = np.maximum(made.host, EPOCH_NS + 500_000_000)
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(made.true, made.device, host))
+    holds(t_ns, host)
+    assert clock.result().resets == 0
+    assert ((t_ns - made.true) / NS)[made.after_s > 3].max() < 0.003
+
+
+def test_a_stalled_host_does_not_move_the_line() -> None:
+    made = make(duration_s=60.0, drift_ppm=10.0)
+    stalled = (made.after_s > 30) & (made.after_s < 33)
+    host = np.where(stalled, np.maximum(made.host, EPOCH_NS + 33 * NS), made.host)
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(made.true, made.device, np.maximum.accumulate(host)))
+    late_s = ((t_ns - made.true) / NS)[made.after_s > 29]
+    assert late_s.max() < 0.0025
+    assert clock.result().resets == 0
+
+
+@pytest.mark.parametrize("step_ms", [-20, 20])
+def test_a_small_step_of_the_least_delay_is_followed_within_seconds(step_ms: int) -> None:
+    made = make(duration_s=90.0, polled=False)
+    host = made.host + np.where(made.after_s > 45, step_ms * 1_000_000, 0) + 30_000_000
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(made.true, made.device, np.maximum.accumulate(host)))
+    holds(t_ns, np.maximum.accumulate(host))
+    late_s = (t_ns - made.true) / NS
+    assert np.median(late_s[made.after_s < 45]) == pytest.approx(0.0303, abs=2e-4)
+    assert late_s[made.after_s > 55] == pytest.approx(0.0303 + step_ms / 1000, abs=3e-4)
+    assert clock.result().resets == 0
+
+
+# -- properties --------------------------------------------------------------------------------
+
+stamps = st.integers(-(2**60), 2**60)
+pairs = st.lists(st.tuples(stamps, st.integers(0, 10**10)), min_size=1, max_size=60)
+
+
+@given(pairs, st.lists(st.integers(0, 60), max_size=5))
+@settings(max_examples=300, deadline=None)
+def test_whatever_a_device_says_times_stay_in_order_and_before_their_arrival(
+    made: list[tuple[int, int]], cuts: list[int]
+) -> None:
+    device = np.array([t for t, _ in made])
+    host = EPOCH_NS + np.cumsum([step for _, step in made])
+    clock = SourceClock()
+    parts = zip(np.split(device, sorted(cuts)), np.split(host, sorted(cuts)), strict=True)
+    t_ns = np.concatenate([clock.add(one, other) for one, other in parts])
+    holds(t_ns, host)
+    assert clock.result().samples == len(made)
+
+
+@given(
+    st.floats(-150, 150),
+    st.floats(1e-4, 5e-3),
+    st.floats(0, 2e-3),
+    st.integers(0, 2**62),
+    st.integers(0, 99),
+)
+@settings(max_examples=15, deadline=None)
+def test_any_quartz_and_any_load_converge(
+    drift_ppm: float, mean_s: float, least_s: float, device_zero: int, seed: int
+) -> None:
+    made = make(
+        rate_hz=200.0,
+        duration_s=40.0,
+        drift_ppm=drift_ppm,
+        mean_s=mean_s,
+        least_s=least_s,
+        polled=False,
+        seed=seed,
+    )
+    t_ns = mapped(SourceClock(), Made(made.true, made.device + device_zero, made.host))
+    holds(t_ns, made.host)
+    late_s = (t_ns - made.true)[made.after_s > 30] / NS
+    assert np.abs(late_s - least_s).max() < 0.1 * mean_s + 5e-6
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**8)), min_size=4, max_size=40))
+@settings(deadline=None)
+def test_the_line_lies_under_all_points_and_nearest(points: list[tuple[int, int]]) -> None:
+    """Against linear programming on the same points (Moon, Skelly, Towsley 1999)."""
+    from scipy.optimize import linprog
+
+    x = np.cumsum([step + 1 for step, _ in points]) + 0.0
+    y = 1e-4 * np.array([height for _, height in points])
+    envelope = Envelope(sigma=1e9)  # nothing is expected of the rate
+    for one, other in zip(x, y, strict=True):
+        envelope.take(float(one), float(other))
+        envelope.close_bucket()
+    line = envelope.line
+    heights = y - line.offset_ns - line.rate * x
+    assert heights.min() > -1e-6
+    scale = x.max()
+    best = linprog(
+        [-len(x), -float((x / scale).sum())],
+        A_ub=np.column_stack([np.ones(len(x)), x / scale]),
+        b_ub=y,
+        bounds=[(None, None), (None, None)],
+    )
+    assert best.status == 0
+    if abs(best.x[1] / scale) < 0.02:  # rates further off are no clock's
+        assert heights.sum() == pytest.approx(y.sum() + best.fun, abs=1e-3 * (1 + y.max()))
+
+
+def test_metadata_is_text_and_leaves_out_what_is_unknown() -> None:
+    clock = SourceClock()
+    clock.add(np.array([100, 200]), np.array([EPOCH_NS, EPOCH_NS + 100]))
+    facts = clock.result().as_metadata("can0")
+    assert facts["can0.offset_ns"] == str(EPOCH_NS - 100)
+    assert facts["can0.samples"] == "2"
+    assert "can0.drift_ppm" not in facts
+    assert clock.pair() == (200, EPOCH_NS + 100)
