@@ -18,7 +18,8 @@ def build_blueprint(content: Content) -> rrb.Blueprint:
         content: What it holds.
 
     Returns:
-        The blueprint, with the viewer's own panels folded away; it opens playing.
+        The blueprint, with the viewer's own panels folded away; it opens playing, or
+        following the end of what still grows.
     """
     views = build_views(content)
     # A mode that never changes isn't worth a lane of its own.
@@ -45,11 +46,17 @@ def build_blueprint(content: Content) -> rrb.Blueprint:
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed", timeline=SESSION_TIME, play_state="playing", loop_mode="all"
-        ),
+        _time_panel(live=content.live),
         auto_views=False,
         auto_layout=False,
+    )
+
+
+def _time_panel(*, live: bool) -> rrb.TimePanel:
+    if live:
+        return rrb.TimePanel(state="collapsed", timeline=SESSION_TIME, play_state="following")
+    return rrb.TimePanel(
+        state="collapsed", timeline=SESSION_TIME, play_state="playing", loop_mode="all"
     )
 
 

@@ -110,20 +110,23 @@ def capsule_columns(
     ).partition(np.count_nonzero(known, axis=1))
 
 
-def log_body(rec: rr.RecordingStream, clock: Clock, motion: Motion) -> float | None:
+def log_body(
+    rec: rr.RecordingStream, clock: Clock, motion: Motion, *, limit_w: float | None = None
+) -> float | None:
     """Draw the measured body, coloured by power per segment.
 
     Args:
         rec: The recording.
         clock: Its timelines.
         motion: What moved.
+        limit_w: Power at which a segment's colour is full [W]; None takes it from the motion.
 
     Returns:
         Power at which a segment's colour is full [W], or None where no power is known and the
         links wear the colours of their place along the body.
     """
     power = None if motion.power_w is None else segment_power(motion.power_w)
-    limit = None if power is None else power_limit(power)
+    limit = None if power is None else limit_w or power_limit(power)
     rec.log(MEASURED, rr.Capsules3D.from_fields(fill_mode=FillMode.Solid), static=True)
     for rows, times in clock.rows(motion.t_ns):
         if power is None or limit is None:

@@ -57,6 +57,7 @@ class Content:
         modes: How often a gait mode began; 0 where none was logged.
         has_events: Whether events were written.
         signals: Further quantities of the joints.
+        live: Whether it still grows: the views follow its end.
     """
 
     robot: Robot | None
@@ -72,3 +73,4 @@ class Content:
     modes: int
     has_events: bool
     signals: tuple[Signal, ...]
+    live: bool = False

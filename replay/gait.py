@@ -78,11 +78,22 @@ def log_mode(rec: rr.RecordingStream, clock: Clock, session: Session, warnings: 
     """
     messages = [(t_ns, str(message.data)) for t_ns, message in _read(session, MODE, warnings)]
     turns = changes([state for _, state in messages])
-    t_ns = np.array([messages[i][0] for i in turns], dtype=np.int64)
-    states = [messages[i][1] for i in turns]
-    for rows, times in clock.rows(t_ns):
-        rec.send_columns(MODE, times, rr.StateChange.columns(state=states[rows]))
+    log_states(rec, clock, [messages[i] for i in turns])
     return len(turns)
+
+
+def log_states(rec: rr.RecordingStream, clock: Clock, states: Sequence[tuple[int, str]]) -> None:
+    """Write states, each lasting until the next one.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        states: When each began [ns], and its name.
+    """
+    t_ns = np.array([time for time, _ in states], dtype=np.int64)
+    names = [name for _, name in states]
+    for rows, times in clock.rows(t_ns):
+        rec.send_columns(MODE, times, rr.StateChange.columns(state=names[rows]))
 
 
 def log_events(
@@ -100,13 +111,24 @@ def log_events(
         Whether there was any.
     """
     events = _read(session, "/rosout", warnings)
+    log_lines(rec, clock, events)
+    return bool(events)
+
+
+def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int, Any]]) -> None:
+    """Write events as lines of text.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        events: When each happened [ns], and its ``rcl_interfaces/msg/Log``.
+    """
     t_ns = np.array([time for time, _ in events], dtype=np.int64)
     texts = [f"{event.name}: {event.msg}" if event.name else event.msg for _, event in events]
     levels = [_LEVELS.get(int(event.level), rr.TextLogLevel.INFO) for _, event in events]
     for rows, times in clock.rows(t_ns):
         columns = rr.TextLog.columns(text=texts[rows], level=levels[rows])
         rec.send_columns(EVENTS, times, columns)
-    return bool(events)
 
 
 def _read(session: Session, topic: str, warnings: list[str]) -> list[tuple[int, Any]]:

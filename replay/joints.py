@@ -153,7 +153,7 @@ def log_angles(
         What was written; one series where all joints share their times.
     """
     return tuple(
-        _log_table(rec, clock, path, table, palette, degrees=True)
+        log_table(rec, clock, path, table, palette, degrees=True)
         for path, table in _placed(entity, tables(tracks))
     )
 
@@ -178,7 +178,7 @@ def log_scalars(
         What was written.
     """
     return tuple(
-        _log_table(rec, clock, path, table, palette, degrees=False)
+        log_table(rec, clock, path, table, palette, degrees=False)
         for path, table in _placed(entity, tables(tracks))
     )
 
@@ -226,10 +226,23 @@ def log_places(
 def _placed(entity: str, parts: Sequence[Table]) -> list[tuple[str, Table]]:
     if len(parts) == 1:
         return [(entity, parts[0])]
-    return [(f"{entity}/{rr.escape_entity_path_part(part.names[0])}", part) for part in parts]
+    return [(part_entity(entity, part.names[0]), part) for part in parts]
 
 
-def _log_table(
+def part_entity(entity: str, first: str) -> str:
+    """Where joints go that were sampled at times of their own.
+
+    Args:
+        entity: E.g. ``/joints/measured``.
+        first: The first joint of those sampled together.
+
+    Returns:
+        The path of their entity.
+    """
+    return f"{entity}/{rr.escape_entity_path_part(first)}"
+
+
+def log_table(
     rec: rr.RecordingStream,
     clock: Clock,
     entity: str,
@@ -238,6 +251,19 @@ def _log_table(
     *,
     degrees: bool,
 ) -> Series:
+    """Write joints that were sampled together.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        entity: Where to.
+        table: Their values.
+        palette: Colour by joint name; None for grey.
+        degrees: Whether the values are angles [rad], to be plotted in degrees.
+
+    Returns:
+        What was written.
+    """
     colors = [GREY if palette is None else palette.get(name, GREY) for name in table.names]
     rec.log(entity, rr.SeriesLines(names=list(table.names), colors=colors), static=True)
     t_ns, values = mark_gaps(table.t_ns, table.values)

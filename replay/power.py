@@ -15,8 +15,7 @@ MECHANICAL = "/power/mechanical"
 TOTAL = "/power/total"
 
 # Vermilion as on the body; violet is on no other map and reads on black and on white.
-_MECHANICAL = (255, 84, 48, 255)
-_ELECTRICAL = (150, 124, 230, 255)
+_COLORS = {"mechanical": (255, 84, 48, 255), "electrical": (150, 124, 230, 255)}
 
 
 def mechanical_power(columns: Columns) -> tuple[Track, ...]:
@@ -105,17 +104,24 @@ def log_total(
     Returns:
         Whether there was any.
     """
-    kinds: list[tuple[str, Sequence[Track], tuple[int, int, int, int]]] = [
-        ("electrical", electrical, _ELECTRICAL),
-        ("mechanical", mechanical, _MECHANICAL),
-    ]
-    for kind, tracks, color in kinds:
+    for kind, tracks in (("electrical", electrical), ("mechanical", mechanical)):
         whole = total(tracks)
-        if whole is None:
-            continue
-        entity = f"{TOTAL}/{kind}"
-        rec.log(entity, rr.SeriesLines(names=kind, colors=color, widths=1.5), static=True)
-        t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
-        for rows, times in clock.rows(t_ns):
-            rec.send_columns(entity, times, rr.Scalars.columns(scalars=values[rows, 0]))
+        if whole is not None:
+            log_sum(rec, clock, kind, whole)
     return bool(mechanical or electrical)
+
+
+def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> None:
+    """Write one kind of the body's power.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        kind: ``mechanical`` or ``electrical``.
+        whole: The body's power [W].
+    """
+    entity = f"{TOTAL}/{kind}"
+    rec.log(entity, rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5), static=True)
+    t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
+    for rows, times in clock.rows(t_ns):
+        rec.send_columns(entity, times, rr.Scalars.columns(scalars=values[rows, 0]))

@@ -76,16 +76,49 @@ def log_ranges(rec: rr.RecordingStream, clock: Clock, session: Session, motion: 
         motion: What moved.
     """
     sensors = tuple(
-        sensor
-        for sensor in motion.robot.sensors
-        if sensor.kind in (SensorKind.IR, SensorKind.SONAR)
-        and sensor_topic(sensor) in session.channels
+        sensor for sensor in range_sensors(motion.robot) if sensor_topic(sensor) in session.channels
     )
     if not sensors:
         return
     chosen = decimate(motion.t_ns, RANGES_RATE_HZ)
     t_ns = motion.t_ns[chosen]
     reading = np.stack([_readings(session, sensor, t_ns) for sensor in sensors], axis=1)
+    log_rays(rec, clock, motion, chosen, sensors=sensors, reading=reading)
+
+
+def range_sensors(robot: Robot) -> tuple[Sensor, ...]:
+    """The robot's distance sensors.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Infrared and ultrasound, in the robot's order.
+    """
+    kinds = (SensorKind.IR, SensorKind.SONAR)
+    return tuple(sensor for sensor in robot.sensors if sensor.kind in kinds)
+
+
+def log_rays(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    motion: Motion,
+    chosen: IntArray,
+    *,
+    sensors: tuple[Sensor, ...],
+    reading: FloatArray,
+) -> None:
+    """Draw what distance sensors see.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        motion: What moved.
+        chosen: Which of its drawing times, shape (n,).
+        sensors: The sensors, k of them.
+        reading: Distances at those times [m], shape (n, k); NaN where there is none.
+    """
+    t_ns = motion.t_ns[chosen]
     look = rr.Arrows3D.from_fields(colors=_COLOR, radii=rr.Radius.ui_points(1.0))
     rec.log(RANGES, look, static=True)
     for part, times in clock.rows(t_ns):

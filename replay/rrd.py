@@ -21,6 +21,7 @@ from analysis.result import Analysis
 from capture import Session
 from capture.errors import DataError, LogWriteError
 from capture.part_file import part_file
+from capture.robot import Robot
 from capture.robot.kinematics import rotation_from_quaternion
 
 from . import body, facts, gait, joints, markers, power, ranges, trail
@@ -160,7 +161,8 @@ def _log(
 ) -> Content:
     """Write everything but the facts."""
     session, robot = sources.session, sources.session.robot
-    palette = _palette(sources)
+    moving = sources.measured or sources.commanded
+    palette = palette_of(robot, [track.name for track in moving])
     places = joints.head_middle_tail(robot, sources.commanded or sources.measured)
     head, limit = _log_world(rec, clock, sources, places, palette)
     if places is not None:
@@ -177,7 +179,7 @@ def _log(
     log_charts(rec, found, palette)
     return Content(
         robot=robot,
-        start=None if head is None else _start(head),
+        start=None if head is None else start_of(head),
         power_limit_w=limit,
         places=places,
         commanded=joints.log_angles(rec, clock, joints.COMMANDED, sources.commanded),
@@ -247,21 +249,30 @@ def _log_signals(
     return tuple(found)
 
 
-def _palette(sources: _Sources) -> dict[str, joints.Color]:
+def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, joints.Color]:
     """Colours of the robot's joints, or of those in the log where there is no robot.
 
-    Joints that the robot doesn't have are grey.
+    Args:
+        robot: The robot, or None.
+        names: Joints in the log, head to tail.
+
+    Returns:
+        Colour by joint name; joints that the robot doesn't have are grey.
     """
-    tracks = sources.measured or sources.commanded
-    names = [track.name for track in tracks]
-    if sources.session.robot is None:
+    if robot is None:
         return joints.joint_palette(names)
-    return dict.fromkeys(names, joints.GREY) | joints.joint_palette(
-        sources.session.robot.joint_names
-    )
+    return dict.fromkeys(names, joints.GREY) | joints.joint_palette(robot.joint_names)
 
 
-def _start(head: HeadPath) -> Start | None:
+def start_of(head: HeadPath) -> Start | None:
+    """Where the camera finds the robot.
+
+    Args:
+        head: The head's path.
+
+    Returns:
+        Its first known pose, or None where none is known.
+    """
     known = np.flatnonzero(np.isfinite(head.position).all(axis=1))
     if not known.size:
         return None

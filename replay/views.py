@@ -67,12 +67,16 @@ def build_views(content: Content) -> Views:
     if content.has_events:
         words.append(rrb.TextLogView(name="Events", contents=[gait.EVENTS]))
     mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
+    angles, effort = _angle_views(content), _effort_views(content)
+    if content.live:  # nothing comes after the cursor
+        for plot in (*angles, *effort):
+            plot.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
     return Views(
         scene=None if content.start is None else _body_view(content, content.start),
         mode=mode if content.modes else None,
         words=tuple(words),
-        angles=tuple(_angle_views(content)),
-        effort=tuple(_effort_views(content)),
+        angles=tuple(angles),
+        effort=tuple(effort),
         bars=tuple(_bar_views(content)),
     )
 
@@ -88,6 +92,8 @@ def body_title(content: Content) -> str:
     """
     if content.power_limit_w is None:
         return "Body, blue head to amber tail"
+    if content.live:  # the scale may still grow
+        return "Body: vermilion drives, cyan is driven"
     limit = content.power_limit_w
     value, unit = (limit * 1e3, "mW") if limit < 1.0 else (limit, "W")
     return f"Body: vermilion drives, cyan is driven, full at ±{value:.3g} {unit} a segment"
@@ -222,12 +228,18 @@ def _plot(
         contents=contents,
         overrides=overrides,
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
-        time_ranges=[
+        time_ranges=_window(BEFORE_CURSOR_S, AFTER_CURSOR_S),
+    )
+
+
+def _window(before_s: float, after_s: float) -> rrb.VisibleTimeRanges:
+    return rrb.VisibleTimeRanges(
+        [
             rrb.VisibleTimeRange(
                 timeline,
-                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-BEFORE_CURSOR_S),
-                end=rrb.TimeRangeBoundary.cursor_relative(seconds=AFTER_CURSOR_S),
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s),
+                end=rrb.TimeRangeBoundary.cursor_relative(seconds=after_s),
             )
             for timeline in (SESSION_TIME, GAIT_CYCLE)
-        ],
+        ]
     )
