@@ -62,6 +62,11 @@ class BusRecorder:
         self.tally = FrameTally()
         self.backlog = 0
 
+    @property
+    def decodes(self) -> bool:
+        """Whether the frames are decoded, too."""
+        return self._decoder is not None
+
     def add(self, frames: FrameArray) -> None:
         """Take frames; they are not written yet.
 
@@ -112,6 +117,12 @@ class BusRecorder:
                 samples, tally = self._decoder.decode(frames)
                 self.tally.add(tally)
                 self._write(self._topics.add(samples), now_ns)
+
+    def decode_no_more(self) -> None:
+        """Only keep the frames from here on; those that waited are safe already."""
+        self._decoder = self._topics = None
+        self._waiting.clear()
+        self.backlog = 0
 
     def finish(self, now_ns: Callable[[], int]) -> None:
         """Write everything that is left.

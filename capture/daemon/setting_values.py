@@ -114,6 +114,7 @@ PARSERS: Mapping[str, Callable[[object], Any]] = MappingProxyType(
     {
         "sources": _sources,
         "robot": _word,
+        "bus": _word,
         "output": _output,
         "force": _flag,
         "duration": _at_least(parse_duration_s, 0.001, "a duration of at least 1ms"),

@@ -10,6 +10,7 @@ A file::
     [record]
     sources = ["can:socketcan:can0", "twin:flat"]
     robot = "snake25"               # a shipped robot, or a TOML file beside this one
+    bus = "can0"                    # the source that is the robot's bus, where there are several
     output = "run-{time}.mcap"      # {time}: UTC of the start, 20260131T235900Z
     force = false                   # replace an existing output
     duration = "1h30min"            # end by itself; never by default
@@ -65,6 +66,7 @@ class RecordSettings:
         sources: Addresses of the sources, at least one.
         output: The session to write, ``.mcap``.
         robot: A shipped robot or a robot TOML; None where a source brings it.
+        bus: Name of the source that is the robot's bus; None where that is clear.
         force: Replace an existing output.
         duration_s: End by itself after this time [s]; None for never.
         split_size: A new part after this size [B]; None for no limit.
@@ -85,6 +87,7 @@ class RecordSettings:
     sources: tuple[str, ...]
     output: Path
     robot: str | None = None
+    bus: str | None = None
     force: bool = False
     duration_s: float | None = None
     split_size: int | None = None

@@ -1,0 +1,283 @@
+"""The recorder's loop: one thread, a tick every 5 ms, and nothing in it that waits.
+
+Each tick takes what has come from every source and writes the raw frames; decoding follows in
+slices. What is due once a second is spread over the second's ticks, so that no tick is long.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from ..errors import LogWriteError
+from ..interruption import StopRequest
+from ..log.recorder_channels import TimeReferenceChannel
+from ..log.writer import SessionWriter
+from ..robot import Robot
+from ..sources.contract import Source, SourceContext
+from .bus_recorder import BusRecorder
+from .clock import SessionClock
+from .source_clock import SourceClock
+from .ticks import TickTally
+
+TICK_NS = 5_000_000
+"""Sources are asked this often [ns]."""
+
+RAW_TICKS = 2
+"""Raw frames are written every so many ticks: what came is safe within 10 ms."""
+
+DECODE_TICKS = 10
+"""Frames are decoded every so many ticks, a backlog in every one."""
+
+_DECODE_BUDGET_NS = 4_000_000
+_BACKLOG = 16_384
+_SECOND_TICKS = 1_000_000_000 // TICK_NS
+_NS = 1_000_000_000
+_LONGEST_NS = 2**31 * _NS  # what a TimeReference can hold
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Why a recording ended.
+
+    Attributes:
+        reason: One sentence.
+        failed: Whether it had to end.
+    """
+
+    reason: str
+    failed: bool = False
+
+
+class Recorder:
+    """Records sources into a session until something ends it.
+
+    Attributes:
+        ticks: How long the ticks took.
+        overruns: Ticks that were left out because the one before took too long.
+        ending: Set to end the recording, from within one of the ``each_tick`` or ``each_second``.
+    """
+
+    def __init__(
+        self,
+        *,
+        writer: SessionWriter,
+        clock: SessionClock,
+        sources: Sequence[Source],
+        context: SourceContext,
+        robot: Robot | None,
+        decoded: str | None,
+        each_tick: Sequence[Callable[[], None]] = (),
+        each_second: Sequence[Callable[[], None]] = (),
+    ) -> None:
+        """Put a recording together; nothing is opened yet.
+
+        Args:
+            writer: The session; the recorder doesn't close it.
+            clock: The session's clock.
+            sources: What to record.
+            context: What the sources are given.
+            robot: The robot that is recorded, or None.
+            decoded: The source that is the robot's bus; None to keep all frames raw.
+            each_tick: Called at the end of every tick.
+            each_second: Called once a second, in different ticks.
+        """
+        self.ticks = TickTally()
+        self.overruns = 0
+        self.ending: Ending | None = None
+        self.clocks: dict[str, SourceClock] = {source.name: SourceClock() for source in sources}
+        self.buses: dict[str, BusRecorder] = {}
+        self._writer, self._clock, self._context = writer, clock, context
+        self._sources = tuple(sources)
+        self._robot, self._decoded = robot, decoded
+        self._each_tick = tuple(each_tick)
+        self._second: dict[int, Callable[[], None]] = {}
+        tasks = (self._write_clocks, *each_second)
+        for k, task in enumerate(tasks):
+            self._second[(k + 1) * _SECOND_TICKS // (len(tasks) + 1)] = task
+        self._events = writer.log("/rosout")
+        self._clock_channels: dict[str, TimeReferenceChannel] = {}
+        self._odd_clocks: set[str] = set()
+        self._unknown: dict[str, set[str]] = {source.name: set() for source in self._sources}
+        self._on_event: Callable[[int, str, str, str], None] | None = None
+
+    def on_event(self, listener: Callable[[int, str, str, str], None]) -> None:
+        """Have events told to someone as well: time [Unix ns], level, who, text.
+
+        Args:
+            listener: Called after the event was written.
+        """
+        self._on_event = listener
+
+    def say(self, level: str, name: str, text: str, t_ns: int | None = None) -> None:
+        """Write an event.
+
+        Args:
+            level: ``info``, ``warn`` or ``error``.
+            name: Who says it.
+            text: One sentence.
+            t_ns: When [Unix ns]; now by default.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        at_ns = self._clock.now_ns() if t_ns is None else t_ns
+        self._events.write(at_ns, level, name, text)
+        if self._on_event is not None:
+            self._on_event(at_ns, level, name, text)
+
+    @property
+    def backlog(self) -> int:
+        """Frames that are safe and wait to be decoded."""
+        return sum(bus.backlog for bus in self.buses.values())
+
+    def run(self, stop: StopRequest, duration_s: float | None = None) -> Ending:
+        """Record until something ends it.
+
+        Args:
+            stop: Looked at every tick.
+            duration_s: Ends by itself after this time [s].
+
+        Returns:
+            Why it ended. The session is whole then, but not closed.
+
+        Raises:
+            SourceError: If a source can never work.
+            LogWriteError: If the session can't be written; the sources are stopped then.
+        """
+        try:
+            self._start()
+            self._loop(stop, duration_s)
+            self._finish()
+        finally:
+            for source in self._sources:
+                source.stop()
+        assert self.ending is not None  # noqa: S101 - the loop ends with one
+        return self.ending
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        for source in self._sources:
+            source.start(self._context)
+        listed = ", ".join(source.name for source in self._sources)
+        self.say("info", "recorder", f"recording {listed}")
+
+    def _loop(self, stop: StopRequest, duration_s: float | None) -> None:
+        begun_ns = due_ns = time.monotonic_ns()
+        end_ns = None if duration_s is None else begun_ns + round(duration_s * _NS)
+        tick = 0
+        while self.ending is None:
+            now_ns = time.monotonic_ns()
+            self._tick(tick)
+            if stop.signal is not None:
+                self.ending = Ending(f"{stop.signal.name} was received")
+            elif end_ns is not None and now_ns >= end_ns:
+                self.ending = Ending(f"{duration_s:g} s are over")
+            elif all(source.finished for source in self._sources):
+                self.ending = Ending("all sources have ended")
+            after_ns = time.monotonic_ns()
+            self.ticks.add(after_ns - now_ns)
+            tick += 1
+            due_ns += TICK_NS
+            if after_ns < due_ns:
+                time.sleep((due_ns - after_ns) / _NS)
+            elif after_ns > due_ns + _NS:  # stopped for a while: ticks are not made up for
+                self.overruns += (after_ns - due_ns) // TICK_NS
+                due_ns = after_ns
+
+    def _tick(self, tick: int) -> None:
+        self._poll()
+        if tick % RAW_TICKS == 0:
+            for bus in self.buses.values():
+                bus.write_raw(self._clock.now_ns)
+        if tick % DECODE_TICKS == 1 or self.backlog > _BACKLOG:
+            until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
+            for name, bus in self.buses.items():
+                self._decode(name, bus, until_ns)
+        task = self._second.get(tick % _SECOND_TICKS)
+        if task is not None:
+            task()
+        for each in self._each_tick:
+            each()
+
+    def _poll(self) -> None:
+        for source in self._sources:
+            polled = source.poll()
+            for event in polled.events:
+                self.say(event.level, source.name, event.text, event.t_ns)
+            for frames in polled.frames:
+                bus = self.buses.get(source.name)
+                if bus is None:
+                    bus = self.buses[source.name] = self._open_bus(source)
+                bus.add(frames)
+
+    def _decode(self, name: str, bus: BusRecorder, until_ns: int) -> None:
+        try:
+            bus.decode(self._clock.now_ns, until_ns)
+        except LogWriteError:
+            raise
+        except Exception as error:  # noqa: BLE001 - raw frames go on, whatever decoding trips over
+            bus.decode_no_more()
+            text = f"frames are only kept raw from here on: decoding them failed with {error!r}"
+            self.say("error", name, text)
+        self._tell_clock(name)
+
+    def _open_bus(self, source: Source) -> BusRecorder:
+        robot = self._robot if source.name == self._decoded else None
+        return BusRecorder(
+            source.name,
+            self._writer,
+            self.clocks[source.name],
+            robot,
+            directions=source.directions,
+        )
+
+    def _write_clocks(self) -> None:
+        now_ns = self._clock.now_ns()
+        for name, clock in self.clocks.items():
+            pair = clock.pair()
+            if pair is None:
+                continue
+            device_ns, host_ns = pair
+            if name not in self._clock_channels:
+                topic = f"/clock/{name}"
+                self._clock_channels[name] = self._writer.time_reference(topic, source=name)
+            if 0 <= device_ns < _LONGEST_NS:
+                self._clock_channels[name].write(host_ns, device_ns, log_time_ns=now_ns)
+            elif name not in self._odd_clocks:
+                self._odd_clocks.add(name)
+                text = f"the device's time, {device_ns} ns, doesn't fit /clock/{name}"
+                self.say("warn", name, text)
+        self._tell_unknown()
+
+    def _tell_clock(self, name: str) -> None:
+        for text in self.clocks[name].take_events():
+            self.say("warn", name, text)
+
+    def _tell_unknown(self) -> None:
+        """Say of each identifier once that nobody knows it; the counts come at the end."""
+        for name, bus in self.buses.items():
+            fresh = set(bus.tally.unknown) - self._unknown[name]
+            if fresh and bus.decodes:
+                self._unknown[name] |= fresh
+                listed = ", ".join(sorted(fresh)[:8])
+                more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
+                self.say("info", name, f"identifiers that no database knows: {listed}{more}")
+
+    def _finish(self) -> None:
+        """Take what is still there, and say what became of the frames."""
+        self._poll()
+        for name, bus in self.buses.items():
+            bus.finish(self._clock.now_ns)
+            self._tell_clock(name)
+            if bus.decodes:
+                for text in bus.tally.problems():
+                    self.say("warn", name, text)
+                for text in bus.tally.notes():
+                    self.say("info", name, text)
+        self._write_clocks()
+        ending = self.ending
+        assert ending is not None  # noqa: S101 - set by the loop
+        self.say("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
