@@ -53,6 +53,7 @@ from .wal_format import (
     segment_files,
     segment_name,
 )
+from .wal_lock import WalLock
 from .wal_segment import SEGMENT_OVERHEAD, Segment, new_header, sync_folder
 
 _MESSAGE = int(Opcode.MESSAGE)
@@ -98,7 +99,8 @@ class WriteAheadLog:
         Raises:
             OutputExistsError: If there are segments and ``force`` is not given: they hold what
                 a recorder that died did not finish.
-            LogWriteError: If there is no room, or the folder can't be written.
+            LogWriteError: If there is no room, the folder can't be written, or another recorder
+                is writing it.
             DataError: If a size or time makes no sense.
         """
         if segment_size < _LEAST_SIZE or not sync_interval_s > 0:
@@ -125,7 +127,7 @@ class WriteAheadLog:
         self._files = threading.Lock()
         self._disk = threading.Lock()
         self._wake = threading.Event()
-        _prepare(self.folder, force=force)
+        self._lock = _prepare(self.folder, force=force)
         self._definitions: list[Segment] = []
         try:
             self._definitions.append(self._reserve(DEFINITIONS, _DEFINITIONS_SIZE))
@@ -133,6 +135,7 @@ class WriteAheadLog:
         except LogWriteError:
             for segment in self._definitions:
                 segment.close(remove=True)
+            self._lock.release()
             with suppress(OSError):
                 self.folder.rmdir()
             raise
@@ -272,6 +275,7 @@ class WriteAheadLog:
         finally:
             for segment in (*self._definitions, *self._sealed, self._current):
                 segment.close(remove=done)
+            self._lock.release()
             if done:
                 with suppress(OSError):  # not empty: something of someone else is in it
                     self.folder.rmdir()
@@ -394,14 +398,21 @@ def _room_for(payload: bytes) -> int:
     return SEGMENT_OVERHEAD + RECORD_SIZE + len(payload)
 
 
-def _prepare(folder: Path, *, force: bool) -> None:
+def _prepare(folder: Path, *, force: bool) -> WalLock:
     try:
         folder.mkdir(exist_ok=True)
-        found = segment_files(folder)
-        if force:
-            for _, _, path in found:
-                path.unlink()
     except OSError as error:
         raise LogWriteError(folder, f"can't be created: {error.strerror}") from error
-    if found and not force:
-        raise OutputExistsError(folder)
+    lock = WalLock(folder)
+    try:
+        found = segment_files(folder)
+        if found and not force:
+            raise OutputExistsError(folder)
+        for _, _, path in found:
+            path.unlink()
+    except OSError as error:
+        lock.release()
+        if isinstance(error, OutputExistsError):
+            raise
+        raise LogWriteError(folder, f"can't be created: {error.strerror}") from error
+    return lock
