@@ -122,6 +122,7 @@ def test_a_size_as_shown_reads_back_within_its_digits(size):
 GOOD = {  # three different values a setting: for the file, the environment, the command line
     "sources": (["a:1"], "b:1 'c:2 3'", ("d:1",)),
     "robot": ("snake25", "snake13", "arcsnake-joint"),
+    "bus": ("can0", "rear", "front"),
     "output": ("a.mcap", "b.mcap", Path("c.mcap")),
     "force": (True, "no", True),
     "duration": ("1h30min", "90", 2.5),
