@@ -35,11 +35,18 @@ def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
 class BusTally:
     """Frames of one bus."""
 
-    def __init__(self) -> None:
-        """Start empty."""
+    def __init__(self, horizon_s: int | None = None) -> None:
+        """Start empty.
+
+        Args:
+            horizon_s: Sum up seconds that are older than this against the newest [s]; None to
+                keep them all.
+        """
         self._timing = TimingTally()
         self._errors = 0
+        self._horizon_s = horizon_s
         self._bits: dict[int, tuple[int, int]] = {}
+        self._closed = self._peak = (0, 0)  # of the seconds that were summed up
 
     def add(self, frames: FrameArray) -> None:
         """Take the next frames.
@@ -58,6 +65,8 @@ class BusTally:
         for second, low, high in zip(seconds.tolist(), *sums, strict=True):
             had = self._bits.get(second, (0, 0))
             self._bits[second] = (had[0] + low, had[1] + high)
+        if self._horizon_s is not None and len(self._bits) > 2 * self._horizon_s:
+            self._close(max(self._bits) - self._horizon_s)
 
     def result(self, topic: str, bitrate: int | None) -> BusHealth:
         """What the frames so far say.
@@ -73,9 +82,11 @@ class BusTally:
         span_s = (timing.last_ns - timing.first_ns) / NS
         load = peak = None
         if bitrate and span_s > 0:
-            low, high = (sum(bits[k] for bits in self._bits.values()) for k in (0, 1))
+            every = [self._closed, *self._bits.values()]
+            low, high = (sum(bits[k] for bits in every) for k in (0, 1))
             load = low / span_s / bitrate, high / span_s / bitrate
-            low, high = (max(bits[k] for bits in self._bits.values()) for k in (0, 1))
+            every[0] = self._peak
+            low, high = (max(bits[k] for bits in every) for k in (0, 1))
             peak = low / bitrate, high / bitrate
         return BusHealth(
             topic,
@@ -87,3 +98,23 @@ class BusTally:
             load,
             peak,
         )
+
+    def last_second(self, bitrate: int | None) -> tuple[float, float] | None:
+        """Load of the last whole second.
+
+        Args:
+            bitrate: [bit/s], None where unknown.
+
+        Returns:
+            Part of the bitrate without and with the most stuff bits; None where unknown.
+        """
+        if not bitrate or not self._bits:
+            return None
+        low, high = self._bits.get(max(self._bits) - 1, (0, 0))
+        return low / bitrate, high / bitrate
+
+    def _close(self, before: int) -> None:
+        for second in [second for second in self._bits if second < before]:
+            low, high = self._bits.pop(second)
+            self._closed = self._closed[0] + low, self._closed[1] + high
+            self._peak = max(self._peak[0], low), max(self._peak[1], high)

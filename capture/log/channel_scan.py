@@ -18,16 +18,20 @@ from .cdr import Layout, layout_of
 from .chunk import Buffer
 from .columns import fits_layout
 from .frames import FRAME_DTYPE, FRAME_LAYOUT, empty_frames
+from .freeze import RangeTally
 from .health import LIMIT_RAD
 from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType
-from .tallies import NS, RangeTally, SequenceTally, TimingTally
+from .tallies import NS, SequenceTally, TimingTally
 
 _STAMP_AT = 4  # a leading Header or Time follows the encapsulation header at once
 _BATCH_ROWS = 4096
 _BATCH_BYTES = 1 << 21
 _MAX_LAYOUTS = 64
+_FLOATS = ("float32", "float64")
 _FIELDS = ("position", "velocity", "effort")
+
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 Limits = dict[str, tuple[float, float]]
 Matrix = NDArray[np.uint8]
@@ -71,27 +75,42 @@ class ChannelScan:
     """One channel."""
 
     def __init__(
-        self, topic: str, kind: MessageType | None, *, joints: bool, limits: Limits | None
+        self,
+        topic: str,
+        kind: MessageType | None,
+        *,
+        joints: bool,
+        limits: Limits | None,
+        horizon_s: int | None = None,
     ) -> None:
         """Start empty.
+
+        ``ends`` are the first and the last message of a topic of diagnostics, None elsewhere.
 
         Args:
             topic: Its topic.
             kind: Its message type; None where it can't be read: log times are looked at then.
             joints: Whether its messages are JointStates.
             limits: Joint name to limits [rad]; None where its positions are not angles.
+            horizon_s: How far stamps may go back in a session that is still being recorded [s];
+                memory is bounded by it. None for a file, which ends.
         """
         self.topic = topic
         self.count = 0
         self.unread = 0
         self.sequence = SequenceTally()
         self.series: dict[tuple[str, ...], Series] = {}
-        self.bus = BusTally() if kind is not None and _holds_frames(topic, kind) else None
+        self.bus = BusTally(horizon_s) if kind is not None and _holds_frames(topic, kind) else None
+        self.ends: tuple[bytes, bytes] | None = None
+        self._keeps_ends = kind is not None and kind.name == DIAGNOSTICS
         self._kind = kind
         self._joints = joints
         self._limits = limits
         self._stamped = kind is not None and _is_stamped(kind)
+        self._horizon_s = horizon_s
+        self._text = kind is not None and not joints and not _has_numbers(kind)
         self._layouts: dict[int, list[Layout]] = {}
+        self._layout_count = 0
         self._log: list[NDArray[np.uint64]] = []
         self._sequence: list[NDArray[np.uint32]] = []
         self._pending: list[tuple[IntArray, Matrix]] = []  # rows of the batch, their messages
@@ -146,6 +165,8 @@ class ChannelScan:
             for parts in by_length.values()
         ]
         kind = self._kind
+        if self._keeps_ends:
+            self._keep_ends(whole)
         stamps = log_ns.copy()
         if self._stamped:
             for rows, matrix in whole:
@@ -161,10 +182,23 @@ class ChannelScan:
                 for _, _, layout, part in self._split(kind, rows, matrix):
                     _count_nan(series, layout, part)
 
-    def _add_times(self, names: tuple[str, ...], stamps: IntArray, log_ns: IntArray) -> Series:
+    def _series_of(self, names: tuple[str, ...]) -> Series:
         if names not in self.series:
-            self.series[names] = Series(names)
-        series = self.series[names]
+            self.series[names] = Series(names, ranges=RangeTally(self._horizon_s))
+        return self.series[names]
+
+    def _keep_ends(self, whole: list[tuple[IntArray, Matrix]]) -> None:
+        """Remember the first and the last message."""
+        if not whole:
+            return
+        first = min(whole, key=lambda part: int(part[0].min()))
+        last = max(whole, key=lambda part: int(part[0].max()))
+        early = first[1][int(first[0].argmin())].tobytes()
+        late = last[1][int(last[0].argmax())].tobytes()
+        self.ends = (early if self.ends is None else self.ends[0], late)
+
+    def _add_times(self, names: tuple[str, ...], stamps: IntArray, log_ns: IntArray) -> Series:
+        series = self._series_of(names)
         series.timing.add(stamps)
         series.first_log_ns = min(series.first_log_ns, int(log_ns.min()))
         series.last_log_ns = max(series.last_log_ns, int(log_ns.max()))
@@ -181,7 +215,7 @@ class ChannelScan:
         for rows, matrix in whole:
             for names, chosen, layout, part in self._split(kind, rows, matrix):
                 places.setdefault(names, []).append(chosen)
-                series = self.series.setdefault(names, Series(names))
+                series = self._series_of(names)
                 _count_nan(series, layout, part)
                 self._add_values(series, layout, part, stamps[chosen])
         for names, chosen in places.items():
@@ -255,8 +289,10 @@ class ChannelScan:
                 self.unread += 1
                 rows, matrix = rows[1:], matrix[1:]
                 continue
-            if len(known) < _MAX_LAYOUTS:
+            room = _MAX_LAYOUTS - (self._layout_count if self._text else len(known))
+            if room > 0:
                 known.append(layout)
+                self._layout_count += 1
             elif not self._joints:  # text: a layout a message, and no numbers worth a look
                 return parts
             fits = fits_layout(matrix, layout)
@@ -306,3 +342,11 @@ def _is_stamped(kind: MessageType) -> bool:
 
 def _holds_frames(topic: str, kind: MessageType) -> bool:
     return topic.startswith("/can/") and kind.name == "std_msgs/msg/UInt8MultiArray"
+
+
+def _has_numbers(kind: MessageType) -> bool:
+    """Whether a message can hold numbers that are NaN."""
+    return any(
+        _has_numbers(part.nested) if part.nested is not None else part.base in _FLOATS
+        for part in kind.fields
+    )

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
+from .freeze import FROZEN_SAMPLES
 from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
-from .tallies import NS, PAUSE_PERIODS, PAUSE_S, Ranges, longest_run
+from .tallies import NS, PAUSE_PERIODS, PAUSE_S
 
 GOOD_LOSS = 1e-3
 """Up to one sample in a thousand may be missing, not finite or repeated in a good session: less
@@ -33,15 +32,8 @@ MAX_JITTER = 0.25
 """Standard deviation of the intervals against their median: a quarter means that one sample in
 twenty is half an interval off, so the rhythm of the source is disturbed."""
 
-FROZEN_COMMAND_RAD = 0.05
-"""A joint is frozen in a second if its angle keeps one value, to the bit, while its command moves
-by more than this: ten steps of the coarsest common servo (0.29 degrees)."""
-
 FROZEN_SECONDS = 2
 """Consecutive seconds that make a frozen joint; one alone may be a slow start of the motion."""
-
-FROZEN_SAMPLES = 5
-"""A second with fewer samples can't tell."""
 
 LIMIT_RAD = 1e-3
 """Nearer to a limit than this is at it: below one step of a 12-bit encoder (1.5 mrad)."""
@@ -72,25 +64,6 @@ class Finding:
 
     weight: int
     sentence: str
-
-
-def frozen_time(measured: Ranges, joint: int, command: Ranges, commanded: int) -> tuple[int, int]:
-    """How long a joint stood, to the bit, while its command moved.
-
-    Args:
-        measured: Of the measured angles [rad].
-        joint: Column of the joint in ``measured``.
-        command: Of the commands [rad].
-        commanded: Column of the joint in ``command``.
-
-    Returns:
-        Longest run of such seconds [s] and its first second [Unix s].
-    """
-    seconds, here, there = np.intersect1d(measured.second, command.second, return_indices=True)
-    stood = measured.high[here, joint] == measured.low[here, joint]
-    stood &= measured.count[here] >= FROZEN_SAMPLES
-    moved = command.high[there, commanded] - command.low[there, commanded] > FROZEN_COMMAND_RAD
-    return longest_run((stood & moved).astype(np.int64), seconds)
 
 
 def judge_file(health: FileHealth) -> list[Finding]:

@@ -16,9 +16,9 @@ from ..arrays import IntArray
 from ..robot import Robot
 from .channel_scan import ChannelScan, Limits, Series
 from .chunk import Buffer
+from .freeze import FreezeTally
 from .health import (
     Finding,
-    frozen_time,
     judge_bus,
     judge_channel,
     judge_joints,
@@ -94,13 +94,18 @@ class ChannelMeasures:
 class SessionScan:
     """The scan of one session, channel by channel."""
 
-    def __init__(self, robot: Robot | None) -> None:
+    def __init__(self, robot: Robot | None, *, horizon_s: int | None = None) -> None:
         """Start without channels.
 
         Args:
             robot: The robot that the session describes; None without a usable description.
+            horizon_s: For a session that is still being recorded: how far stamps may go back [s].
+                What is older is summed up, so that memory is bounded; samples that come later
+                still are left out where joints are looked at for standing still. None for a file.
         """
         self._robot = robot
+        self._horizon_s = horizon_s
+        self._freezes: dict[tuple[int, tuple[str, ...], int, tuple[str, ...]], FreezeTally] = {}
         self._scans: dict[int, ChannelScan] = {}
         self._types: dict[int, str] = {}
 
@@ -131,7 +136,9 @@ class SessionScan:
         if angles and self._robot is not None:
             limits = {joint.name: (joint.lower, joint.upper) for joint in self._robot.joints}
         joints = kind is not None and type_name == "sensor_msgs/msg/JointState"
-        self._scans[key] = ChannelScan(topic, kind, joints=joints, limits=limits)
+        self._scans[key] = ChannelScan(
+            topic, kind, joints=joints, limits=limits, horizon_s=self._horizon_s
+        )
         self._types[key] = type_name
 
     def add(self, key: int, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
@@ -199,7 +206,7 @@ class SessionScan:
         every = [taken.get(key) or self.measure(key) for key, _ in found]
         channels = tuple(each.channel for each in every)
         series = tuple(one for each in every for one in each.series)
-        joints = self._joints([scan for _, scan in found])
+        joints = self._joints(found)
         bitrate = self._bitrate([scan for _, scan in found if scan.bus is not None])
         buses = tuple(
             scan.bus.result(scan.topic, bitrate) for _, scan in found if scan.bus is not None
@@ -230,37 +237,58 @@ class SessionScan:
             buses=buses,
         )
 
-    def _joints(self, scans: list[ChannelScan]) -> tuple[JointHealth, ...]:
-        tallies = [(scan.topic, series) for scan in scans for series in scan.series.values()]
-        commands = [
-            (series.names, series.ranges.result(len(series.names)))
-            for topic, series in tallies
-            if topic == COMMANDS
-        ]
+    def _joints(self, scans: list[tuple[int, ChannelScan]]) -> tuple[JointHealth, ...]:
         limited = set(self._robot.joint_names) if self._robot is not None else set[str]()
         found: dict[tuple[str, str], JointHealth] = {}
-        for topic, series in tallies:
-            measured = series.ranges.result(len(series.names))
-            for k, name in enumerate(series.names):
-                runs = [
-                    frozen_time(measured, k, command, names.index(name))
-                    for names, command in commands
-                    if topic == STATES and name in names
-                ]
-                bounded = name in limited and topic in (COMMANDS, STATES) and series.rows
-                longest = max(runs, default=None)
-                joint = JointHealth(
-                    topic=topic,
-                    name=name,
-                    samples=series.rows,
-                    nan=int(series.joint_nan[k]),
-                    at_limit=float(series.at_limit[k] / series.rows) if bounded else None,
-                    frozen_s=None if longest is None else longest[0],
-                    frozen_at_ns=0 if longest is None else longest[1] * NS,
-                )
-                had = found.get((topic, name))
-                found[topic, name] = joint if had is None else had.with_more(joint)
+        for key, scan in scans:
+            for series in scan.series.values():
+                runs = self._frozen(key, series, scans) if scan.topic == STATES else {}
+                for k, name in enumerate(series.names):
+                    bounded = name in limited and scan.topic in (COMMANDS, STATES) and series.rows
+                    longest = max(runs.get(k, ()), default=None)
+                    joint = JointHealth(
+                        topic=scan.topic,
+                        name=name,
+                        samples=series.rows,
+                        nan=int(series.joint_nan[k]),
+                        at_limit=float(series.at_limit[k] / series.rows) if bounded else None,
+                        frozen_s=None if longest is None else longest[0],
+                        frozen_at_ns=0 if longest is None else longest[1] * NS,
+                    )
+                    had = found.get((scan.topic, name))
+                    found[scan.topic, name] = joint if had is None else had.with_more(joint)
+        for _, scan in scans:
+            for series in scan.series.values():
+                series.ranges.forget(self._closed(scans))
         return tuple(found.values())
+
+    def _frozen(
+        self, key: int, series: Series, scans: list[tuple[int, ChannelScan]]
+    ) -> dict[int, list[tuple[int, int]]]:
+        """Frozen seconds and their first one, for each joint with a command, by its place."""
+        measured = series.ranges.result(len(series.names))
+        runs: dict[int, list[tuple[int, int]]] = {}
+        for other, scan in scans:
+            for command in scan.series.values() if scan.topic == COMMANDS else ():
+                pair = (key, series.names, other, command.names)
+                if pair not in self._freezes:
+                    self._freezes[pair] = FreezeTally(series.names, command.names)
+                freeze = self._freezes[pair]
+                ranges = command.ranges.result(len(command.names))
+                lasted, since = freeze.result(measured, ranges, self._closed(scans))
+                for k, *run in zip(freeze.columns, lasted.tolist(), since.tolist(), strict=True):
+                    runs.setdefault(k, []).append((run[0], run[1]))
+        return runs
+
+    def _closed(self, scans: list[tuple[int, ChannelScan]]) -> int | None:
+        """Seconds before this one will not change in any series of angles."""
+        every = [
+            series.ranges.closed
+            for _, scan in scans
+            for series in scan.series.values()
+            if scan.topic in (COMMANDS, STATES)
+        ]
+        return min((second for second in every if second is not None), default=None)
 
     def _bitrate(self, buses: list[ChannelScan]) -> int | None:
         """The described bus's bitrate, where it is clear which one that is."""

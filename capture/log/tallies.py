@@ -129,7 +129,8 @@ class TimingTally:
             return
         steps, starts = steps[forward], starts[forward]
         longest = int(steps.argmax())
-        self._longest = max(self._longest, (int(steps[longest]), int(starts[longest])))
+        if int(steps[longest]) > self._longest[0]:  # of equal ones the first, as they came
+            self._longest = int(steps[longest]), int(starts[longest])
         size = steps.astype(np.float64)
         bins = np.minimum((np.log2(size) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
         sums = [np.bincount(bins, weight, _BINS) for weight in (None, size, size**2)]
@@ -241,91 +242,3 @@ class SequenceTally:
         span = self._high - self._low + 1
         dropped = max(span - (self._count - self._repeated), 0)
         return Sequence("counted", dropped, self._reordered)
-
-
-@dataclass(frozen=True)
-class Ranges:
-    """Smallest and largest value of each joint in each second.
-
-    Attributes:
-        second: Unix seconds, increasing, shape (s,).
-        count: Samples in each, shape (s,).
-        low: Shape (s, k); NaN where a second has nothing else.
-        high: Shape (s, k).
-    """
-
-    second: IntArray
-    count: IntArray
-    low: FloatArray
-    high: FloatArray
-
-
-class RangeTally:
-    """Ranges by the second: what tells a frozen joint from a still one. 16 byte a joint-second."""
-
-    def __init__(self) -> None:
-        """Start empty."""
-        self._parts: list[Ranges] = []
-
-    def add(self, t_ns: IntArray, values: FloatArray) -> None:
-        """Take the next samples.
-
-        Args:
-            t_ns: Their times [Unix ns], shape (n,).
-            values: Shape (n, k).
-        """
-        if len(t_ns):
-            self._parts.append(_by_second(t_ns // NS, np.ones(len(t_ns), int), values, values))
-
-    def result(self, width: int) -> Ranges:
-        """The ranges so far.
-
-        Args:
-            width: Number of joints k, for a stream without samples.
-
-        Returns:
-            One row a second that has samples.
-        """
-        if not self._parts:
-            none = np.empty((0, width))
-            return Ranges(np.empty(0, np.int64), np.empty(0, np.int64), none, none)
-        whole = _by_second(
-            np.concatenate([part.second for part in self._parts]),
-            np.concatenate([part.count for part in self._parts]),
-            np.concatenate([part.low for part in self._parts]),
-            np.concatenate([part.high for part in self._parts]),
-        )
-        self._parts = [whole]
-        return whole
-
-
-def _by_second(second: IntArray, count: IntArray, low: FloatArray, high: FloatArray) -> Ranges:
-    if (np.diff(second) < 0).any():
-        order = np.argsort(second, kind="stable")
-        second, count, low, high = second[order], count[order], low[order], high[order]
-    first = np.flatnonzero(np.diff(second, prepend=second[:1] - 1))
-    return Ranges(
-        second[first],
-        np.add.reduceat(count, first),
-        np.fmin.reduceat(low, first, axis=0),
-        np.fmax.reduceat(high, first, axis=0),
-    )
-
-
-def longest_run(flags: IntArray, at: IntArray) -> tuple[int, int]:
-    """The longest run of flagged, consecutive seconds.
-
-    Args:
-        flags: 0 or 1, shape (s,).
-        at: Increasing seconds, shape (s,).
-
-    Returns:
-        Its length [s] and its first second; (0, 0) where none is flagged.
-    """
-    chosen = at[flags.astype(bool)]
-    if not len(chosen):
-        return 0, 0
-    cuts = np.flatnonzero(np.diff(chosen) != 1) + 1
-    runs = np.split(chosen, cuts)
-    best = max(runs, key=len)
-    return len(best), int(best[0])
