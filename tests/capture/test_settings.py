@@ -123,6 +123,7 @@ GOOD = {  # three different values a setting: for the file, the environment, the
     "sources": (["a:1"], "b:1 'c:2 3'", ("d:1",)),
     "robot": ("snake25", "snake13", "arcsnake-joint"),
     "bus": ("can0", "rear", "front"),
+    "bus": ("can0", "can1", "can2"),
     "output": ("a.mcap", "b.mcap", Path("c.mcap")),
     "force": (True, "no", True),
     "duration": ("1h30min", "90", 2.5),
