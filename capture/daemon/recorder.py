@@ -122,8 +122,9 @@ class Recorder:
         Raises:
             LogWriteError: If it can't be written.
         """
-        at_ns = self._clock.now_ns() if t_ns is None else t_ns
-        self._events.write(at_ns, level, name, text)
+        now_ns = self._clock.now_ns()
+        at_ns = now_ns if t_ns is None else t_ns
+        self._events.write(at_ns, level, name, text, log_time_ns=now_ns)
         if self._on_event is not None:
             self._on_event(at_ns, level, name, text)
 

@@ -293,17 +293,19 @@ class StringChannel:
         """Wrap what writes a message."""
         self._send = send
 
-    def write(self, t_ns: int, text: str) -> None:
+    def write(self, t_ns: int, text: str, *, log_time_ns: int | None = None) -> None:
         """Write one text.
 
         Args:
             t_ns: Time [Unix ns].
             text: The text.
+            log_time_ns: Time of recording [Unix ns]; the time itself if None.
 
         Raises:
             LogWriteError: If the file can't be written.
         """
-        self._send(t_ns, t_ns, encode(message_type("std_msgs/msg/String"), {"data": text}))
+        log_time = t_ns if log_time_ns is None else log_time_ns
+        self._send(log_time, t_ns, encode(message_type("std_msgs/msg/String"), {"data": text}))
 
 
 class LogChannel:
@@ -313,7 +315,9 @@ class LogChannel:
         """Wrap what writes a message."""
         self._send = send
 
-    def write(self, t_ns: int, level: str, name: str, text: str) -> None:
+    def write(
+        self, t_ns: int, level: str, name: str, text: str, *, log_time_ns: int | None = None
+    ) -> None:
         """Write one event.
 
         Args:
@@ -321,6 +325,7 @@ class LogChannel:
             level: ``debug``, ``info``, ``warn``, ``error`` or ``fatal``.
             name: Who says it, e.g. ``twin``.
             text: One sentence.
+            log_time_ns: Time of recording [Unix ns]; when it happened if None.
 
         Raises:
             DataError: If the level is none of these.
@@ -331,7 +336,8 @@ class LogChannel:
         seconds, nanoseconds = divmod(t_ns, _NS)
         stamp = {"sec": seconds, "nanosec": nanoseconds}
         values = {"stamp": stamp, "level": _LEVELS[level], "name": name, "msg": text}
-        self._send(t_ns, t_ns, encode(message_type("rcl_interfaces/msg/Log"), values))
+        log_time = t_ns if log_time_ns is None else log_time_ns
+        self._send(log_time, t_ns, encode(message_type("rcl_interfaces/msg/Log"), values))
 
 
 class FrameChannel:
