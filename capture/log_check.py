@@ -12,6 +12,7 @@ from .console import emit_json, progress
 if TYPE_CHECKING:
     from .log.measures import BusHealth, SeriesHealth
     from .log.session_check import SessionHealth
+    from .log.source_health import SourceHealth
 
 
 def log_check(file: Path, /, *, json: bool = False) -> int:
@@ -46,7 +47,7 @@ def as_json(health: SessionHealth) -> dict[str, Any]:
 
     Returns:
         ``verdict``, ``reasons``, ``notes``, ``stored``, ``session``, ``file``, ``channels``,
-        ``series``, ``joints``, ``buses``; what can't be computed is null.
+        ``series``, ``joints``, ``buses``, ``sources``; what can't be computed is null.
     """
     series: list[dict[str, Any]] = []
     for each in health.series:
@@ -73,6 +74,7 @@ def as_json(health: SessionHealth) -> dict[str, Any]:
         "series": series,
         "joints": [asdict(joint) for joint in health.joints],
         "buses": [asdict(bus) for bus in health.buses],
+        "sources": [asdict(source) for source in health.sources],
     }
 
 
@@ -89,6 +91,8 @@ def _print(health: SessionHealth) -> None:
     _print_series(health)
     for bus in health.buses:
         print(_bus_line(bus))
+    for source in health.sources:
+        print(_source_line(source))
     _print_sequences(health)
     file = health.file
     print(
@@ -148,6 +152,14 @@ def _print_sequences(health: SessionHealth) -> None:
         print(f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}")
     if "not a count" in kinds:
         print(f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}")
+
+
+def _source_line(source: SourceHealth) -> str:
+    lost = "losses unknown" if source.dropped is None else f"{source.dropped} lost before us"
+    return (
+        f"\nsource {source.name}, as its recorder counted: {source.frames} frames, {lost}, "
+        f"{source.malformed} unreadable, connected again {source.reconnects} times"
+    )
 
 
 def _bus_line(bus: BusHealth) -> str:

@@ -103,7 +103,7 @@ class ChannelScan:
         self.bus = BusTally(horizon_s) if kind is not None and _holds_frames(topic, kind) else None
         self.ends: tuple[bytes, bytes] | None = None
         self._keeps_ends = kind is not None and kind.name == DIAGNOSTICS
-        self._kind = kind
+        self.kind = kind
         self._joints = joints
         self._limits = limits
         self._stamped = kind is not None and _is_stamped(kind)
@@ -126,7 +126,7 @@ class ChannelScan:
         """
         self._log.append(heads["log"])
         self._sequence.append(heads["sequence"])
-        if self._kind is not None:
+        if self.kind is not None:
             lengths = heads["length"].astype(np.int64) - FIXED_SIZE
             first = int(lengths[0])
             if (lengths == first).all():
@@ -164,7 +164,7 @@ class ChannelScan:
             (np.concatenate([r for r, _ in parts]), np.concatenate([m for _, m in parts]))
             for parts in by_length.values()
         ]
-        kind = self._kind
+        kind = self.kind
         if self._keeps_ends:
             self._keep_ends(whole)
         stamps = log_ns.copy()

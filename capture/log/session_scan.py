@@ -28,6 +28,7 @@ from .health import (
 )
 from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 from .rosmsg import MessageType
+from .source_health import SourceHealth, judge_source, measure_sources
 from .tallies import NS
 
 COMMANDS, STATES = "/joint_commands", "/joint_states"
@@ -46,6 +47,7 @@ class SessionMeasures:
         series: By topic and names.
         joints: By topic, in the order of the messages.
         buses: By topic.
+        sources: As the recorder counted them, by name.
     """
 
     robot: str | None
@@ -56,6 +58,7 @@ class SessionMeasures:
     series: tuple[SeriesHealth, ...]
     joints: tuple[JointHealth, ...]
     buses: tuple[BusHealth, ...]
+    sources: tuple[SourceHealth, ...]
 
     @property
     def duration_s(self) -> float:
@@ -211,6 +214,12 @@ class SessionScan:
         buses = tuple(
             scan.bus.result(scan.topic, bitrate) for _, scan in found if scan.bus is not None
         )
+        sources = tuple(
+            source
+            for _, scan in found
+            if scan.ends is not None and scan.kind is not None
+            for source in measure_sources(scan.kind, *scan.ends)
+        )
         types = {channel.topic: channel.type_name for channel in channels}
         chain = self._robot.joint_names if self._robot is not None else ()
         seen = [joint.name for joint in joints if joint.topic == STATES]
@@ -225,6 +234,8 @@ class SessionScan:
         findings += judge_joints(joints, start_ns)
         for bus in buses:
             findings += judge_bus(bus, start_ns)
+        for source in sources:
+            findings += judge_source(source)
         findings.sort(key=lambda finding: -finding.weight)
         return SessionMeasures(
             robot=self._robot.name if self._robot is not None else None,
@@ -235,6 +246,7 @@ class SessionScan:
             series=series,
             joints=joints,
             buses=buses,
+            sources=sources,
         )
 
     def _joints(self, scans: list[tuple[int, ChannelScan]]) -> tuple[JointHealth, ...]:
