@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 
 
 def view(
-    file: Path,
+    file: Path | None = None,
     /,
     *,
+    live: Path | None = None,
     save: Path | None = None,
     web: bool = False,
+    connect: str | None = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -31,23 +33,57 @@ def view(
     it can be made again from the session at any time. The session stays on this machine; the
     viewer counts its own use on its makers' server, which `rerun analytics disable` ends.
 
+    With `--live` it shows a session while it is recorded; the recorder never waits for it.
+
     Example: `undulog view run.mcap --save run.rrd`
 
     Args:
         file: The session, `.mcap`.
-        save: Write the recording to this `.rrd` file instead of opening the viewer.
+        live: Instead of a file, the socket that a recorder on this machine sends to.
+        save: Write the recording to this `.rrd` file instead of opening the viewer. Of what is
+            recorded live, one session, when it has ended.
         web: Serve the viewer to a browser on this machine (127.0.0.1 only) until interrupted.
+        connect: With `--live`: send to a Rerun viewer that runs already, by its address, e.g.
+            `rerun+http://127.0.0.1:9876/proxy`.
         force: Replace the recording if it is there.
         json: Print one JSON object: what was written and what is missing. Needs `--save`.
     """
-    if save is not None and web:
-        raise UsageError("--save writes a file and --web serves one; give one of them")
-    if json and save is None:
-        raise UsageError("--json reports what --save wrote; give --save X.rrd as well")
+    _check_usage(file, live, save=save, web=web, connect=connect, json=json)
     if save is not None:
         if save.suffix.lower() != ".rrd":
             raise UsageError(f"{save}: a Rerun recording; end its name in .rrd")
         refuse_existing(save, force=force)
+    if live is not None:
+        from .live_cli import view_live
+
+        view_live(live, save=save, web=web, connect=connect, json=json)
+    elif file is not None:
+        _view_file(file, save=save, web=web, json=json)
+
+
+def _check_usage(
+    file: Path | None,
+    live: Path | None,
+    *,
+    save: Path | None,
+    web: bool,
+    connect: str | None,
+    json: bool,
+) -> None:
+    if (file is None) == (live is None):
+        raise UsageError("give a session to see, or --live with the recorder's socket")
+    if connect is not None and live is None:
+        raise UsageError("--connect sends what is recorded now; give --live as well")
+    if connect is not None and (web or save is not None):
+        raise UsageError("--connect sends to a viewer; give it without --web and --save")
+    if save is not None and web:
+        raise UsageError("--save writes a file and --web serves one; give one of them")
+    if json and save is None:
+        raise UsageError("--json reports what --save wrote; give --save X.rrd as well")
+
+
+def _view_file(file: Path, *, save: Path | None, web: bool, json: bool) -> None:
+    if save is not None:
         recording, duration_s = _convert(file, save)
         _report(recording, duration_s, json=json)
         return

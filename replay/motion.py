@@ -16,8 +16,11 @@ from .tracks import Track, resampled
 
 BODY_RATE_HZ = 50.0
 
-_POSITION = [f"pose.pose.position.{axis}" for axis in "xyz"]
-_ORIENTATION = [f"pose.pose.orientation.{axis}" for axis in "xyzw"]
+POSE = [
+    *(f"pose.pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+]
+"""Position [m] and orientation of an Odometry."""
 
 
 @dataclass(frozen=True)
@@ -97,17 +100,39 @@ def read_head(
     odometry = session.channels.get("/odom")
     if odometry is None or not odometry.count:
         warnings.append("no /odom in the session: the head is held at the origin")
-        t_ns = positions[0].t_ns
-        still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (t_ns.size, 1))
-        return HeadPath(t_ns, still[:, :3], still[:, 3:], tracked=False)
+        return still_head(positions[0].t_ns)
     table = session.table("/odom")
     child, head = str(table["child_frame_id"].iloc[0]), robot.links[0].name
     if child != head:
         warnings.append(f"/odom is of {child or 'no frame'}; it is taken as the head link {head}")
-    t_ns, pose = ordered(
-        table.index.to_numpy(dtype=np.int64),
-        table[_POSITION + _ORIENTATION].to_numpy(dtype=np.float64),
-    )
+    pose = table[POSE].to_numpy(dtype=np.float64)
+    return tracked_head(table.index.to_numpy(dtype=np.int64), pose)
+
+
+def still_head(t_ns: IntArray) -> HeadPath:
+    """The head at the origin, where nobody tracked it.
+
+    Args:
+        t_ns: Times [ns], shape (n,).
+
+    Returns:
+        The path.
+    """
+    still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (t_ns.size, 1))
+    return HeadPath(t_ns, still[:, :3], still[:, 3:], tracked=False)
+
+
+def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
+    """The head's path from odometry.
+
+    Args:
+        t_ns: Sampling times [ns], shape (n,).
+        pose: Columns as in :data:`POSE`, shape (n, 7).
+
+    Returns:
+        The path in the order of its times; NaN where there is no orientation.
+    """
+    t_ns, pose = ordered(t_ns, pose)
     norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         quaternion = pose[:, 3:] / norm  # NaN where the tracker wrote zeros: no pose

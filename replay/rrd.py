@@ -35,7 +35,8 @@ from .views import body_title
 
 APPLICATION = "undulog"
 
-_DRAWN = {"/joint_states", "/joint_commands", "/gait"}
+DRAWN = {"/joint_states", "/joint_commands", "/gait"}
+"""JointState topics that have views of their own."""
 _NAMESPACE = uuid.UUID("8f4b6f0e-6f0a-5d3f-9a53-5d1f7a3f2c11")
 
 
@@ -131,7 +132,7 @@ def write_recording(
             rec.send_blueprint(layout(content))
         finally:
             rec.disconnect()
-        _require_whole(draft, path)
+        require_whole(draft, path)
     return Recording(path, identity, content, told)
 
 
@@ -238,7 +239,7 @@ def _log_signals(
     """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
     found: list[Signal] = []
     for (topic, field), tracks in sources.columns.items():
-        if topic in _DRAWN or field != "position" or not tracks:
+        if topic in DRAWN or field != "position" or not tracks:
             continue
         names = [track.name for track in tracks]
         of_joints = bool(set(names) & set(palette))
@@ -289,8 +290,16 @@ def _save(rec: rr.RecordingStream, draft: Path, path: Path) -> None:
         raise LogWriteError(path, f"can't be written: {error}") from error
 
 
-def _require_whole(draft: Path, path: Path) -> None:
-    """Check that the file has its footer: Rerun only logs that its disk was full."""
+def require_whole(draft: Path, path: Path) -> None:
+    """Check that a recording has its footer: Rerun only logs that its disk was full.
+
+    Args:
+        draft: The file.
+        path: What it will be called, for the message.
+
+    Raises:
+        LogWriteError: If it isn't whole.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")

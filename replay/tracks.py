@@ -15,8 +15,10 @@ from capture.log.signals import JointSignals
 
 from .sampling import ordered
 
-_JOINT_STATE = "sensor_msgs/msg/JointState"
-_OFFSETS = ("/joint_sample_offset", "/joint_command_offset")
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+OFFSETS = ("/joint_sample_offset", "/joint_command_offset")
+"""JointState topics that say when, not what."""
 
 Columns = dict[tuple[str, str], tuple["Track", ...]]
 """(topic, field of the JointState) to tracks."""
@@ -67,7 +69,7 @@ def read_columns(session: Session) -> Columns:
     wanted = {
         topic: ["position", *(["velocity", "effort"] if topic == "/joint_states" else [])]
         for topic, channel in session.channels.items()
-        if channel.type_name == _JOINT_STATE and channel.count and topic not in _OFFSETS
+        if channel.type_name == JOINT_STATE and channel.count and topic not in OFFSETS
     }
     try:
         columns = session.joint_columns(wanted)

@@ -1,0 +1,162 @@
+"""The relay's end of the live feed: a socket that is read at once, and a bounded queue.
+
+A thread reads the socket, so that a slow picture doesn't fill it; when the queue is full the oldest
+messages go.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from capture.daemon.live_wire import MAX_DATAGRAM, DatagramHead, Kind, read_head
+from capture.errors import DataError, UsageError
+
+_LOOK_S = 0.2
+
+
+class Datagram(NamedTuple):
+    """One datagram, its head read.
+
+    Attributes:
+        head: Its head.
+        data: All its bytes.
+    """
+
+    head: DatagramHead
+    data: bytes
+
+
+class Inbox:
+    """Binds the socket and reads it until it is left."""
+
+    def __init__(self, path: Path, *, max_bytes: int = 16 << 20) -> None:
+        """Bind, and begin to read.
+
+        Args:
+            path: Where the socket will be; one that nobody reads is replaced.
+            max_bytes: How many bytes wait at most to be shown.
+
+        Raises:
+            UsageError: If another relay reads there, or the socket can't be made.
+        """
+        self.path = path
+        self.dropped = 0
+        """Messages that were dropped here because showing them took too long."""
+        self.refused = 0
+        """Datagrams that were none of ours."""
+        self._max_bytes = max_bytes
+        self._queue: deque[Datagram] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()
+        self._socket, self._file = _bind(path)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._read, name="live inbox", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """Nothing to do: it reads."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop reading and remove the socket."""
+        self.close()
+
+    def close(self) -> None:
+        """Stop reading and remove the socket, unless another relay has taken its place."""
+        self._ending.set()
+        self._thread.join()
+        self._socket.close()
+        try:
+            if self.path.stat().st_ino == self._file:
+                self.path.unlink()
+        except FileNotFoundError:
+            return
+
+    def take(self) -> list[Datagram]:
+        """What has come since the last time, in order.
+
+        Returns:
+            The datagrams.
+        """
+        with self._lock:
+            taken = list(self._queue)
+            self._queue.clear()
+            self._bytes = 0
+        return taken
+
+    def _read(self) -> None:
+        while not self._ending.is_set():
+            try:
+                data = self._socket.recv(MAX_DATAGRAM)
+            except TimeoutError:
+                continue
+            try:
+                head = read_head(data)
+            except DataError:
+                self.refused += 1
+                continue
+            with self._lock:
+                self._queue.append(Datagram(head, data))
+                self._bytes += len(data)
+                if self._bytes > self._max_bytes:
+                    self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        """Drop the oldest messages; the last of repeated definitions stay."""
+        kept: dict[bytes, Datagram] = {}
+        while self._queue and self._bytes > self._max_bytes:
+            oldest = self._queue.popleft()
+            self._bytes -= len(oldest.data)
+            if oldest.head.kind is Kind.MESSAGES:
+                self.dropped += oldest.head.messages
+            else:
+                kept[_said(oldest)] = oldest
+        self._queue.extendleft(reversed(kept.values()))
+        self._bytes += sum(len(one.data) for one in kept.values())
+
+
+def _said(datagram: Datagram) -> bytes:
+    """What tells definitions from their repetition: all but the counter in the head."""
+    return bytes([datagram.head.kind]) + datagram.data[-(len(datagram.data) - 24) :]
+
+
+def _bind(path: Path) -> tuple[socket.socket, int]:
+    """A socket of that name which only its owner may write to, and its inode."""
+    if path.exists() and not path.is_socket():
+        raise UsageError(f"{path} is there and is no socket; choose another name")
+    if path.is_socket() and _answers(path):
+        raise UsageError(f"{path}: another live view reads there")
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    link.settimeout(_LOOK_S)
+    # Bound under another name, closed to others, then renamed: nobody finds it open before.
+    draft = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        link.bind(str(draft))
+        draft.chmod(0o600)
+        inode = draft.stat().st_ino
+        draft.replace(path)
+    except OSError as error:
+        link.close()
+        draft.unlink(missing_ok=True)
+        raise UsageError(f"{path}: the socket can't be made: {error.strerror or error}") from error
+    return link, inode
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        try:
+            link.connect(str(path))
+        except OSError:
+            return False
+    return True
