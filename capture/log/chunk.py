@@ -19,7 +19,7 @@ from ..arrays import IntArray
 PREFIX_SIZE = 9
 """Opcode (u8) and length (u64) before each record's body."""
 
-Buffer = bytes | mmap.mmap
+Buffer = bytes | bytearray | mmap.mmap
 
 
 @dataclass
@@ -37,6 +37,7 @@ class Block:
         index_at: Channel id to the file offset of its MessageIndex record.
         offsets: Channel id to message offsets in the payload; filled where there is no index.
         complete: False for a chunk that the end of the file cuts short.
+        part: Which file of the session it is in, from 0.
     """
 
     start: int
@@ -49,6 +50,7 @@ class Block:
     index_at: dict[int, int] = field(default_factory=dict[int, int])
     offsets: dict[int, IntArray] | None = None
     complete: bool = True
+    part: int = 0
 
 
 def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
@@ -75,6 +77,24 @@ def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
         frame = cast("Any", lz4.frame.LZ4FrameDecompressor())  # the package has no types
         return bytes(frame.decompress(raw, max_length=size))
     raise RuntimeError(f"unknown compression {compression!r}")
+
+
+def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
+    """Decompress a zstd frame into memory that is there already: no page of it is new.
+
+    Args:
+        raw: The compressed bytes, one frame.
+        room: As much memory as the frame should need.
+
+    Returns:
+        Bytes that the frame has; at most one more than there is room for is found out.
+
+    Raises:
+        zstandard.ZstdError: If the frame is damaged.
+    """
+    with zstandard.ZstdDecompressor().stream_reader(raw, closefd=False) as reader:
+        size = reader.readinto(room)  # all at once, since there is room for the whole frame
+        return size + len(reader.read(1))
 
 
 def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:

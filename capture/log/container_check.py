@@ -18,7 +18,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from .chunk import PREFIX_SIZE, inflate, walk_records
-from .storage import MAGIC
+from .mcap_file import MAGIC
 
 _CHUNK = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
 _PIECE = 1 << 24

@@ -1,69 +1,96 @@
-"""MCAP as blocks of messages: what the file holds and where, without decoding it.
+"""A session as blocks of messages: one file, the parts of a split one, or what a crash left.
 
-A :class:`Block` is one chunk (or the unchunked part of a file) with the offsets of each
-channel's messages. An indexed file is opened from its summary alone; a file without one
-(truncated, or written without an index) is walked record by record, and what could not be read
-is said in ``warnings``.
-
-Format: https://mcap.dev/spec.
+Naming any part opens the whole. What only the write-ahead log of a recorder has follows the
+files' blocks as one more block, in memory; nothing on the disk is changed.
 """
 
 from __future__ import annotations
 
-import mmap
-import struct
-import zlib
-from collections import OrderedDict
-from collections.abc import Callable
-from io import BytesIO
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol
 
 import numpy as np
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
-from .chunk import PREFIX_SIZE, Block, Buffer, inflate, walk_records
-
-MAGIC = b"\x89MCAP0\r\n"
-_FOOTER_SIZE = 1 + 8 + 20
-_MAX_BLOCK_SIZE = 1 << 30
-_CACHE_SIZE = 64 << 20
-
-_Record = TypeVar("_Record")
+from .chunk import Block, Buffer
+from .mcap_file import McapFile
+from .message_heads import read_heads
+from .part_files import PartFiles, first_part, open_parts
+from .part_names import PART_RECORD
+from .wal_tail import MessageKey, WalContents, WalTail, beyond, read_wal
 
 
-class _NoSummaryError(Exception):
-    """The file can't be opened from its summary."""
+class _Part(Protocol):
+    """What has blocks."""
+
+    def payload(self, block: Block) -> tuple[Buffer, int]: ...
+    def payload_once(self, block: Block) -> tuple[Buffer, int, int]: ...
+    def inflates(self, block: Block, limit: int) -> bool: ...
+    def inflate_into(self, block: Block, room: memoryview) -> None: ...
+    def entries(self, block: Block, channel_id: int) -> bytes: ...
+    def offsets(self, block: Block, channel_id: int) -> IntArray: ...
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What was put together of a session that was not finalised.
+
+    Attributes:
+        folder: Its write-ahead log.
+        live: Whether its recorder is still writing.
+        in_files: Messages that the files have.
+        from_wal: Messages that only the write-ahead log has.
+        accepted: Messages that the recorder accepted; None where nothing tells.
+    """
+
+    folder: Path
+    live: bool
+    in_files: int
+    from_wal: int
+    accepted: int | None
+
+    @property
+    def missing(self) -> int | None:
+        """Messages that were accepted and are in neither; None where nothing tells."""
+        if self.accepted is None:
+            return None
+        return max(0, self.accepted - self.in_files - self.from_wal)
+
+    def __str__(self) -> str:
+        """One sentence."""
+        total = self.in_files + self.from_wal
+        if self.live:
+            return (
+                f"this recording is running: its first {total} messages are read, "
+                f"{self.from_wal} of them from its write-ahead log"
+            )
+        missing = (
+            "how many are missing can't be told" if self.missing is None else "none is missing"
+        )
+        if self.missing:
+            missing = f"{self.missing} of {self.accepted} are missing"
+        return (
+            f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
+            f"from its write-ahead log; {missing}; 'undulog log recover' writes a whole file"
+        )
 
 
 class LogFile:
-    """An MCAP file, memory-mapped, as blocks, channels, schemas, metadata and attachments."""
+    """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
 
     def __init__(self, path: Path) -> None:
-        """Open a file and find what it holds.
+        """Open a session and find what it holds.
 
         Args:
-            path: The MCAP file.
+            path: Its file, any of its parts, or a folder that holds it and no other.
 
         Raises:
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
-            LogError: If the operating system can't open it.
+            LogError: If the operating system can't open it, or a folder holds several sessions.
         """
         self.path = path
         self.warnings: list[str] = []
@@ -76,18 +103,30 @@ class LogFile:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, Attachment] = {}
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
-        self._cache: OrderedDict[int, Buffer] = OrderedDict()
-        self._buffer = self._map()
+        self.recovered: Recovered | None = None
+        self._sources: list[_Part] = []
+        first = first_part(path)
+        wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
+        self.parts: PartFiles = open_parts(first, bare=wal is not None)
         try:
-            self._load()
+            for file in self.files:
+                self._join(file)
+            self.warnings += self.parts.missing
+            if wal is not None:
+                self._join_wal(wal)
+            self._require_channels()
         except BaseException:
             self.close()
             raise
 
+    @property
+    def files(self) -> list[McapFile]:
+        """The files that were opened, in order; a block's ``part`` counts them from 0."""
+        return list(self.parts.files.values())
+
     def close(self) -> None:
-        """Release the mapping."""
-        self._cache.clear()
-        self._buffer.close()
+        """Release everything."""
+        self.parts.close()
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """The uncompressed bytes of a block, and where in them the message offsets count from.
@@ -101,16 +140,7 @@ class LogFile:
         Raises:
             LogError: If the payload can't be decompressed or its CRC doesn't fit.
         """
-        if not block.compression:
-            return self._buffer, block.start
-        if block.start in self._cache:
-            self._cache.move_to_end(block.start)
-            return self._cache[block.start], 0
-        data = self._decompress(block)
-        self._cache[block.start] = data
-        while len(self._cache) > 1 and sum(map(len, self._cache.values())) > _CACHE_SIZE:
-            self._cache.popitem(last=False)
-        return data, 0
+        return self._sources[block.part].payload(block)
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
         """The uncompressed bytes of a block, checked, and not kept in memory for later.
@@ -124,15 +154,7 @@ class LogFile:
         Raises:
             LogError: If the payload can't be decompressed or its CRC doesn't fit.
         """
-        if block.compression:
-            data = self._decompress(block)
-            return data, 0, len(data)
-        if block.crc and block.complete:
-            with memoryview(self._buffer) as whole, whole[block.start : block.stop] as payload:
-                if zlib.crc32(payload) != block.crc:
-                    where = f"the chunk at byte {block.start}"
-                    raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
-        return self._buffer, block.start, block.stop
+        return self._sources[block.part].payload_once(block)
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
         """Where a channel's message records start in a block's payload.
@@ -147,262 +169,154 @@ class LogFile:
         Raises:
             LogError: If the index or the payload is damaged.
         """
-        if block.offsets is None and block.index_at:
-            if channel_id not in block.index_at:
-                return np.empty(0, dtype=np.int64)
-            return self._message_index(block, block.index_at[channel_id], channel_id)
-        if block.offsets is None:  # a chunk that was written without a message index
-            block.offsets = self._walk_block(block)
-        return block.offsets.get(channel_id, np.empty(0, dtype=np.int64))
+        return self._sources[block.part].offsets(block, channel_id)
 
-    # -- opening ---------------------------------------------------------------------------
+    def inflates(self, block: Block, limit: int) -> bool:
+        """Whether :meth:`inflate_into` can be used: a whole zstd chunk of no more than ``limit``.
 
-    def _map(self) -> mmap.mmap:
-        try:
-            with self.path.open("rb") as stream:
-                if not stream.read(1):
-                    raise NotALogError(self.path, "the file is empty (0 bytes)")
-                return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except FileNotFoundError as error:
-            raise LogError(self.path, "no such file") from error
-        except OSError as error:
-            raise LogError(self.path, f"can't be opened: {error.strerror}") from error
+        Args:
+            block: One of ``blocks``.
+            limit: Largest size wanted [byte].
 
-    def _load(self) -> None:
-        if self._buffer[: len(MAGIC)] != MAGIC:
-            found = bytes(self._buffer[: len(MAGIC)]).hex(" ")
-            raise NotALogError(
-                self.path,
-                f"not an MCAP file (it starts with {found}); "
-                "'undulog import' reads CAN logs and CSV files",
-            )
-        try:
-            self._load_summary()
-        except _NoSummaryError as why:
-            self.blocks.clear()
-            self.counts.clear()
-            self.appendices.clear()
-            self._scan()
-            self.warnings.append(f"{why}; read record by record")
-        if not self.channels:
-            raise NotALogError(self.path, "an MCAP file without any channel that could be read")
-        self.blocks.sort(key=lambda block: block.start)
+        Returns:
+            False for a block that only :meth:`payload` can read.
+        """
+        return self._sources[block.part].inflates(block, limit)
 
-    def _load_summary(self) -> None:
-        """Fill in everything from the summary.
+    def inflate_into(self, block: Block, room: memoryview) -> None:
+        """Decompress a block into memory that is there already, and check it.
+
+        Args:
+            block: One for which :meth:`inflates` holds.
+            room: As many bytes as it has.
 
         Raises:
-            _NoSummaryError: If the file has no whole summary; says why.
+            LogError: If it can't be decompressed or its CRC doesn't fit.
         """
-        summary_start, footer = self._summary_range()
-        indexes: list[tuple[int, int]] = []  # opcode of the indexed record, its offset
-        statistics: Statistics | None = None
-        try:
-            for opcode, start, stop in walk_records(self._buffer, len(MAGIC), footer):
-                self._take(opcode, start, stop)
-                break  # the header is the first record
-            for opcode, start, stop in walk_records(self._buffer, summary_start, footer):
-                if opcode == Opcode.CHUNK_INDEX:
-                    self.blocks.append(self._block(self._parse(ChunkIndex.read, start, stop)))
-                elif opcode == Opcode.STATISTICS:
-                    statistics = self._parse(Statistics.read, start, stop)
-                elif opcode == Opcode.ATTACHMENT_INDEX:
-                    entry = self._parse(AttachmentIndex.read, start, stop)
-                    indexes.append((Opcode.ATTACHMENT, entry.offset))
-                elif opcode == Opcode.METADATA_INDEX:
-                    entry = self._parse(MetadataIndex.read, start, stop)
-                    indexes.append((Opcode.METADATA, entry.offset))
-                else:
-                    self._take(opcode, start, stop)
-            for opcode, offset in sorted(indexes, key=lambda index: index[1]):  # file order
-                self._take(opcode, *self._record_at(offset))
-        except (LogError, McapError, struct.error, ValueError) as error:
-            raise _NoSummaryError(f"the summary is damaged ({error})") from error
-        if statistics is None or not self.channels:
-            raise _NoSummaryError("the summary does not list the channels")
-        if statistics.message_count and not self.blocks:
-            raise _NoSummaryError("the file has no chunk index")
-        if statistics.attachment_count + statistics.metadata_count != len(indexes):
-            raise _NoSummaryError("the summary does not list all attachments and metadata")
-        self.counts = dict(statistics.channel_message_counts)
+        self._sources[block.part].inflate_into(block, room)
 
-    def _summary_range(self) -> tuple[int, int]:
-        """First byte of the summary, and of the footer."""
-        buffer = self._buffer
-        footer = len(buffer) - len(MAGIC) - _FOOTER_SIZE
-        if footer < len(MAGIC) or buffer[-len(MAGIC) :] != MAGIC or buffer[footer] != Opcode.FOOTER:
-            raise _NoSummaryError("the file is cut short (no footer)")
-        (summary_start,) = struct.unpack_from("<Q", buffer, footer + PREFIX_SIZE)
-        if not len(MAGIC) <= summary_start < footer:
-            raise _NoSummaryError("the file has no summary")
-        return summary_start, footer
+    def entries(self, block: Block, channel_id: int) -> bytes:
+        """A channel's message index in a block: log time and offset (u64 each) of each message.
 
-    def _take(self, opcode: int, start: int, stop: int, data: Buffer | None = None) -> None:
-        """Note a record that reads alike in the data section, in a chunk and in the summary."""
-        if opcode == Opcode.HEADER:
-            header = self._parse(Header.read, start, stop, data)
-            self.profile, self.library = header.profile, header.library
-        elif opcode == Opcode.SCHEMA:
-            schema = self._parse(Schema.read, start, stop, data)
-            self.schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = self._parse(Channel.read, start, stop, data)
-            self.channels[channel.id] = channel
-        elif opcode == Opcode.ATTACHMENT:
-            attachment = self._parse(Attachment.read, start, stop, data)
-            self.attachments[attachment.name] = attachment
-            self.appendices.append(attachment)
-        elif opcode == Opcode.METADATA:
-            metadata = self._parse(Metadata.read, start, stop, data)
-            self.metadata.setdefault(metadata.name, {}).update(metadata.metadata)
-            self.appendices.append(metadata)
+        Args:
+            block: One of ``blocks``.
+            channel_id: The channel.
 
-    def _block(self, index: ChunkIndex) -> Block:
-        """The block of a chunk index; the chunk's own header is checked against it."""
-        at, file_size = index.chunk_start_offset, len(self._buffer)
-        if not (len(MAGIC) <= at and at + index.chunk_length <= file_size):
-            raise LogError(self.path, f"a chunk index points to byte {at}, outside the file")
-        block = self._chunk_at(at + PREFIX_SIZE, at + index.chunk_length)
-        block.index_at = dict(index.message_index_offsets)
-        return block
+        Returns:
+            16 bytes a message, in the order of the index; nothing is checked but its size.
 
-    def _chunk_at(self, start: int, stop: int) -> Block:
-        """The block of the chunk record whose body is [start, stop), possibly cut short."""
-        fixed = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
-        begin, end, size, crc, name_size = fixed.unpack_from(self._buffer, start)
-        data_at = start + fixed.size + name_size + 8
-        if data_at > stop:
-            raise LogError(self.path, f"the chunk at byte {start} is cut in its header")
-        name = self._buffer[start + fixed.size : data_at - 8].decode("ascii", "replace")
-        (data_size,) = struct.unpack_from("<Q", self._buffer, data_at - 8)
-        data_stop = min(data_at + data_size, stop)
-        complete = data_at + data_size <= stop
-        return Block(data_at, data_stop, name, size, crc, begin, end, complete=complete)
+        Raises:
+            LogError: If the index or the payload is damaged.
+        """
+        return self._sources[block.part].entries(block, channel_id)
 
-    def _scan(self) -> None:
-        """Fill in everything by walking the records from the first to the last whole one."""
-        buffer, end = self._buffer, len(self._buffer)
-        loose = Block(0, end, "", end, 0, 2**63 - 1, 0, offsets={})
-        loose_at: dict[int, list[int]] = {}
-        at = len(MAGIC)
-        while at + PREFIX_SIZE <= end:
-            opcode = buffer[at]
-            (length,) = struct.unpack_from("<Q", buffer, at + 1)
-            start, stop = at + PREFIX_SIZE, at + PREFIX_SIZE + length
-            if stop > end or opcode == 0:
-                self._salvage(opcode, start, end)
-                break
-            try:
-                self._scan_record(opcode, start, stop, loose, loose_at)
-            except (McapError, struct.error, ValueError, LogError) as error:
-                self.warnings.append(f"the record at byte {at} is damaged and was skipped: {error}")
-            if opcode == Opcode.DATA_END:
-                break
-            at = stop
-        if loose_at:
-            loose.offsets = {k: np.array(v, dtype=np.int64) for k, v in loose_at.items()}
-            self._count(loose.offsets)
-            self.blocks.append(loose)
+    # -- putting together ------------------------------------------------------------------
 
-    def _scan_record(
-        self, opcode: int, start: int, stop: int, loose: Block, loose_at: dict[int, list[int]]
-    ) -> None:
-        if opcode == Opcode.CHUNK:
-            self._scan_chunk(self._chunk_at(start, stop))
-        elif opcode == Opcode.MESSAGE:
-            channel_id, _, log_time = struct.unpack_from("<HIQ", self._buffer, start)
-            loose_at.setdefault(channel_id, []).append(start - PREFIX_SIZE)
-            loose.start_ns = min(loose.start_ns, log_time)
-            loose.end_ns = max(loose.end_ns, log_time)
+    def _require_channels(self) -> None:
+        if not self.channels:
+            raise NotALogError(self.path, "an MCAP file without any channel that could be read")
+
+    def _join(self, file: McapFile) -> None:
+        several = len(self.parts.files) > 1
+        self.warnings += [
+            f"{file.path.name}: {text}" if several else text for text in file.warnings
+        ]
+        self.profile = self.profile or file.profile
+        self.library = self.library or file.library
+        self.schemas |= file.schemas
+        self.channels |= file.channels
+        for item in file.appendices:
+            self._keep(item)
+        self._add(file, file.blocks, file.counts)
+
+    def _add(self, source: _Part, blocks: list[Block], counts: dict[int, int]) -> None:
+        for block in blocks:
+            block.part = len(self._sources)
+        self._sources.append(source)
+        self.blocks += blocks
+        for channel_id, count in counts.items():
+            self.counts[channel_id] = self.counts.get(channel_id, 0) + count
+
+    def _keep(self, item: Attachment | Metadata) -> None:
+        """Note a metadata record or attachment; each part repeats those of the session."""
+        if item.name == PART_RECORD or (len(self._sources) and item in self.appendices):
+            return
+        self.appendices.append(item)
+        if isinstance(item, Attachment):
+            self.attachments[item.name] = item
         else:
-            self._take(opcode, start, stop)
+            self.metadata.setdefault(item.name, {}).update(item.metadata)
 
-    def _scan_chunk(self, block: Block) -> None:
-        block.offsets = self._walk_block(block)
-        self._count(block.offsets)
-        self.blocks.append(block)
+    def _join_wal(self, wal: WalContents) -> None:
+        self._define(wal)
+        self._leave_cut_chunk(wal)
+        in_files = sum(self.counts.values())
+        rest = beyond(wal.messages, self._last_keys(len(wal.messages)))
+        if rest:
+            tail = WalTail(rest)
+            self._add(tail, tail.blocks, tail.counts)
+        accepted = wal.accepted if wal.messages else None
+        self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted)
+        self.warnings.append(str(self.recovered))
+        self.warnings += wal.warnings
 
-    def _salvage(self, opcode: int, start: int, end: int) -> None:
-        """Read what there is of the last record, which the end of the file cuts short."""
-        if opcode == Opcode.CHUNK:
+    def _define(self, wal: WalContents) -> None:
+        """Take from a write-ahead log what the files don't explain themselves."""
+        for item in wal.definitions:
+            if isinstance(item, Header):
+                self.profile = self.profile or item.profile
+                self.library = self.library or item.library
+            elif isinstance(item, Schema):
+                self.schemas.setdefault(item.id, item)
+            elif isinstance(item, Channel):
+                self.channels.setdefault(item.id, item)
+            elif item not in self.appendices:
+                self._keep(item)
+
+    def _leave_cut_chunk(self, wal: WalContents) -> None:
+        """Leave out a chunk that the file's end cuts short where the log has all of it, whole."""
+        last = self.files[-1] if self.files else None
+        if last is None or not last.cut:
+            return
+        expected = [text for text in last.warnings if _is_of_the_end(text)]
+        several = len(self.files) > 1
+        dropped = {f"{last.path.name}: {text}" if several else text for text in expected}
+        self.warnings = [text for text in self.warnings if text not in dropped]
+        block = self.blocks[-1] if self.blocks else None
+        if block is None or block.complete or not wal.messages:
+            return
+        found = {key: len(at) for key, at in (block.offsets or {}).items()}
+        whole = sum(self.counts.values()) - sum(found.values())
+        if wal.messages[0].position - 1 <= whole:
+            self.blocks.pop()
+            for channel_id, count in found.items():
+                self.counts[channel_id] -= count
+
+    def _last_keys(self, least: int) -> set[MessageKey]:
+        """The keys of the files' last messages, at least so many where there are."""
+        keys: set[MessageKey] = set()
+        for block in reversed(self.blocks):
+            if len(keys) >= least:
+                break
+            ids = block.offsets if block.offsets is not None else block.index_at
+            offsets = [self.offsets(block, channel_id) for channel_id in ids]
+            if not offsets:
+                continue
             try:
-                block = self._chunk_at(start, end)
-                block.complete = False
-                self._scan_chunk(block)
-            except (McapError, struct.error, ValueError, LogError) as error:
-                self.warnings.append(f"nothing of the last, cut chunk could be read: {error}")
-                return
-            found = sum(len(at) for at in (block.offsets or {}).values())
-            got = len(self.payload(block)[0])
-            self.warnings.append(
-                f"the last chunk is cut short: {found} messages of it could be read "
-                f"({got} of {block.size} bytes)"
-            )
-        else:
-            self.warnings.append(f"the last {end - start + PREFIX_SIZE} bytes are a cut record")
+                data, base = self.payload(block)
+                stop = len(data) if block.compression else block.stop
+                heads = read_heads(data, np.concatenate(offsets) + base, stop)
+            except LogError:  # told where its messages are read
+                continue
+            if heads is not None:
+                columns = (heads[name].tolist() for name in ("channel", "sequence", "log"))
+                keys.update(zip(*columns, strict=True))
+        return keys
 
-    def _count(self, offsets: dict[int, IntArray]) -> None:
-        for channel_id, at in offsets.items():
-            self.counts[channel_id] = self.counts.get(channel_id, 0) + len(at)
 
-    # -- records ---------------------------------------------------------------------------
-
-    def _record_at(self, offset: int) -> tuple[int, int]:
-        for _, start, stop in walk_records(self._buffer, offset, len(self._buffer)):
-            return start, stop
-        raise LogError(self.path, f"an index points to byte {offset}, where no record is")
-
-    def _parse(
-        self,
-        read: Callable[[ReadDataStream], _Record],
-        start: int,
-        stop: int,
-        data: Buffer | None = None,
-    ) -> _Record:
-        body = (self._buffer if data is None else data)[start:stop]
-        return read(ReadDataStream(BytesIO(body)))
-
-    def _walk_block(self, block: Block) -> dict[int, IntArray]:
-        """Offsets by channel of a payload without index; schemas and channels are noted."""
-        data, base = self.payload(block)
-        found: dict[int, list[int]] = {}
-        end = len(data) if block.compression else block.stop
-        for opcode, start, stop in walk_records(data, base, end):
-            if opcode == Opcode.MESSAGE:
-                (channel_id,) = struct.unpack_from("<H", data, start)
-                found.setdefault(channel_id, []).append(start - PREFIX_SIZE - base)
-            else:
-                self._take(opcode, start, stop, data)
-        return {channel_id: np.array(at, dtype=np.int64) for channel_id, at in found.items()}
-
-    def _message_index(self, block: Block, at: int, channel_id: int) -> IntArray:
-        start, stop = self._record_at(at)
-        if self._buffer[at] != Opcode.MESSAGE_INDEX or stop - start < 6:
-            raise LogError(self.path, f"no message index at byte {at}")
-        found_id, size = struct.unpack_from("<HI", self._buffer, start)
-        if found_id != channel_id or size != stop - start - 6 or size % 16:
-            raise LogError(self.path, f"the message index at byte {at} is damaged")
-        entries = np.frombuffer(self._buffer[start + 6 : stop], dtype="<u8").reshape(-1, 2)
-        offsets = entries[:, 1].astype(np.int64)
-        if offsets.size and not (offsets.min() >= 0 and offsets.max() + PREFIX_SIZE <= block.size):
-            raise LogError(self.path, f"the message index at byte {at} points outside its chunk")
-        return offsets
-
-    # -- payloads --------------------------------------------------------------------------
-
-    def _decompress(self, block: Block) -> bytes:
-        where = f"the chunk at byte {block.start}"
-        if block.size > _MAX_BLOCK_SIZE:
-            raise LogError(self.path, f"{where} claims {block.size} bytes; at most 1 GiB is read")
-        raw = self._buffer[block.start : block.stop]
-        try:
-            data = inflate(block.compression, raw, block.size, whole=block.complete)
-        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-            raise LogError(self.path, f"{where} can't be decompressed: {error}") from error
-        if not block.complete:
-            return data
-        if len(data) != block.size:
-            raise LogError(self.path, f"{where} has {len(data)} bytes, not {block.size}")
-        if block.crc and zlib.crc32(data) != block.crc:
-            raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
-        return data
+def _is_of_the_end(warning: str) -> bool:
+    """Whether a warning only says that a file was not finalised."""
+    return (
+        warning.startswith(("the file is cut short", "the last ", "nothing of the last"))
+        or "cut record" in warning
+    )
