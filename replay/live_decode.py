@@ -17,7 +17,7 @@ from capture.daemon.live_wire import LiveMessage
 from capture.errors import DataError, RobotFileError
 from capture.log.cdr import Layout, layout_of
 from capture.log.joint_reader import OFFSET_TOPICS
-from capture.log.joint_rows import JointRows, merge_rows, own_times
+from capture.log.joint_rows import JointRows, merge_rows
 from capture.log.rosmsg import MessageType, parse_message_type
 from capture.log.sink import Description
 from capture.robot import Robot
@@ -37,6 +37,10 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _RANGE = "sensor_msgs/msg/Range"
 _STRING = "std_msgs/msg/String"
 _LOG = "rcl_interfaces/msg/Log"
+
+
+_Offsets = dict[str, tuple[IntArray, FloatArray]]
+"""Joint to stamps [ns] and sample time minus stamp [s]."""
 
 
 @dataclass
@@ -111,12 +115,16 @@ class LiveLog:
         self._topics: dict[int, _Topic] = {}
         self._files: dict[str, str] = {}
         self._robot: Robot | None = None
-        self._offsets: dict[str, list[JointRows]] = {}
+        self._offsets: dict[str, _Offsets] = {}
+        self._robot_is_read = True
         self._shift_ns: int | None = None
 
     @property
     def robot(self) -> Robot | None:
         """The robot, or None while none is described."""
+        if not self._robot_is_read:
+            self._robot_is_read = True
+            self._read_robot()
         return self._robot
 
     def unit(self, topic: str) -> str:
@@ -144,7 +152,7 @@ class LiveLog:
                 text = record.data.decode("utf-8", "replace")
                 if self._files.get(record.name) != text:
                     self._files[record.name] = text
-                    self._read_robot()
+                    self._robot_is_read = False
             case _:
                 return
 
@@ -185,19 +193,17 @@ class LiveLog:
         self._topics[channel.id] = _Topic(channel, schema, kind)
 
     def _read_robot(self) -> None:
-        """Read the robot, once its databases are there."""
-        text = self._files.get("robot.toml")
-        if text is None:
+        """Read the robot from the files that have come so far."""
+        if "robot.toml" not in self._files:
             return
         try:
+            text = self._files["robot.toml"]
             self._robot = parse_robot(text, source="robot.toml", databases=self._files)
         except RobotFileError as error:
             self._robot = None
-            note = f"the robot description can't be used: {error}"
-            if not any(name.endswith(".dbc") for name in self._files):
-                return  # its databases may be on their way
-            if note not in self.notes:
-                self.notes.append(note)
+            self.notes[:] = [f"the robot description can't be used: {error}"]
+        else:
+            self.notes.clear()
 
     # -- messages --------------------------------------------------------------------------
 
@@ -227,36 +233,48 @@ class LiveLog:
         fields = ("position", "velocity", "effort") if name == "/joint_states" else ("position",)
         groups = self._groups(topic, messages)
         if name in OFFSETS:
-            kept = self._offsets.setdefault(name, [])
-            kept += [self._joint_rows(group, "position") for group in groups]
-            del kept[:-_OFFSETS_KEPT]
+            self._keep_offsets(name, [self._joint_rows(group, "position") for group in groups])
             return
+        own: dict[tuple[str, int], IntArray] = {}  # the fields of a message share their times
         for one in fields:
             rows = [self._joint_rows(group, one) for group in groups]
-            tracks = self._tracks(name, one, [row for row in rows if row.values.size])
+            tracks = self._tracks(name, one, [row for row in rows if row.values.size], own)
             if tracks:
                 batch.columns[name, one] = tracks
 
-    def _tracks(self, topic: str, one: str, rows: Sequence[JointRows]) -> tuple[Track, ...]:
+    def _tracks(
+        self,
+        topic: str,
+        one: str,
+        rows: Sequence[JointRows],
+        own: dict[tuple[str, int], IntArray],
+    ) -> tuple[Track, ...]:
         names, times, values = merge_rows(rows, topic, one, _say_nothing)
-        offsets = self._joint_offsets(topic)
+        offsets = self._offsets.get(OFFSET_TOPICS.get(topic, ""), {})
         found: dict[str, Track] = {}
         for name, t_ns, column in zip(names, times, values, strict=True):
-            own = own_times(t_ns, *offsets[name]) if name in offsets else t_ns
-            track = without_filler(Track(name, *ordered(own, column)))
+            if name in offsets:
+                key = name, t_ns.size
+                if key not in own:
+                    own[key] = _own_times(t_ns, *offsets[name])
+                t_ns = own[key]  # noqa: PLW2901
+            track = without_filler(Track(name, *ordered(t_ns, column)))
             if np.isfinite(track.values).any():
                 found[name] = track
-        chain = self._robot.joint_names if self._robot is not None else ()
+        chain = self.robot.joint_names if self.robot is not None else ()
         inside = [found[name] for name in chain if name in found]
         return (*inside, *(track for name, track in found.items() if name not in chain))
 
-    def _joint_offsets(self, topic: str) -> dict[str, tuple[IntArray, FloatArray]]:
-        """Joint to stamps and sample time minus stamp [s]."""
-        kept = self._offsets.get(OFFSET_TOPICS.get(topic, ""))
-        if not kept:
-            return {}
-        names, times, values = merge_rows(kept, topic, "position", _say_nothing)
-        return {n: (t, v) for n, t, v in zip(names, times, values, strict=True)}
+    def _keep_offsets(self, topic: str, rows: Sequence[JointRows]) -> None:
+        """Keep the last sample times relative to the stamp; none where all are zero."""
+        kept = self._offsets.setdefault(topic, {})
+        names, times, values = merge_rows(rows, topic, "position", _say_nothing)
+        if not kept and not any(column.any() for column in values):
+            return  # sampled together
+        for name, t_ns, column in zip(names, times, values, strict=True):
+            old_t, old = kept.get(name, (t_ns[:0], column[:0]))
+            joined = ordered(np.concatenate([old_t, t_ns]), np.concatenate([old, column]))
+            kept[name] = joined[0][-_OFFSETS_KEPT:], joined[1][-_OFFSETS_KEPT:]
 
     def _joint_rows(self, group: _Group, one: str) -> JointRows:
         strings = group.layout.strings
@@ -321,6 +339,13 @@ def _learn(topic: _Topic, example: bytes) -> Layout:
     topic.known.append(layout)
     del topic.known[:-_LAYOUTS_KEPT]
     return layout
+
+
+def _own_times(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
+    """Stamps plus the offset that was logged with each, or last before it [ns], shape (n,)."""
+    last = np.maximum(np.searchsorted(stamp_ns, t_ns, side="right") - 1, 0)
+    offset = np.nan_to_num(offset_s[last], nan=0.0, posinf=0.0, neginf=0.0)
+    return t_ns + np.rint(offset * _NS).astype(np.int64)
 
 
 def _say_nothing(_sentence: str) -> None:

@@ -137,8 +137,8 @@ class LiveScene:
         self._measured.write(rec, clock, measured, palette)
         self._commanded.write(rec, clock, commanded)
         window = self._window.tracks("/joint_states"), self._window.tracks("/joint_commands")
-        errors = self._fresh.tracks("error", joints.tracking_errors(*window))
-        self._errors.write(rec, clock, errors, palette)
+        new = self._fresh.tracks("error", window[0])
+        self._errors.write(rec, clock, joints.tracking_errors(new, window[1]), palette)
         self._choose_places(window[1] or window[0])
         if self._places is not None and (measured or commanded):
             joints.log_places(
