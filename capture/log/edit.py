@@ -184,7 +184,8 @@ def edited_log(
         LogWriteError: If it can't be written; nothing is left behind then.
         UndulogError: If a stop was requested.
     """
-    refuse_output(output, [source.path for source in sources], force=force)
+    read = [path for source in sources for path in (source.path, *source.paths)]
+    refuse_output(output, read, force=force)
     profiles = {source.file.profile for source in sources}
     with part_file(output) as part:
         with part.open("wb") as stream:

@@ -76,7 +76,9 @@ def judge_file(health: FileHealth) -> list[Finding]:
         The findings.
     """
     found = [Finding(2, sentence) for sentence in health.damage]
-    if health.truncated:
+    if health.unfinished:
+        found.append(Finding(0 if health.running else 1, health.unfinished))
+    elif health.truncated:
         found.append(Finding(1, "the file is cut short: what came after the cut is lost"))
     elif not health.indexed:
         found.append(Finding(1, "the file has no usable index and can only be read from the start"))

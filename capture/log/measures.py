@@ -138,6 +138,8 @@ class FileHealth:
         truncated: Whether the end is missing.
         indexed: Whether it has the summary and the chunk index.
         notes: What the reader said when it opened the file.
+        unfinished: What was put together of a session that was not finalised; empty where it was.
+        running: Whether its recorder is still writing.
     """
 
     chunks: int
@@ -147,3 +149,5 @@ class FileHealth:
     truncated: bool
     indexed: bool
     notes: tuple[str, ...]
+    unfinished: str = ""
+    running: bool = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -71,6 +72,31 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
         found.close()
         raise
     return found
+
+
+def check_chain(parts: PartFiles) -> list[str]:
+    """Hold each part against the hash that the next one has of it.
+
+    Args:
+        parts: The files of a session.
+
+    Returns:
+        What doesn't fit, one sentence each.
+    """
+    wrong: list[str] = []
+    for number, file in parts.files.items():
+        stated = file.metadata.get(PART_RECORD, {}).get("previous_sha256")
+        former = parts.files.get(number - 1)
+        if stated is None or former is None:
+            continue
+        with former.path.open("rb") as stream:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+        if found != stated:
+            wrong.append(
+                f"{former.path.name} is not the file that {file.path.name} was recorded after: "
+                "its hash is another"
+            )
+    return wrong
 
 
 def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:

@@ -25,6 +25,7 @@ from .storage import LogFile
 _LENGTH = struct.Struct("<Q")
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
 _BODY_AT = PREFIX_SIZE + _FIXED.size
+_PIECE = 1 << 20
 
 
 class RawMessage(NamedTuple):
@@ -52,7 +53,7 @@ class RawLog:
         """Open a log and find what an edit must know of it.
 
         Args:
-            path: The MCAP file.
+            path: The MCAP file; of a split session any part, or the folder.
 
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
@@ -61,8 +62,8 @@ class RawLog:
         self.path = path
         self.file = LogFile(path)
         self.warnings = list(self.file.warnings)
-        with path.open("rb") as stream:
-            self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        self.paths = [file.path for file in self.file.files]
+        self.sha256 = _hash(self.paths)
         filled = [block for block in self.file.blocks if block.end_ns]
         self.start_ns = min((block.start_ns for block in filled), default=0)
         self.end_ns = max((block.end_ns for block in filled), default=0)
@@ -138,19 +139,21 @@ class RawLog:
         Returns:
             At most one message a channel; of equal log times, the later in the file.
         """
-        last: dict[int, tuple[int, int, RawMessage]] = {}  # with log time and place of its block
-        backward = sorted(self.file.blocks, key=lambda block: (block.end_ns, block.start))[::-1]
+        # With log time, and file and place of its block.
+        last: dict[int, tuple[tuple[int, int, int], RawMessage]] = {}
+        backward = sorted(self.file.blocks, key=lambda b: (b.end_ns, b.part, b.start))[::-1]
         for block in backward:
             if block.end_ns and block.start_ns >= before_ns:
                 continue
-            open_ids = {k for k in channel_ids if k not in last or last[k][0] <= block.end_ns}
+            open_ids = {k for k in channel_ids if k not in last or last[k][0][0] <= block.end_ns}
             if not open_ids:
                 break
             for message in self._block_messages(block, open_ids, 0, before_ns):
-                found = (message.log_time_ns, block.start, message)
-                if found[:2] >= last.get(message.channel_id, (-1, -1))[:2]:
-                    last[message.channel_id] = found
-        return sorted((found[2] for found in last.values()), key=lambda m: m.log_time_ns)
+                place = (message.log_time_ns, block.part, block.start)
+                former = last.get(message.channel_id)
+                if former is None or place >= former[0]:
+                    last[message.channel_id] = (place, message)
+        return sorted((message for _, message in last.values()), key=lambda m: m.log_time_ns)
 
     def _block_messages(
         self, block: Block, channel_ids: Collection[int], start_ns: int, stop_ns: int
@@ -174,7 +177,7 @@ class RawLog:
             channel_id, sequence, log_ns, publish_ns = _FIXED.unpack_from(data, at + PREFIX_SIZE)
             if channel_id in channel_ids:
                 if start_ns <= log_ns < stop_ns:
-                    message = data[at + _BODY_AT : end]
+                    message = bytes(data[at + _BODY_AT : end])
                     yield RawMessage(log_ns, channel_id, sequence, publish_ns, message)
             elif channel_id not in self.file.channels:
                 unknown += 1
@@ -204,6 +207,16 @@ class RawLog:
 
 def _loose_places(block: Block) -> Iterator[int]:
     yield from sorted(at for found in (block.offsets or {}).values() for at in found.tolist())
+
+
+def _hash(paths: list[Path]) -> str:
+    """SHA-256 of one file, or of all parts one after the other."""
+    total = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as stream:
+            while piece := stream.read(_PIECE):
+                total.update(piece)
+    return total.hexdigest()
 
 
 def _robot_name(log_file: LogFile) -> str:

@@ -17,8 +17,10 @@ from ..robot.description import parse_robot
 from .chunk import Block
 from .container_check import Container, check_chunk, check_container
 from .health import judge_file
+from .mcap_file import McapFile
 from .measures import FileHealth
 from .message_heads import read_heads
+from .part_files import check_chain
 from .session_scan import SessionMeasures, SessionScan
 from .storage import LogFile
 from .topics import Topics
@@ -49,7 +51,7 @@ def check_session(
     """Measure and judge a session from its data alone.
 
     Args:
-        path: An MCAP file, of any make.
+        path: An MCAP file, of any make; of a split session any part, or the folder.
         on_part: Told how much has been read, 0 to 1.
 
     Returns:
@@ -100,12 +102,52 @@ class _Check:
     # -- reading ---------------------------------------------------------------------------
 
     def _read(self, on_part: Callable[[float], None]) -> FileHealth:
-        path, blocks = self._file.path, self._file.blocks
+        log_file = self._file
+        total = max(1, len(log_file.blocks))
+        done = 0
+
+        def step() -> None:
+            nonlocal done
+            done += 1
+            on_part(done / total)
+
+        several = len(log_file.files) > 1
+        found = [
+            _with_name(self._read_file(part, file, step), file.path.name if several else "")
+            for part, file in enumerate(log_file.files)
+        ]
+        for block in log_file.blocks:
+            if block.part >= len(found):  # from the write-ahead log, checked when it was read
+                self._read_block(block, Container(), log_file.path)
+                step()
+        recovered = log_file.recovered
+        told = [*log_file.parts.missing, *check_chain(log_file.parts)]
+        if recovered is not None and recovered.missing:
+            told.append(
+                f"{recovered.missing} of {recovered.accepted} messages that the recorder accepted "
+                "are missing"
+            )
+        return FileHealth(
+            chunks=sum(one.chunks for one in found),
+            checked=sum(one.checked for one in found),
+            without_crc=sum(one.without_crc for one in found),
+            damage=(*(text for one in found for text in one.damage), *told),
+            truncated=any(one.truncated for one in found),
+            indexed=all(one.indexed for one in found),
+            notes=(*(text for one in found for text in one.notes), *self._notes),
+            unfinished="" if recovered is None else str(recovered),
+            running=recovered is not None and recovered.live,
+        )
+
+    def _read_file(self, part: int, file: McapFile, step: Callable[[], None]) -> FileHealth:
+        path = file.path
+        blocks = [block for block in self._file.blocks if block.part == part]
         container = check_container(path)
         loose = [block for block in blocks if block.complete]
         indexed = not container.truncated and all(b.index_at for b in loose if b.end_ns)
-        skipped = [note for note in self._file.warnings if note.startswith("the record at byte")]
-        notes = [note for note in self._file.warnings if note not in skipped]
+        skipped = [note for note in file.warnings if note.startswith("the record at byte")]
+        # Of what was not finalised, the write-ahead log knows more than the file's end.
+        notes = [note for note in file.warnings if note not in skipped and not self._file.recovered]
         damage = [*container.damage, *skipped]
         read = {block.start for block in blocks}
         for place in container.chunks.values():
@@ -117,14 +159,14 @@ class _Check:
             wrong = check_chunk(path, place)
             damage.append(wrong or f"the chunk at byte {place.start} is missing in the index")
         checked = without_crc = 0
-        for done, block in enumerate(blocks):
+        for block in blocks:
             try:
-                crc = self._read_block(block, container)
+                crc = self._read_block(block, container, path)
                 checked += crc
                 without_crc += not crc and block.start in container.chunks
             except LogError as error:
                 damage.append(str(error).removeprefix(f"{path}: "))
-            on_part((done + 1) / len(blocks))
+            step()
         return FileHealth(
             chunks=len(container.chunks),
             checked=checked,
@@ -132,7 +174,7 @@ class _Check:
             damage=tuple(damage),
             truncated=container.truncated,
             indexed=indexed,
-            notes=(*notes, *self._notes),
+            notes=tuple(notes),
         )
 
     def _against_summary(self, file: FileHealth) -> FileHealth:
@@ -147,7 +189,7 @@ class _Check:
         ]
         return replace(file, damage=tuple(wrong))
 
-    def _read_block(self, block: Block, container: Container) -> bool:
+    def _read_block(self, block: Block, container: Container, path: Path) -> bool:
         """Read one block; whether a CRC was there and fits."""
         data, base = self._file.payload(block)  # its CRC is checked where it is compressed
         chunk = container.chunks.get(block.start)
@@ -155,7 +197,7 @@ class _Check:
         plain = chunk is not None and not block.compression and chunk.crc
         if plain and zlib.crc32(data[block.start : block.stop]) != block.crc:
             where = f"the chunk at byte {block.start}"
-            raise LogError(self._file.path, f"{where} is corrupt (its CRC doesn't fit)")
+            raise LogError(path, f"{where} is corrupt (its CRC doesn't fit)")
         keys = list(block.offsets if block.offsets is not None else block.index_at)
         if not keys:
             keys = list(self._scan.keys)
@@ -165,7 +207,7 @@ class _Check:
         twice = any((np.diff(offsets) == 0).any() for offsets in found)
         if heads is None or twice or (heads["channel"] != owners).any():
             where = f"the message index of the chunk at byte {block.start}"
-            raise LogError(self._file.path, f"{where} does not list its messages")
+            raise LogError(path, f"{where} does not list its messages")
         begin = 0
         for key, offsets in zip(keys, found, strict=True):
             if len(offsets) and key in self._scan.keys:
@@ -201,6 +243,17 @@ class _Check:
         if kind is not None and kind.name != type_name:  # a second type on one topic
             kind = None
         self._scan.define(key, channel.topic, type_name, kind, channel.metadata)
+
+
+def _with_name(health: FileHealth, name: str) -> FileHealth:
+    """The health of one part, its sentences beginning with its name."""
+    if not name:
+        return health
+    return replace(
+        health,
+        damage=tuple(f"{name}: {text}" for text in health.damage),
+        notes=tuple(f"{name}: {text}" for text in health.notes),
+    )
 
 
 def _reasons(text: str) -> tuple[str, ...]:
