@@ -1,0 +1,81 @@
+"""What error frames say: a node in trouble, a controller off the bus and back.
+
+An error frame is one with :data:`capture.log.frames.ERROR_FLAG`; its identifier holds the classes
+of error and its data the details, as in ``linux/can/error.h``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..log.frames import ERROR_FLAG, ID_MASK, FrameArray
+from .events import Tally
+
+BUS_OFF = 0x40
+"""Error class: the controller left the bus."""
+RESTARTED = 0x100
+"""Error class: the controller is back."""
+
+_CLASSES = {
+    0x001: "transmit time-out",
+    0x002: "lost arbitration",
+    0x004: "controller problem",
+    0x008: "protocol violation",
+    0x010: "transceiver problem",
+    0x020: "no acknowledgement",
+    0x080: "bus error",
+    0x200: "error counters changed",
+}
+_CONTROLLER = 0x004
+_CONTROLLER_STATES = {
+    0x01: "receive buffer overflow",
+    0x02: "transmit buffer overflow",
+    0x04: "reception warning level",
+    0x08: "transmission warning level",
+    0x10: "reception error passive",
+    0x20: "transmission error passive",
+    0x40: "error active again",
+}
+
+
+class BusWatch:
+    """Counts error frames and tells what they mean."""
+
+    def __init__(self) -> None:
+        """Start with a bus that is well."""
+        self._off = False
+
+    def look(self, frames: FrameArray, tally: Tally) -> None:
+        """Look through frames.
+
+        Args:
+            frames: What came, in order.
+            tally: Where to count and tell.
+        """
+        ids = frames["id_flags"]
+        is_error = (ids & ERROR_FLAG) != 0
+        errors = int(np.count_nonzero(is_error))
+        if self._off and errors < len(frames):
+            self._back(tally)
+        if not errors:
+            return
+        tally.counts.error_frames += errors
+        for frame in frames[is_error]:
+            self._tell(int(frame["id_flags"]) & ID_MASK, frame["data"].tolist(), tally)
+
+    def _tell(self, classes: int, data: list[int], tally: Tally) -> None:
+        if classes & RESTARTED:
+            self._off = True  # even if the frame that said so was missed
+            self._back(tally)
+        if classes & BUS_OFF and not self._off:
+            self._off = True
+            tally.events.say("error", "bus-off: the controller left the bus")
+        said = [text for bit, text in _CLASSES.items() if classes & bit]
+        if classes & _CONTROLLER:
+            said += [text for bit, text in _CONTROLLER_STATES.items() if data[1] & bit]
+        if said or not classes & (RESTARTED | BUS_OFF):
+            tally.events.say("warn", f"error frame: {', '.join(said) or 'no class given'}")
+
+    def _back(self, tally: Tally) -> None:
+        self._off = False
+        tally.events.say("info", "the controller is back on the bus")

@@ -1,0 +1,199 @@
+"""CAN interfaces of the Linux kernel, drained in bulk from a raw socket.
+
+The kernel stamps each frame when it comes and counts what it had to drop because nobody fetched
+it, so a stall of the recorder neither blurs times nor hides losses. The socket is never written to;
+whether the controller itself is listen-only is set when the interface is brought up
+(``ip link set can0 type can bitrate 1000000 listen-only on``).
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..errors import SourceError
+from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
+from ..robot import ClockDomain
+from .contract import SourceAddress
+from .events import Tally
+from .link import LinkedSource
+from .receive_many import (
+    SO_RCVBUFFORCE,
+    SO_RXQ_OVFL,
+    SO_TIMESTAMPNS,
+    Batch,
+    ReceiveMany,
+    enlarge_buffer,
+    on_session_clock,
+)
+
+CAN_MTU = 16
+"""Bytes of a classic frame, ``struct can_frame``."""
+CANFD_MTU = 72
+"""Bytes of a CAN FD frame, ``struct canfd_frame``."""
+
+_CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's name for it is missing in its type hints
+_CAN_FRAME = np.dtype([("id", "=u4"), ("len", "u1"), ("pad", "V3"), ("data", "u1", (8,))])
+_BUFFER_BYTES = 8 << 20
+_PACKETS = 256
+_MOST_BATCHES = 64
+
+
+def frames_of(batch: Batch, t_host_ns: np.ndarray[tuple[int], np.dtype[np.uint64]]) -> FrameArray:
+    """Turn the kernel's frames into ours.
+
+    Args:
+        batch: Packets of a raw CAN socket; those that aren't classic frames are left out.
+        t_host_ns: Their arrival [Unix ns], shape (n,).
+
+    Returns:
+        The classic frames; device and host time are both the arrival.
+    """
+    classic = batch.sizes == CAN_MTU
+    raw = np.ascontiguousarray(batch.packets[classic, :CAN_MTU]).view(_CAN_FRAME)[:, 0]
+    frames = empty_frames(len(raw))
+    frames["t_device_ns"] = frames["t_host_ns"] = t_host_ns[classic]
+    frames["id_flags"] = raw["id"]
+    frames["dlc"] = raw["len"]
+    local = (batch.flags[classic] & socket.MSG_DONTROUTE) != 0
+    frames["dir"] = np.where(local, DIR_TX, DIR_RX)
+    frames["data"] = raw["data"]
+    return frames
+
+
+class SocketcanLink:
+    """An open raw CAN socket."""
+
+    detail = "never transmits"
+
+    def __init__(self, sock: socket.socket, tally: Tally) -> None:
+        """Take over a bound socket.
+
+        Args:
+            sock: The socket.
+            tally: Where to count.
+        """
+        self._socket = sock
+        self._tally = tally
+        self._receive = ReceiveMany(_PACKETS, CANFD_MTU + 1)
+        self._drops = 0
+        self._floor_ns = tally.now_ns()
+        self._error: OSError | None = None
+
+    def read(self, now_ns: int) -> Sequence[FrameArray]:
+        """Drain the socket.
+
+        Args:
+            now_ns: The session's clock [Unix ns].
+
+        Returns:
+            The frames.
+
+        Raises:
+            OSError: If the interface went down or away.
+        """
+        if self._error is not None:
+            raise self._error
+        found: list[FrameArray] = []
+        for _ in range(_MOST_BATCHES):
+            wall_ns, now_ns = time.time_ns(), self._tally.now_ns()
+            try:
+                batch = self._receive.receive(self._socket.fileno())
+            except OSError as error:
+                self._error = error  # first hand out what came before
+                break
+            if len(batch.sizes):
+                times = on_session_clock(batch.stamps_ns, now_ns, wall_ns, self._floor_ns)
+                found.append(frames_of(batch, times))
+                self._count(batch)
+            if len(batch.sizes) < self._receive.capacity:
+                self._floor_ns = now_ns
+                break
+        if not found and self._error is not None:
+            raise self._error
+        return found
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _count(self, batch: Batch) -> None:
+        fd = int(np.count_nonzero(batch.sizes == CANFD_MTU))
+        if fd:
+            self._tally.events.say("warn", "CAN FD frame left out", fd)
+        odd = len(batch.sizes) - fd - int(np.count_nonzero(batch.sizes == CAN_MTU))
+        self._tally.malformed("packet that is no CAN frame", odd)
+        if batch.drops is not None and batch.drops != self._drops:
+            lost = (batch.drops - self._drops) % 2**32
+            self._drops = batch.drops
+            self._tally.counts.dropped = (self._tally.counts.dropped or 0) + lost
+            self._tally.events.say("warn", "frame dropped by the kernel", lost)
+
+
+def open_socketcan(interface: str, tally: Tally) -> SocketcanLink:
+    """Open a raw socket on an interface.
+
+    Args:
+        interface: E.g. ``can0``.
+        tally: Where to count.
+
+    Returns:
+        The open link.
+
+    Raises:
+        OSError: If there is no such interface, or it is down: it may come.
+    """
+    sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        enlarge_buffer(sock, SO_RCVBUFFORCE, socket.SO_RCVBUF, _BUFFER_BYTES)
+        every_class = struct.pack("=I", socket.CAN_ERR_MASK)
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, every_class)
+        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        sock.bind((interface,))
+    except OSError:
+        sock.close()
+        raise
+    tally.counts.dropped = tally.counts.dropped or 0
+    return SocketcanLink(sock, tally)
+
+
+def socketcan_source(
+    address: SourceAddress, channel: str, facts: Mapping[str, str], *, directions: bool
+) -> LinkedSource:
+    """Make the source of an interface.
+
+    Args:
+        address: What was asked for.
+        channel: The interface, e.g. ``can0``.
+        facts: For the session's metadata.
+        directions: Whether this computer is the robot's own: then the frames that it sends are
+            commands, and the kernel tells them apart.
+
+    Returns:
+        The source; nothing is opened.
+
+    Raises:
+        SourceError: If this computer's kernel has no CAN sockets.
+    """
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as error:
+        raise SourceError(
+            address.text,
+            f"this computer's kernel offers no CAN sockets ({error.strerror}); "
+            "load its modules (modprobe can_raw), or use another interface",
+        ) from error
+    return LinkedSource(
+        address,
+        lambda tally: open_socketcan(channel, tally),
+        place=channel,
+        clock=ClockDomain.HOST,
+        facts=facts,
+        directions=directions,
+    )

@@ -1,0 +1,161 @@
+"""CAN buses served over TCP by socketcand, its raw mode read in bulk.
+
+The server's own times of the frames are kept, to the microsecond, as the device's clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+from collections.abc import Mapping, Sequence
+
+from ..log.frames import FrameArray
+from ..robot import ClockDomain
+from .contract import SourceAddress
+from .events import Tally
+from .link import LinkedSource
+from .socketcand_text import SocketcandText
+
+PORT = 29536
+"""Where socketcand listens unless told otherwise."""
+
+_CONNECT_S = 5.0
+_CHUNK = 1 << 18
+_MOST_BYTES = 1 << 21
+_LONGEST_ANSWER = 4096
+
+
+class SocketcandLink:
+    """An open connection in raw mode."""
+
+    detail = "never transmits"
+
+    def __init__(self, sock: socket.socket, first: bytes, tally: Tally) -> None:
+        """Take over a connection.
+
+        Args:
+            sock: In raw mode.
+            first: What came already behind the last answer.
+            tally: Where to count.
+        """
+        self._socket = sock
+        self._first = first
+        self._text = SocketcandText()
+        self._tally = tally
+        self._error: OSError | None = None
+        sock.setblocking(False)
+
+    def read(self, now_ns: int) -> Sequence[FrameArray]:
+        """Take what the server sent.
+
+        Args:
+            now_ns: The session's clock [Unix ns].
+
+        Returns:
+            The frames.
+
+        Raises:
+            OSError: If the connection is broken.
+        """
+        if self._error is not None:
+            raise self._error
+        chunks = [self._first] if self._first else []
+        self._first = b""
+        size = 0
+        try:
+            while size < _MOST_BYTES:
+                chunk = self._socket.recv(_CHUNK)
+                if not chunk:
+                    raise ConnectionResetError(errno.ECONNRESET, "the server closed the connection")
+                chunks.append(chunk)
+                size += len(chunk)
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            if not chunks:
+                raise
+            self._error = error  # first hand out what came before
+        if not chunks:
+            return ()
+        return (self._text.feed(b"".join(chunks), now_ns, self._tally),)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+def open_socketcand(host: str, port: int, channel: str, tally: Tally) -> SocketcandLink:
+    """Connect, open the bus and go to raw mode.
+
+    Args:
+        host: Name or address.
+        port: TCP port.
+        channel: The bus, as the server calls it.
+        tally: Where to count.
+
+    Returns:
+        The open link.
+
+    Raises:
+        OSError: If the server isn't there, has no such bus, or speaks something else.
+    """
+    sock = socket.create_connection((host, port), timeout=_CONNECT_S)
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # A server whose computer lost its power says no farewell: ask, after 5 s of silence.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        rest = _expect(sock, b"", b"hi")
+        sock.sendall(b"< open %s >" % channel.encode())
+        rest = _expect(sock, rest, b"ok")
+        sock.sendall(b"< rawmode >")
+        rest = _expect(sock, rest, b"ok")
+    except OSError:
+        sock.close()
+        raise
+    return SocketcandLink(sock, rest, tally)
+
+
+def socketcand_source(
+    address: SourceAddress, host: str, port: int, channel: str, facts: Mapping[str, str]
+) -> LinkedSource:
+    """Make the source of a served bus.
+
+    Args:
+        address: What was asked for.
+        host: Name or address of the server.
+        port: Its TCP port.
+        channel: The bus, as the server calls it.
+        facts: For the session's metadata.
+
+    Returns:
+        The source; nothing is opened.
+    """
+    return LinkedSource(
+        address,
+        lambda tally: open_socketcand(host, port, channel, tally),
+        place=f"{channel} at {host}:{port}",
+        clock=ClockDomain.DEVICE,
+        facts=facts,
+    )
+
+
+def _expect(sock: socket.socket, rest: bytes, word: bytes) -> bytes:
+    """Wait for an answer; returns what came behind it."""
+    while b">" not in rest:
+        chunk = sock.recv(4096)
+        if not chunk:
+            raise ConnectionResetError(errno.ECONNRESET, "the server closed the connection")
+        rest += chunk
+        if len(rest) > _LONGEST_ANSWER:
+            break
+    answer, _, rest = rest.partition(b">")
+    if answer.replace(b"<", b"").strip() != word:
+        said = answer.decode("ascii", "replace").strip()[:80]
+        with contextlib.suppress(OSError):
+            sock.shutdown(socket.SHUT_RDWR)
+        raise OSError(errno.EPROTO, f"the server says {said!r} instead of '< {word.decode()} >'")
+    return rest
