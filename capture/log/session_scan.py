@@ -302,6 +302,21 @@ class SessionScan:
         ]
         return min((second for second in every if second is not None), default=None)
 
+    def last_load(self, topic: str) -> tuple[float, float] | None:
+        """Load of a bus in its last whole second.
+
+        Args:
+            topic: The bus's topic.
+
+        Returns:
+            Part of the bitrate without and with the most stuff bits; None where unknown.
+        """
+        buses = [scan for scan in self._scans.values() if scan.bus is not None and scan.count]
+        for scan in buses:
+            if scan.topic == topic and scan.bus is not None:
+                return scan.bus.last_second(self._bitrate(buses))
+        return None
+
     def _bitrate(self, buses: list[ChannelScan]) -> int | None:
         """The described bus's bitrate, where it is clear which one that is."""
         if self._robot is None or self._robot.bus is None or len(buses) != 1:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import IntArray
 
 NS = 1_000_000_000
 
@@ -37,6 +37,7 @@ SEQUENCE_COUNTS = 0.5
 constant, or a counter shared by all channels, does not."""
 
 _BINS_PER_OCTAVE = 64
+_QUANTILES = (0.25, 0.5, 0.75, 0.99)
 _OCTAVES = 48  # 1 ns to 78 h
 _BINS = _BINS_PER_OCTAVE * _OCTAVES
 
@@ -133,21 +134,21 @@ class TimingTally:
             self._longest = int(steps[longest]), int(starts[longest])
         size = steps.astype(np.float64)
         bins = np.minimum((np.log2(size) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
-        sums = [np.bincount(bins, weight, _BINS) for weight in (None, size, size**2)]
-        self._bins += np.array(sums)
+        for row, weight in zip(self._bins, (1.0, size, size**2), strict=True):
+            np.add.at(row, bins, weight)
 
     def result(self) -> Timing:
         """What the samples so far say."""
-        number, total, squares = self._bins
+        number, total, squares = self._bins[:, self._bins[0] > 0]
         intervals = int(number.sum())
         median = std = p99 = None
         regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0
         if intervals:
-            median = _quantile(number, total, 0.5)
-            spread = _quantile(number, total, 0.75) - _quantile(number, total, 0.25)
-            regular = intervals >= MIN_INTERVALS and spread <= REGULAR_SPREAD * median
-            p99 = _quantile(number, total, 0.99)
-            mean = np.divide(total, number, out=np.zeros(_BINS), where=number > 0)
+            mean = total / number
+            reached = np.cumsum(number)
+            places = np.searchsorted(reached, np.array(_QUANTILES) * intervals)
+            low, median, high, p99 = mean[places].tolist()
+            regular = intervals >= MIN_INTERVALS and high - low <= REGULAR_SPREAD * median
             long = (mean > GAP_PERIODS * median) & regular
             gaps = int(number[long].sum())
             lost = number * np.rint(mean / median - 1) * long
@@ -174,13 +175,6 @@ class TimingTally:
             duplicates=self._duplicates,
             backward=self._backward,
         )
-
-
-def _quantile(number: FloatArray, total: FloatArray, part: float) -> float:
-    """Mean of the bin that the quantile falls into."""
-    reached = np.cumsum(number)
-    at = int(np.searchsorted(reached, part * float(number.sum())))
-    return float(total[at] / number[at])
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,344 @@
+"""The verdict on a running recording is the one that its finished file gets."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.records import Metadata
+
+from capture import SessionWriter, load_robot
+from capture.daemon.live_health import LiveHealth
+from capture.daemon.tapped_sink import TappedSink
+from capture.log.diagnostics import OK, DiagnosticStatus
+from capture.log.frames import ERROR_FLAG, empty_frames
+from capture.log.freeze import FreezeTally, RangeTally
+from capture.log.mcap_sink import McapSink
+from capture.log.session_check import SessionHealth, check_session
+from capture.log.session_scan import SessionMeasures
+from capture.log.sink import Description, MessageSink
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NS = 1_000_000_000
+STEP_NS = 10_000_000
+ROBOT = load_robot("snake25")
+NAMES = ROBOT.joint_names
+
+
+class Lossy:
+    """A sink that loses every message whose number a draw hits; others keep their numbers."""
+
+    def __init__(self, sink: MessageSink, rng: np.random.Generator, part: float) -> None:
+        self._sink, self._rng, self._part = sink, rng, part
+
+    def define(self, record: Description) -> None:
+        self._sink.define(record)
+
+    def write(
+        self, channel_id: int, log_ns: int, publish_ns: int, number: int, data: bytes
+    ) -> None:
+        if self._rng.random() >= self._part:
+            self._sink.write(channel_id, log_ns, publish_ns, number, data)
+
+    def close(self, last: tuple[Metadata, ...]) -> None:
+        self._sink.close(last)
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong in a recording, as parts of the ticks or as whole ticks."""
+
+    seed: int
+    ticks: int
+    lost: float
+    skipped: float
+    nan: float
+    frozen: int
+    back: float
+    late: float
+    clipped: bool
+    gap: int
+    dropped: int
+    updates: float
+
+
+faults = st.builds(
+    Faults,
+    seed=st.integers(0, 2**32),
+    ticks=st.integers(1, 900),
+    lost=st.sampled_from([0.0, 0.0, 0.01, 0.3]),
+    skipped=st.sampled_from([0.0, 0.0, 0.02, 0.2]),
+    nan=st.sampled_from([0.0, 0.0, 0.002, 0.2]),
+    frozen=st.integers(0, 25),
+    back=st.sampled_from([0.0, 0.0, 0.01]),
+    late=st.sampled_from([0.0, 1e6, 5e6]),
+    clipped=st.booleans(),
+    gap=st.sampled_from([0, 0, 30, 500]),
+    dropped=st.sampled_from([0, 0, 7, 100_000]),
+    updates=st.sampled_from([0.0, 0.01, 0.5]),
+)
+
+
+def record(path: Path, wrong: Faults) -> SessionMeasures:
+    """A recording of up to 9 s with faults; what was said of it live, at its end."""
+    rng = np.random.default_rng(wrong.seed)
+    health = LiveHealth(ROBOT)
+    sink = Lossy(TappedSink(McapSink(path), [health]), rng, wrong.lost)
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT, sink=sink) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
+        current = writer.joint_state("/joint_current", NAMES, unit="A")
+        sonar = writer.range(
+            "/sonar", frame="head", min_range=0.1, max_range=4.0, field_of_view=0.2
+        )
+        bus, said = writer.frames("/can/can0"), writer.log("/rosout")
+        diagnostics = writer.diagnostics()
+        limit = ROBOT.joints[0].upper
+        after = 0
+        for tick in range(wrong.ticks):
+            if tick == wrong.ticks // 2:
+                after = wrong.gap
+            log_ns = EPOCH_NS + (tick + after) * STEP_NS
+            t_ns = log_ns + int(rng.normal(0.0, wrong.late))
+            if rng.random() < wrong.back:
+                t_ns -= 3 * STEP_NS
+            command = 0.4 * np.sin(np.pi * tick / 100 - 0.5 * np.arange(len(NAMES)))
+            angles = command + rng.normal(0.0, 1e-3, len(NAMES))
+            angles[: wrong.frozen] = 0.1
+            if wrong.clipped:
+                angles[20] = np.clip(3 * command[20], -limit, limit)
+            angles[rng.random(len(NAMES)) < wrong.nan] = np.nan
+            commands.write(t_ns, command, log_time_ns=log_ns)
+            if rng.random() >= wrong.skipped:
+                states.write(t_ns, angles, command, log_time_ns=log_ns)
+            if tick % 3 == 0:
+                current.write(t_ns, angles, log_time_ns=log_ns)
+                sonar.write(t_ns, np.nan if rng.random() < wrong.nan else 1.0, log_time_ns=log_ns)
+            frames = empty_frames(int(rng.integers(0, 30)))
+            frames["t_host_ns"] = log_ns + np.arange(len(frames)) * 1000
+            frames["dlc"] = 8
+            frames["id_flags"][rng.random(len(frames)) < wrong.nan] = ERROR_FLAG
+            bus.write(log_ns, frames)
+            if tick % 100 == 0:
+                said.write(log_ns, "info", "recorder", f"tick {tick}")
+                counts = {"frames": str(tick * 15), "dropped": str(wrong.dropped * tick // 100)}
+                diagnostics.write(log_ns, [DiagnosticStatus(OK, "source can0", "", "", counts)])
+            if rng.random() < wrong.updates:
+                health.step(log_ns)
+        found = health.final()
+        writer.set_verdict(found.verdict, found.reasons)
+    return found
+
+
+def without_rounding(health: SessionMeasures) -> dict[str, object]:
+    """All that was measured; a standard deviation is a difference of sums, so to nine digits."""
+    series = [
+        asdict(replace(each, timing=replace(each.timing, std_s=None)))
+        | {"std_s": round(each.timing.std_s or 0.0, 9)}
+        for each in health.series
+    ]
+    parts = {
+        name: getattr(health, name)
+        for name in ("robot", "start_ns", "end_ns", "channels", "joints", "buses", "sources")
+    }
+    return parts | {"series": series, "verdict": health.verdict, "reasons": health.reasons}
+
+
+@given(faults)
+@settings(max_examples=60, deadline=None)
+def test_the_live_verdict_is_that_of_the_finished_file(
+    tmp_path_factory: pytest.TempPathFactory, wrong: Faults
+) -> None:
+    path = tmp_path_factory.mktemp("live") / "s.mcap"
+    live = record(path, wrong)
+    checked: SessionHealth = check_session(path)
+    assert checked.file.damage == ()
+    assert without_rounding(live) == without_rounding(checked)
+    assert live.findings == checked.findings
+    assert (checked.stored, checked.stored_reasons) == (checked.verdict, checked.reasons)
+
+
+NOTHING = Faults(1, 800, 0.0, 0.0, 0.0, 0, 0.0, 0.0, clipped=False, gap=0, dropped=0, updates=0.2)
+
+
+def test_a_clean_recording_is_good(tmp_path: Path) -> None:
+    live = record(tmp_path / "s.mcap", NOTHING)
+    assert (live.verdict, live.reasons) == ("good", ())
+    assert live.sources[0].name == "can0"
+
+
+def test_frames_lost_before_the_recorder_are_held_against_the_session(tmp_path: Path) -> None:
+    live = record(tmp_path / "s.mcap", replace(NOTHING, dropped=12))
+    assert live.reasons == (
+        "source can0 lost 84 of 10584 frames before the recorder (0.79%)",
+    )  # at tick 700: 700 * 15 taken, 7 * 12 lost
+    checked = check_session(tmp_path / "s.mcap")
+    assert checked.reasons == live.reasons
+    assert json.loads(json.dumps([asdict(each) for each in checked.sources]))[0]["dropped"] == 84
+
+
+def test_a_later_part_answers_for_its_own_losses_only(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        diagnostics = writer.diagnostics()
+        for second, dropped in ((100, 50), (101, 50), (102, 53)):
+            counts = {"frames": str(1000 * second), "dropped": str(dropped)}
+            recorder = {"elapsed_s": str(second)}
+            diagnostics.write(
+                EPOCH_NS + second * NS,
+                [
+                    DiagnosticStatus(OK, "recorder", "", "", recorder),
+                    DiagnosticStatus(OK, "source can0", "", "", counts),
+                ],
+            )
+    (source,) = check_session(path).sources
+    assert (source.frames, source.dropped) == (2000, 3)
+
+
+def test_other_people_s_diagnostics_are_no_sources(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        status = DiagnosticStatus(OK, "source of light", "on", "lamp", {"dropped": "twice"})
+        writer.diagnostics().write(EPOCH_NS, [status])
+    assert check_session(path).sources == ()
+
+
+# -- what is shown while recording -------------------------------------------------------------
+
+
+def test_rates_ages_and_gaps_are_those_of_the_last_seconds(tmp_path: Path) -> None:
+    health = LiveHealth(ROBOT)
+    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
+    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+        states = writer.joint_state("/joint_states", NAMES, unit="rad")
+        sonar = writer.string("/gait/mode")
+        bus = writer.frames("/can/can0")
+        for tick in range(2001):
+            t_ns = EPOCH_NS + tick * STEP_NS
+            if tick % 200 == 0:
+                sonar.write(t_ns, "walk")
+            if tick < 1500 or tick % 2 == 0:  # half of the rate in the last quarter
+                states.write(t_ns, np.sin(0.1 * tick + np.arange(25)))
+            frames = empty_frames(8)
+            frames["t_host_ns"], frames["dlc"] = t_ns + np.arange(8), 8
+            bus.write(t_ns, frames)
+            if tick % 100 == 0:
+                health.update(t_ns)
+        topics = {topic.topic: topic for topic in health.topics()}
+        assert topics["/joint_states"].rate_hz == pytest.approx(50.0)
+        assert topics["/joint_states"].count == 1751
+        assert topics["/joint_states"].gaps == 250
+        assert topics["/joint_states"].dropped == 0
+        assert topics["/gait/mode"].gaps is None
+        assert topics["/can/can0"].rate_hz == pytest.approx(100.0)
+        health.update(EPOCH_NS + 23 * NS)
+        topics = {topic.topic: topic for topic in health.topics()}
+        assert topics["/joint_states"].age_s == pytest.approx(3.0)
+        assert topics["/joint_states"].rate_hz < 50.0
+
+
+def test_stepping_looks_at_one_channel_a_tick_and_loses_none(tmp_path: Path) -> None:
+    health = LiveHealth(None)
+    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
+    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+        channels = [writer.string(f"/text/{k}") for k in range(5)]
+        for tick in range(1000):
+            t_ns = EPOCH_NS + tick * 5_000_000
+            for channel in channels:
+                channel.write(t_ns, "walk")
+            health.step(t_ns)
+        seen = [topic.count for topic in health.topics()]
+        assert len(seen) == 5
+        assert all(600 <= count < 1000 for count in seen)  # up to the last whole round
+        assert [channel.count for channel in health.final().channels] == [1000] * 5
+
+
+# -- bounded memory ----------------------------------------------------------------------------
+
+
+def longest(flags: np.ndarray) -> tuple[int, int]:
+    """Longest run of true flags and where it begins, the slow way."""
+    best = (0, 0)
+    for start in range(len(flags)):
+        stop = start
+        while stop < len(flags) and flags[stop]:
+            stop += 1
+        if stop - start > best[0]:
+            best = (stop - start, start)
+    return best
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=300), st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(
+    seconds: list[tuple[bool, bool]], data: st.DataObject
+) -> None:
+    """Joint a stands in the seconds that are flagged first, its command moves in the others."""
+    measured, command = RangeTally(horizon_s=5), RangeTally(horizon_s=5)
+    freeze = FreezeTally(("b", "a"), ("a", "x"))
+    within = np.arange(6) * 150_000_000
+    found = None
+    for second, (stands, moves) in enumerate(seconds):
+        t_ns = EPOCH_NS + second * NS + within
+        angles = np.column_stack([np.linspace(0, 1, 6), np.linspace(0, not stands, 6)])
+        commands = np.column_stack([np.linspace(0, 0.2 * moves, 6), np.zeros(6)])
+        for tally, values in ((measured, angles), (command, commands)):
+            tally.add(t_ns, values)
+        if data.draw(st.booleans()):
+            closed = min(measured.closed, command.closed)
+            found = freeze.result(measured.result(2), command.result(2), closed)
+            for tally in (measured, command):
+                tally.forget(closed)
+                assert len(tally.result(2).second) <= 6
+    found = freeze.result(measured.result(2), command.result(2), None)
+    lasted, since = longest(np.array([stands and moves for stands, moves in seconds]))
+    assert freeze.columns == (1,)
+    assert found[0].tolist() == [lasted]
+    assert found[1].tolist() == [EPOCH_NS // NS + since if lasted else 0]
+
+
+def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path: Path) -> None:
+    """What is kept is counted after 30 and after 180 minutes of a slow recording."""
+    import gc
+    import sys
+
+    def kept() -> int:
+        gc.collect()
+        seen, stack, total = set[int](), [health], 0
+        while stack:
+            each = stack.pop()
+            if id(each) in seen or isinstance(each, type):
+                continue
+            seen.add(id(each))
+            total += sys.getsizeof(each)
+            stack += [other for other in gc.get_referents(each) if not callable(other)]
+        return total
+
+    health = LiveHealth(ROBOT)
+    sizes: list[int] = []
+    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
+    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad")
+        bus, said, diagnostics = writer.frames("/can/can0"), writer.log(), writer.diagnostics()
+        frames = empty_frames(1)
+        for second in range(10_800):
+            t_ns = EPOCH_NS + second * NS
+            commands.write(t_ns, np.full(25, 0.1 * (second % 2)))
+            states.write(t_ns, np.full(25, 0.1))
+            frames["t_host_ns"] = t_ns
+            bus.write(t_ns, frames)
+            if second % 5 == 0:
+                said.write(t_ns, "info", "recorder", f"second {second} of {'x' * (second % 97)}")
+                values = {"frames": str(second), "elapsed_s": str(second)}
+                diagnostics.write(t_ns, [DiagnosticStatus(OK, "source c", "", "", values)])
+            if second % 10 == 9:
+                health.update(t_ns)
+            if second in (1799, 10_799):
+                sizes.append(kept())
+    assert sizes[1] < sizes[0] + 65_536
