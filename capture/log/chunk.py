@@ -5,6 +5,7 @@ Format: https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import io
 import mmap
 import struct
 from collections.abc import Iterator
@@ -92,9 +93,10 @@ def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
     Raises:
         zstandard.ZstdError: If the frame is damaged.
     """
-    with zstandard.ZstdDecompressor().stream_reader(raw, closefd=False) as reader:
-        size = reader.readinto(room)  # all at once, since there is room for the whole frame
-        return size + len(reader.read(1))
+    opened = zstandard.ZstdDecompressor().stream_reader(raw, closefd=False)
+    with cast("io.RawIOBase", opened) as reader:
+        size = reader.readinto(room) or 0  # all at once, since there is room for the whole frame
+        return size + len(reader.read(1) or b"")
 
 
 def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:

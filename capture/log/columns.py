@@ -1,55 +1,92 @@
 """Messages in bulk: all messages of a channel as columns, without a Python loop over them.
 
-The messages of a block that have one length are gathered into a matrix of bytes by one numpy
-call; those that share their strings and sequence lengths (:class:`capture.log.cdr.Layout`) have
-every number in the same columns of that matrix. So a bag with one message per servo costs as
-many layouts as servos, and a message of any other layout is still read right, only slower.
+Messages that share their length, strings and sequence lengths (:class:`capture.log.cdr.Layout`)
+have every number at the same place, so one numpy call takes one field of hundreds of them out of
+the payload, and another holds their strings against the layout's. So a bag with one message per
+servo costs as many layouts as servos, and a message of any other layout is still read right, only
+slower.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ..arrays import IntArray
-from ..errors import DataError, LogError
+from ..errors import DataError
+from .batches import Records, Window, blocks_in, record_batches
 from .cdr import Layout, layout_of
-from .chunk import Buffer
+from .chunk import Block, Buffer
 from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType
 from .storage import LogFile
+from .stores import ColumnStore, TimeStore
 
-# A message record: opcode u8, length u64, channel u16, sequence u32, log time u64, publish u64.
-_LENGTH_AT, _LOG_TIME_AT = 1, 15
+_LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
 _MAX_LAYOUTS = 64
+_EXPANSION = 64
+"""No more memory is reserved than this many times the bytes in the file; more may be used."""
+
+_STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
+_NS = 1_000_000_000
 
 Matrix = NDArray[np.uint8]
 
 
-@dataclass
 class Group:
-    """All messages of a channel that share one layout.
+    """All messages of a topic that share one layout.
 
     Attributes:
         layout: The layout.
-        log_ns: Log times, one array a block.
-        order: Place of each message among all of the topic, in file order, one array a block.
-        columns: Leaf path to values, one array of shape (n, count) a block.
+        is_stamped: Whether they have a stamp.
     """
 
-    layout: Layout
-    log_ns: list[IntArray] = field(default_factory=list[IntArray])
-    order: list[IntArray] = field(default_factory=list[IntArray])
-    columns: dict[str, list[NDArray[Any]]] = field(default_factory=dict[str, list[NDArray[Any]]])
+    def __init__(self, layout: Layout, paths: frozenset[str] | None, capacity: int) -> None:
+        """Start empty.
+
+        Args:
+            layout: The layout.
+            paths: Leaf paths to keep; None for all. A stamp is kept as a time, not as a leaf.
+            capacity: Messages to expect.
+        """
+        self.layout = layout
+        leaves = layout.leaves
+        stamps = [pair for pair in _STAMPS if all(path in leaves for path in pair)]
+        self._stamp = tuple(leaves[path] for path in stamps[0]) if stamps else ()
+        self.is_stamped = bool(stamps)
+        self._times = TimeStore(capacity, stamped=self.is_stamped)
+        self._order: list[IntArray | range] = []
+        self._columns = {
+            path: ColumnStore(leaf.dtype, leaf.count, capacity)
+            for path, leaf in leaves.items()
+            if leaf not in self._stamp and (paths is None or path in paths)
+        }
+        self._tiles = [b"" for _ in layout.hull]
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self._times)
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """Leaf paths that are kept, in wire order, without the stamp's."""
+        return tuple(self._columns)
 
     def times(self) -> IntArray:
         """Log times of all its messages [Unix ns], shape (n,)."""
-        return np.concatenate(self.log_ns)
+        return self._times.log()
+
+    def stamps(self) -> IntArray:
+        """Stamps of all its messages [ns], shape (n,), or log times where they have none."""
+        return self._times.stamps()
+
+    def order(self) -> IntArray:
+        """Place of each message among all of the topic, in file order, shape (n,)."""
+        return np.concatenate([np.arange(0), *(np.asarray(part) for part in self._order)])
 
     def values(self, path: str) -> NDArray[Any]:
         """All values of one field.
@@ -58,11 +95,55 @@ class Group:
             path: Leaf path, e.g. ``position``.
 
         Returns:
-            Shape (n, count); (n, 0) where the layout has no such leaf.
+            Shape (n, count), each column contiguous (bytes: each row); (n, 0) where the layout has
+            no such leaf.
         """
-        if path not in self.columns:
-            return np.empty((sum(map(len, self.log_ns)), 0), dtype=np.float64)
-        return np.concatenate(self.columns[path])
+        if path not in self._columns:
+            return np.empty((len(self), 0), dtype=np.float64)
+        return self._columns[path].values()
+
+    def holds(self, data: Buffer, at: IntArray) -> bool:
+        """Whether messages have this layout: the quick check, for messages of its length.
+
+        Args:
+            data: A payload.
+            at: Where messages start, shape (n,).
+
+        Returns:
+            True if all do; False if some don't, or differ in padding.
+        """
+        for k, (start, stop) in enumerate(self.layout.hull):
+            width = stop - start
+            if len(self._tiles[k]) < width * len(at):
+                self._tiles[k] = self.layout.example[start:stop] * (2 * len(at))
+            if not self._tiles[k].startswith(gather(data, at + start, f"V{width}").tobytes()):
+                return False
+        return True
+
+    def take(self, data: Buffer, at: IntArray, log_ns: IntArray, order: IntArray | range) -> None:
+        """Copy messages of this layout.
+
+        Args:
+            data: A payload.
+            at: Where they start, shape (n,).
+            log_ns: Their log times [Unix ns], shape (n,).
+            order: Their places in the topic, n of them.
+        """
+        self._order.append(order)
+        stamp_ns = None
+        if self._stamp:
+            seconds, rest = (gather(data, at + leaf.offset, leaf.dtype) for leaf in self._stamp)
+            stamp_ns = seconds.astype(np.int64) * _NS + rest.astype(np.int64)
+        self._times.append(log_ns, stamp_ns)
+        for path, store in self._columns.items():
+            leaf = self.layout.leaves[path]
+            if leaf.count == 1:
+                store.append(gather(data, at + leaf.offset, leaf.dtype))
+                continue
+            width = leaf.count * np.dtype(leaf.dtype).itemsize
+            store.append(
+                gather(data, at + leaf.offset, f"V{width}").view(leaf.dtype).reshape(len(at), -1)
+            )
 
 
 @dataclass
@@ -112,7 +193,7 @@ def read_messages(
     log_file: LogFile,
     requests: Sequence[Request],
     *,
-    window_ns: tuple[int | None, int | None] = (None, None),
+    window_ns: Window = (None, None),
     warn: Callable[[str], None],
 ) -> list[Messages]:
     """Read several topics in one pass over the file: each chunk is decompressed once.
@@ -126,52 +207,45 @@ def read_messages(
     Returns:
         The messages, one entry a request.
     """
-    readers = [_GroupReader(request) for request in requests]
+    blocks = blocks_in(log_file, window_ns)
+    readers = [_GroupReader(request, *_expected(log_file, request, blocks)) for request in requests]
     wanted = [request.channel_ids for request in requests]
-    for data, found in message_blocks(log_file, wanted, window_ns, warn):
-        for reader, offsets in zip(readers, found, strict=True):
-            if len(offsets):
-                reader.add(data, offsets, window_ns)
+    for data, found in record_batches(log_file, wanted, blocks, warn):
+        for reader, records in zip(readers, found, strict=True):
+            if len(records.offsets):
+                reader.add(data, records, window_ns)
     return [Messages(reader.groups, reader.unread) for reader in readers]
+
+
+def _expected(log_file: LogFile, request: Request, blocks: Sequence[Block]) -> tuple[int, int]:
+    """How many messages to expect, and for how many bytes of columns memory may be reserved."""
+    counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
+    part = len(blocks) / max(len(log_file.blocks), 1)
+    stored = sum(block.stop - block.start for block in blocks)
+    return int(counted * min(part, 1.0)) + 1, _EXPANSION * stored
 
 
 def message_blocks(
     log_file: LogFile,
-    wanted: Sequence[Sequence[int]],
-    window_ns: tuple[int | None, int | None],
+    channel_ids: Sequence[int],
+    window_ns: Window,
     warn: Callable[[str], None],
-) -> Iterator[tuple[Buffer, list[IntArray]]]:
-    """The payloads that hold messages of some topics, with the offsets of their records.
+) -> Iterator[tuple[Buffer, IntArray]]:
+    """The payloads that hold messages of one topic, with the offsets of their records.
 
     Args:
         log_file: The file.
-        wanted: Channel ids, one sequence a topic.
+        channel_ids: The topic's channels.
         window_ns: Blocks wholly outside this window of log times are passed over.
         warn: Takes one sentence for each block that couldn't be read.
 
     Yields:
-        Payload and checked record offsets, one array of shape (n,) a topic, not all empty.
+        Payload, to be used before the next is asked for, and checked record offsets, shape (n,).
     """
-    start, stop = window_ns
-    for block in log_file.blocks:
-        if (stop is not None and block.start_ns >= stop) or (
-            start is not None and block.end_ns < start
-        ):
-            continue
-        try:
-            found = [
-                np.concatenate([log_file.offsets(block, channel_id) for channel_id in ids])
-                for ids in wanted
-            ]
-            if not any(map(len, found)):
-                continue
-            data, base = log_file.payload(block)
-            found = [np.sort(offsets) + base for offsets in found]  # file order
-            _check(data, np.concatenate(found))
-        except LogError as error:
-            warn(f"{error}; its messages are missing")
-            continue
-        yield data, found
+    for block in blocks_in(log_file, window_ns):  # one by one: who wants the first wants no more
+        for data, (records,) in record_batches(log_file, [channel_ids], [block], warn):
+            if len(records.offsets):
+                yield data, records.offsets
 
 
 def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
@@ -186,77 +260,97 @@ def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
     """
     length = int.from_bytes(data[offset + _LENGTH_AT : offset + 9], "little") - FIXED_SIZE
     log_ns = int.from_bytes(data[offset + _LOG_TIME_AT : offset + 23], "little")
-    return log_ns, data[offset + BODY_AT : offset + BODY_AT + length]
+    return log_ns, bytes(data[offset + BODY_AT : offset + BODY_AT + length])
 
 
 class _GroupReader:
     """Sorts messages into groups by layout."""
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: Request, expected: int, reserve: int) -> None:
         self._type = request.message_type
-        self._paths = None if request.paths is None else set(request.paths)
+        self._paths = None if request.paths is None else frozenset(request.paths)
+        self._expected, self._reserve = expected, reserve
         self._by_length: dict[int, list[Group]] = {}
         self._count = 0
         self.groups: list[Group] = []
         self.unread: list[Unread] = []
 
-    def add(
-        self, data: Buffer, offsets: IntArray, window_ns: tuple[int | None, int | None]
-    ) -> None:
-        log_ns = gather(data, offsets + _LOG_TIME_AT, "<u8").astype(np.int64)
-        if window_ns != (None, None):
-            start, stop = window_ns
-            keep = np.ones(len(offsets), dtype=bool)
+    def add(self, data: Buffer, records: Records, window_ns: Window) -> None:
+        at = records.offsets + BODY_AT
+        log_ns = records.heads["log"].astype(np.int64)
+        lengths = records.heads["length"].astype(np.int64) - FIXED_SIZE
+        start, stop = window_ns
+        if (start is not None and (log_ns < start).any()) or (
+            stop is not None and (log_ns >= stop).any()
+        ):
+            keep = np.ones(len(at), dtype=bool)
             keep &= True if start is None else log_ns >= start
             keep &= True if stop is None else log_ns < stop
-            offsets, log_ns = offsets[keep], log_ns[keep]
-        order = self._count + np.arange(len(offsets))
-        self._count += len(offsets)
-        lengths = gather(data, offsets + _LENGTH_AT, "<u8").astype(np.int64) - FIXED_SIZE
-        one_length = bool((lengths == lengths[0]).all()) if len(lengths) else False
-        for length in lengths[:1].tolist() if one_length else np.unique(lengths).tolist():
-            rows = slice(None) if one_length else np.flatnonzero(lengths == length)
-            records = gather(data, offsets[rows] + BODY_AT, f"V{max(length, 1)}")
-            matrix = records.view(np.uint8).reshape(len(records), -1)
-            self._add_matrix(matrix[:, :length], log_ns[rows], order[rows])
+            at, log_ns, lengths = at[keep], log_ns[keep], lengths[keep]
+        if not len(at):
+            return
+        first = self._count
+        self._count += len(at)
+        length = int(lengths[0])
+        if (lengths == length).all():
+            known = self._by_length.get(length)
+            if known and known[0].holds(data, at):  # the usual case
+                known[0].take(data, at, log_ns, range(first, self._count))
+                return
+            self._sort_in(data, length, at, log_ns, np.arange(first, self._count))
+            return
+        for length in np.unique(lengths).tolist():
+            rows = np.flatnonzero(lengths == length)
+            self._sort_in(data, length, at[rows], log_ns[rows], first + rows)
 
-    def _add_matrix(self, matrix: Matrix, log_ns: IntArray, order: IntArray) -> None:
-        known = self._by_length.setdefault(matrix.shape[1], [])
+    def _sort_in(
+        self, data: Buffer, length: int, at: IntArray, log_ns: IntArray, order: IntArray
+    ) -> None:
+        """Take messages of one length, whatever their layouts."""
+        matrix = _matrix(data, at, length)
+        known = self._by_length.setdefault(length, [])
         for group in known:
             fits = fits_layout(matrix, group.layout)
-            if fits.all():
-                self._take(group, matrix, log_ns, order)
-                return
             if fits.any():
-                self._take(group, matrix[fits], log_ns[fits], order[fits])
-                matrix, log_ns, order = matrix[~fits], log_ns[~fits], order[~fits]
-        while len(matrix):
+                group.take(data, at[fits], log_ns[fits], order[fits])
+                rest = ~fits
+                matrix, at, log_ns, order = matrix[rest], at[rest], log_ns[rest], order[rest]
+            if not len(at):
+                return
+        while len(at):
             example = matrix[0].tobytes()
             try:
-                group = Group(layout_of(self._type, example))
+                layout = layout_of(self._type, example)
             except DataError as error:
                 self.unread.append(Unread(int(log_ns[0]), example, str(error)))
-                matrix, log_ns, order = matrix[1:], log_ns[1:], order[1:]
+                matrix, at, log_ns, order = matrix[1:], at[1:], log_ns[1:], order[1:]
                 continue
             # Text topics have a layout a message: don't hold every later message against each.
-            fits = np.zeros(len(matrix), dtype=bool)
+            fits = np.zeros(len(at), dtype=bool)
             fits[0] = True
             if len(known) < _MAX_LAYOUTS:
-                fits = fits_layout(matrix, group.layout)
+                fits = fits_layout(matrix, layout)
+                group = Group(layout, self._paths, self._capacity(length, int(fits.sum())))
                 known.append(group)
+            else:
+                group = Group(layout, self._paths, 1)
             self.groups.append(group)
-            self._take(group, matrix[fits], log_ns[fits], order[fits])
-            matrix, log_ns, order = matrix[~fits], log_ns[~fits], order[~fits]
+            group.take(data, at[fits], log_ns[fits], order[fits])
+            rest = ~fits
+            matrix, at, log_ns, order = matrix[rest], at[rest], log_ns[rest], order[rest]
 
-    def _take(self, group: Group, matrix: Matrix, log_ns: IntArray, order: IntArray) -> None:
-        group.log_ns.append(log_ns)
-        group.order.append(order)
-        for path, leaf in group.layout.leaves.items():
-            if self._paths is not None and path not in self._paths:
-                continue
-            width = leaf.count * np.dtype(leaf.dtype).itemsize
-            cut = np.ascontiguousarray(matrix[:, leaf.offset : leaf.offset + width])
-            group.columns.setdefault(path, []).append(cut.view(leaf.dtype))
+    def _capacity(self, length: int, seen: int) -> int:
+        """Room for a group: all that is expected for the first, and what a file of its size has."""
+        if self.groups:
+            return 2 * seen
+        return max(seen, min(self._expected, self._reserve // max(length, 1)))
+
+
+def _matrix(data: Buffer, at: IntArray, length: int) -> Matrix:
+    """Messages of one length as rows of bytes."""
+    if not length:
+        return np.empty((len(at), 0), dtype=np.uint8)
+    return gather(data, at, f"V{length}").view(np.uint8).reshape(len(at), length)
 
 
 def fits_layout(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
@@ -281,15 +375,3 @@ def fits_layout(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
         static = layout.static
         fits[doubtful] = (matrix[np.ix_(doubtful, static)] == example[static]).all(axis=1)
     return fits
-
-
-def _check(data: Buffer, offsets: IntArray) -> None:
-    """Raise LogError-compatible complaints before numpy reads beyond the records."""
-    size = len(data)
-    if offsets.size and (offsets.min() < 0 or offsets.max() + BODY_AT > size):
-        raise LogError("message index", "points outside its chunk")
-    opcodes = gather(data, offsets, "u1")
-    lengths = gather(data, offsets + _LENGTH_AT, "<u8")
-    room = (size - offsets - 9).astype(np.uint64)
-    if np.any(opcodes != Opcode.MESSAGE) or np.any((lengths < FIXED_SIZE) | (lengths > room)):
-        raise LogError("message index", "points to something that is not a message")

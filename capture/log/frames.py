@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..arrays import IntArray
 
 FrameArray: TypeAlias = NDArray[np.void]
 """Array of records of :data:`FRAME_DTYPE`, shape (n,)."""
@@ -66,3 +69,35 @@ def frames_from_bytes(data: bytes | memoryview[Any]) -> FrameArray:
         A view of the bytes, shape (len(data) / 32,).
     """
     return np.frombuffer(data, dtype=FRAME_DTYPE)
+
+
+def join_batches(batches: Sequence[tuple[IntArray, IntArray, FrameArray]]) -> FrameArray:
+    """One array of frames from messages of different sizes.
+
+    Args:
+        batches: For messages of one size: their log times [Unix ns], shape (n,), their places in
+            the file, shape (n,), and their frames, shape (n, frames a message).
+
+    Returns:
+        The frames of all messages, by log time and then place, shape (total,).
+    """
+    if not batches:
+        return empty_frames(0)
+    log_ns = np.concatenate([each for each, _, _ in batches])
+    place = np.concatenate([each for _, each, _ in batches])
+    in_order = (log_ns[1:] > log_ns[:-1]) | (
+        (log_ns[1:] == log_ns[:-1]) & (place[1:] >= place[:-1])
+    )
+    if len(batches) == 1 and in_order.all():  # the usual case: nothing is moved
+        return np.ascontiguousarray(batches[0][2]).reshape(-1)
+    sizes = np.concatenate([np.full(len(frames), frames.shape[1]) for _, _, frames in batches])
+    order = np.lexsort((place, log_ns))
+    starts = np.empty(len(order), dtype=np.int64)
+    starts[order] = np.cumsum(sizes[order]) - sizes[order]
+    joined = empty_frames(int(sizes.sum()))
+    done = 0
+    for _, _, frames in batches:
+        at = starts[done : done + len(frames)]
+        joined[at[:, None] + np.arange(frames.shape[1])] = frames
+        done += len(frames)
+    return joined

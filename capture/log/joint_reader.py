@@ -10,7 +10,8 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import DataError, MissingChannelError
 from .columns import Messages
-from .joint_rows import JointRows, merge_rows, own_times, rows_of
+from .joint_rows import JointRows, merge_rows, rows_of
+from .own_times import Series, own_times
 from .rosmsg import MessageType
 from .signals import JointSignals
 from .stamp_clock import StampClock
@@ -37,7 +38,8 @@ OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
 _SLACK_NS = 5 * _NS
 """How far a sampling time may lie from its log time before a window could miss it."""
 
-_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+_NEAR_NS = _NS // 4
+"""The same for logs of our own, as long as the window turns out to be covered."""
 
 
 class JointReader:
@@ -58,7 +60,7 @@ class JointReader:
         self._topics = topics
         self._clock = clock
         self._warn = warn
-        self._offsets: dict[str, JointSignals] = {}
+        self._offsets: dict[str, Series] = {}
 
     def read(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window, chain: Sequence[str]
@@ -77,18 +79,96 @@ class JointReader:
             MissingChannelError: If the session has no such topic, or it never carries the field.
             DataError: If a topic is not of JointStates, or there is no such field.
         """
+        requests = self.requests(wanted)
+        found: dict[str, Messages] | None = None
+        if self._topics.is_ours and window_ns != (None, None):
+            found = self._topics.read(requests, _widened(window_ns, _NEAR_NS))
+        if found is None or not _covers(found, window_ns):
+            found = self._topics.read(requests, _widened(window_ns, _SLACK_NS))
+        return self.signals(wanted, found, window_ns, chain)
+
+    def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+        """What has to be read of the file for some fields.
+
+        Args:
+            wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
+
+        Returns:
+            Topic to leaf paths; the offset topics are among them.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic is not of JointStates, or there is no such field.
+        """
         self._check(wanted)
-        start, stop = window_ns
-        wide = (
-            None if start is None else start - _SLACK_NS,
-            None if stop is None else stop + _SLACK_NS,
-        )
-        found = self._topics.read({topic: [*_STAMP, *wanted[topic]] for topic in wanted}, wide)
+        offsets = {topic for topic in map(self._offset_topic, wanted) if topic is not None}
+        self._check(dict.fromkeys(offsets, ()))
         return {
-            (topic, field): self._signals(topic, field, found[topic], window_ns, chain)
-            for topic in wanted
-            for field in wanted[topic]
+            topic: [*wanted.get(topic, ()), *(["position"] if topic in offsets else [])]
+            for topic in dict.fromkeys([*wanted, *sorted(offsets)])
         }
+
+    def signals(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        found: Mapping[str, Messages],
+        window_ns: Window,
+        chain: Sequence[str],
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Make signals of what was read.
+
+        Args:
+            wanted: Topic to fields.
+            found: What was read for :meth:`requests`.
+            window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
+            chain: Joint names head to tail; joints not in it come after it.
+
+        Returns:
+            (topic, field) to signals.
+
+        Raises:
+            MissingChannelError: If a topic never carries a field.
+        """
+        keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
+        series = {key: self._series(*key, found[key[0]]) for key in keys}
+        times = {key: list(each.t_ns) for key, each in series.items()}
+        for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
+            own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
+            stamped = [series[key] for key in own]
+            offsets = self._offset_series(offset_topic, found, stamped, window_ns)
+            if not any(values.any() for values in offsets.values):
+                continue  # sampled together
+            if offset_topic in wanted:
+                offsets = _copied(offsets)
+            times |= zip(own, own_times(stamped, offsets), strict=True)
+            for key in own:
+                for name in series[key].names:
+                    if name not in offsets.names:
+                        self._warn(f"{offset_topic} has no {name}: its message stamps are used")
+        return {key: self._signals(key, series[key], times[key], window_ns, chain) for key in keys}
+
+    def _offset_topic(self, topic: str) -> str | None:
+        name = OFFSET_TOPICS.get(topic)
+        return name if name in self._topics.channels else None
+
+    def _offset_series(
+        self,
+        topic: str,
+        found: Mapping[str, Messages],
+        stamped: Sequence[Series],
+        window_ns: Window,
+    ) -> Series:
+        """The offsets of a topic, from before the first stamp on; free to be overwritten."""
+        if topic in self._offsets:
+            return _copied(self._offsets[topic])
+        offsets = self._series(topic, "position", found[topic])
+        first = min((int(t[0]) for each in stamped for t in each.t_ns if len(t)), default=0)
+        known = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
+        if known or window_ns[0] is None:
+            return offsets
+        whole = self._topics.read({topic: ["position"]}, (None, None))[topic]
+        self._offsets[topic] = self._series(topic, "position", whole)  # such topics say little
+        return _copied(self._offsets[topic])
 
     def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
         channels = self._topics.channels
@@ -104,17 +184,26 @@ class JointReader:
                 if field not in UNITS:
                     raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
 
-    def _signals(
-        self, topic: str, field: str, found: Messages, window_ns: Window, chain: Sequence[str]
-    ) -> JointSignals:
+    def _series(self, topic: str, field: str, found: Messages) -> Series:
+        """One field of a topic, at message stamps on the log's clock."""
         rows = [rows_of(group, field) for group in found.groups]
         rows.extend(self._general_rows(topic, field, found))
         if rows and not any(row.values.size for row in rows):
             raise MissingChannelError(self._path, f"{field} in {topic}", self._filled(topic))
         rows = [self._on_log_clock(row, topic) for row in rows]
-        names, times, values = merge_rows(rows, topic, field, self._warn)
-        times = self._at_own_times(topic, names, times)
-        cut = [_cut(t, v, window_ns) for t, v in zip(times, values, strict=True)]
+        return Series(*merge_rows(rows, topic, field, self._warn))
+
+    def _signals(
+        self,
+        key: tuple[str, str],
+        series: Series,
+        times: Sequence[IntArray],
+        window_ns: Window,
+        chain: Sequence[str],
+    ) -> JointSignals:
+        topic, field = key
+        names = series.names
+        cut = [_cut(t, v, window_ns) for t, v in zip(times, series.values, strict=True)]
         unit = UNITS[field]
         if field == "position":
             unit = self._topics.channels[topic].metadata.get("unit", unit)
@@ -149,36 +238,16 @@ class JointReader:
     def _filled(self, topic: str) -> list[str]:
         """The fields that the topic does carry."""
         found = self._topics.read({topic: list(UNITS)}, (None, None))[topic]
-        return [name for name in UNITS if any(name in group.columns for group in found.groups)]
+        return [name for name in UNITS if any(name in group.paths for group in found.groups)]
 
     def _on_log_clock(self, row: JointRows, topic: str) -> JointRows:
         if len(row.stamp_ns) and not row.stamp_ns.any():
             self._warn(f"{topic}: header stamps are zero; log times are used instead")
             return JointRows(row.names, row.log_ns, row.log_ns, row.values)
         shift_ns = self._clock.shift_ns(topic)
+        if not shift_ns:
+            return row
         return JointRows(row.names, row.stamp_ns + shift_ns, row.log_ns, row.values)
-
-    def _at_own_times(
-        self, topic: str, names: Sequence[str], times: Sequence[IntArray]
-    ) -> list[IntArray]:
-        offset_topic = OFFSET_TOPICS.get(topic)
-        if offset_topic not in self._topics.channels or offset_topic is None:
-            return list(times)
-        if offset_topic not in self._offsets:
-            key = (offset_topic, "position")
-            self._offsets[offset_topic] = self.read({key[0]: [key[1]]}, (None, None), ())[key]
-        offsets = self._offsets[offset_topic]
-        if all(not values.any() for values in offsets.values):
-            return list(times)  # sampled together: keep the shared array
-        own: list[IntArray] = []
-        for name, t_ns in zip(names, times, strict=True):
-            if name in offsets.names:
-                signal = offsets.signal(name)
-                own.append(own_times(t_ns, signal.t_ns, signal.values))
-            else:
-                self._warn(f"{offset_topic} has no {name}: its message stamps are used")
-                own.append(t_ns)
-        return own
 
 
 def _is_joint_state(found: MessageType) -> bool:
@@ -196,6 +265,30 @@ def _is_joint_state(found: MessageType) -> bool:
         and "name" in fields
         and fields["name"].base == "string"
     )
+
+
+def _copied(series: Series) -> Series:
+    return Series(series.names, series.t_ns, [values.copy() for values in series.values])
+
+
+def _widened(window_ns: Window, slack_ns: int) -> Window:
+    """A window of log times for one of sampling times."""
+    start, stop = window_ns
+    return None if start is None else start - slack_ns, None if stop is None else stop + slack_ns
+
+
+def _covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
+    """Whether what was read goes beyond a window at both ends, in order, so nothing is missing."""
+    start, stop = window_ns
+    for messages in found.values():
+        if len(messages.groups) != 1 or messages.unread:
+            return False
+        stamps = messages.groups[0].stamps()
+        if not (start is None or stamps[0] < start) or not (stop is None or stamps[-1] >= stop):
+            return False
+        if (stamps[1:] < stamps[:-1]).any():
+            return False
+    return True
 
 
 def _cut(t_ns: IntArray, values: FloatArray, window_ns: Window) -> tuple[IntArray, FloatArray]:

@@ -14,7 +14,6 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from .columns import Group
 
-_NS = 1_000_000_000
 _EARLY_OR_LATE = 0.1
 """A joint that is missing for more than this part of the topic's span is worth a warning."""
 
@@ -48,9 +47,8 @@ def rows_of(group: Group, field: str) -> JointRows:
     """
     strings = group.layout.strings
     names = tuple(text for path, text in strings.items() if path.startswith("name["))
-    seconds = group.values("header.stamp.sec")[:, 0].astype(np.int64)
-    nanoseconds = group.values("header.stamp.nanosec")[:, 0].astype(np.int64)
-    stamp_ns, log_ns = seconds * _NS + nanoseconds, group.times()
+    log_ns = group.times()
+    stamp_ns = group.stamps() if group.is_stamped else np.zeros_like(log_ns)
     values = group.values(field).astype(np.float64, copy=False)
     if (np.diff(log_ns) < 0).any():  # a file need not be in log order, a reader must be
         logged = np.argsort(log_ns, kind="stable")
@@ -83,7 +81,9 @@ def merge_rows(
     if len(filled) == 1:
         row = filled[0]
         t_ns, order = _in_time(row.stamp_ns, f"{topic}", warn)
-        values = np.asfortranarray(row.values if order is None else row.values[order])
+        values = row.values if order is None else row.values[order]
+        if values.strides[0] != values.itemsize:  # a joint's samples side by side
+            values = np.asfortranarray(values)
         return row.names, [t_ns] * len(row.names), [values[:, j] for j in range(len(row.names))]
     parts: dict[str, list[tuple[JointRows, int]]] = {}
     for row in filled:
@@ -101,25 +101,6 @@ def merge_rows(
         columns.append(values if order is None else values[order])
     _warn_changed_set(tuple(parts), times, topic, warn)
     return tuple(parts), times, columns
-
-
-def own_times(t_ns: IntArray, offset_t_ns: IntArray, offset_s: FloatArray) -> IntArray:
-    """Sampling times from message stamps and logged sample offsets.
-
-    Args:
-        t_ns: Message stamps [Unix ns], shape (n,).
-        offset_t_ns: Stamps of the offsets [Unix ns], not decreasing, shape (k,).
-        offset_s: Sample time minus stamp [s], shape (k,).
-
-    Returns:
-        ``t_ns`` plus the offset that was logged with each stamp, or last before it (the first
-        offset for stamps before that), shape (n,). Offsets that are not finite count as zero.
-    """
-    if not len(offset_t_ns):
-        return t_ns
-    last = np.clip(np.searchsorted(offset_t_ns, t_ns, side="right") - 1, 0, None)
-    offset = np.nan_to_num(offset_s[last], nan=0.0, posinf=0.0, neginf=0.0)
-    return t_ns + np.rint(offset * _NS).astype(np.int64)
 
 
 def _in_time(

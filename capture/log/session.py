@@ -15,16 +15,17 @@ from typing import Any, Self
 import numpy as np
 import pandas as pd
 
+from ..arrays import IntArray
 from ..errors import DataError, RobotFileError
 from ..robot import Robot
 from ..robot.description import parse_robot
-from .columns import Group
-from .frames import FRAME_DTYPE, FrameArray, empty_frames, frames_from_bytes
+from .columns import Group, Messages
+from .frames import FRAME_DTYPE, FrameArray, join_batches
 from .joint_reader import JointReader
 from .signals import JointSignals
 from .stamp_clock import StampClock
 from .storage import LogFile
-from .topics import Channel, Topics, Window
+from .topics import Channel, Topics
 
 _NS = 1_000_000_000
 
@@ -232,13 +233,37 @@ class Session:
             MissingChannelError: If the session has no such topic.
             DataError: If its type can't be read.
         """
-        groups = self._groups(topic, None, (start_ns, stop_ns))
-        shift_ns = self._clock.shift_ns(topic)
-        frames = [_frame(group, shift_ns) for group in groups]
-        if not frames:
-            return pd.DataFrame(index=pd.Index([], dtype="int64", name="t_ns"))
-        table = pd.concat(frames) if len(frames) > 1 else frames[0]
-        return table.sort_index(kind="stable")
+        found = self._topics.read({topic: None}, (start_ns, stop_ns))[topic]
+        return self._table(topic, found)
+
+    def columns(
+        self,
+        joints: Mapping[str, Sequence[str]],
+        tables: Mapping[str, Sequence[str] | None],
+    ) -> tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]:
+        """Joint signals and tables of the whole session, in one pass over the file.
+
+        Args:
+            joints: JointState topic to fields, as for :meth:`joint_columns`.
+            tables: Topic to field paths, e.g. ``{"/sonar": ["range"]}``; None for all of a topic.
+
+        Returns:
+            (topic, field) to signals as :meth:`joints` gives them, and topic to table as
+            :meth:`table` gives it.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If a topic can't be read as asked, or is asked for both ways.
+        """
+        requests: dict[str, Sequence[str] | None] = dict(self._joints.requests(joints))
+        if twice := sorted(requests.keys() & tables.keys()):
+            raise DataError(f"{', '.join(twice)}: ask for signals or for a table, not for both")
+        found = self._topics.read(requests | dict(tables), (None, None))
+        read: dict[str, pd.DataFrame] = {}
+        for topic in tables:
+            read[topic] = self._table(topic, found.pop(topic))
+        chain = self.robot.joint_names if self.robot is not None else ()
+        return self._joints.signals(joints, found, (None, None), chain), read
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Decode a topic message by message, for types of any shape (slow).
@@ -275,17 +300,14 @@ class Session:
             MissingChannelError: If the session has no such topic.
             DataError: If the topic holds something else.
         """
-        groups = self._groups(topic, ["data"], (start_ns, stop_ns))
-        batches: list[tuple[int, int, FrameArray]] = []
-        for group in groups:
+        batches: list[tuple[IntArray, IntArray, FrameArray]] = []
+        found = self._topics.read({topic: ["data"]}, (start_ns, stop_ns))[topic]
+        for group in self._groups(topic, found):
             data = group.values("data")
             if data.shape[1] % FRAME_DTYPE.itemsize or not group.layout.strings:
                 raise DataError(f"{self.path}: {topic} does not hold frames of 32 bytes")
-            places = zip(group.times().tolist(), np.concatenate(group.order).tolist(), strict=True)
-            for (log_ns, order), row in zip(places, data, strict=True):
-                batches.append((log_ns, order, frames_from_bytes(row.tobytes())))
-        batches.sort(key=lambda batch: batch[:2])
-        return np.concatenate([empty_frames(0), *(frames for _, _, frames in batches)])
+            batches.append((group.times(), group.order(), data.view(FRAME_DTYPE)))
+        return join_batches(batches)
 
     # -- inside ----------------------------------------------------------------------------
 
@@ -296,31 +318,36 @@ class Session:
     def _filled(self) -> list[Any]:
         return [block for block in self._file.blocks if block.end_ns]
 
-    def _groups(self, topic: str, paths: Sequence[str] | None, window_ns: Window) -> list[Group]:
-        found = self._topics.read({topic: paths}, window_ns)[topic]
+    def _groups(self, topic: str, found: Messages) -> list[Group]:
         if found.unread:
             why = found.unread[0].why
             self._warn(f"{topic}: {len(found.unread)} messages can't be read: {why}")
         return found.groups
 
+    def _table(self, topic: str, found: Messages) -> pd.DataFrame:
+        groups = self._groups(topic, found)
+        shift_ns = self._clock.shift_ns(topic)
+        frames = [_frame(group, shift_ns) for group in groups]
+        if not frames:
+            return pd.DataFrame(index=pd.Index([], dtype="int64", name="t_ns"))
+        table = pd.concat(frames) if len(frames) > 1 else frames[0]
+        if table.index.is_monotonic_increasing:
+            return table
+        return table.sort_index(kind="stable")
+
 
 def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """One layout group as a table."""
-    count = sum(map(len, group.log_ns))
     columns: dict[str, Any] = {}
     for path, text in group.layout.strings.items():
-        columns[path] = np.full(count, text, dtype=object)
-    for path, leaf in group.layout.leaves.items():
+        columns[path] = np.full(len(group), text, dtype=object)
+    for path in group.paths:
         values = group.values(path)
-        if leaf.is_array:
-            columns |= {f"{path}[{k}]": values[:, k] for k in range(leaf.count)}
+        if group.layout.leaves[path].is_array:
+            columns |= {f"{path}[{k}]": values[:, k] for k in range(values.shape[1])}
         else:
             columns[path] = values[:, 0]
-    t_ns = group.times()
-    for prefix in ("header.", ""):
-        if f"{prefix}stamp.sec" in columns:
-            seconds = columns.pop(f"{prefix}stamp.sec").astype(np.int64)
-            stamp_ns = seconds * _NS + columns.pop(f"{prefix}stamp.nanosec").astype(np.int64)
-            t_ns = np.where(stamp_ns == 0, t_ns, stamp_ns + shift_ns)
-            break
-    return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"))
+    t_ns = group.stamps()
+    if group.is_stamped:
+        t_ns = np.where(t_ns == 0, group.times(), t_ns + shift_ns)
+    return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"), copy=False)

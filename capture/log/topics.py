@@ -79,6 +79,11 @@ class Topics:
         found = read_messages(self._file, requests, window_ns=window_ns, warn=self._warn)
         return dict(zip(wanted, found, strict=True))
 
+    @property
+    def is_ours(self) -> bool:
+        """Whether undulog wrote the file: then its log times follow the stamps closely."""
+        return self._file.library.startswith("undulog/")
+
     def message_type(self, topic: str) -> MessageType:
         """The type of a topic's messages.
 
@@ -129,7 +134,7 @@ class Topics:
             MissingChannelError: If the log has no such topic.
         """
         ids = self._channel_ids(topic)
-        for data, (offsets,) in message_blocks(self._file, [ids], (None, None), self._warn):
+        for data, offsets in message_blocks(self._file, ids, (None, None), self._warn):
             for offset in offsets.tolist():
                 yield message_bytes(data, offset)
 

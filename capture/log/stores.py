@@ -1,0 +1,120 @@
+"""Columns that grow while a log is read, without a second copy at the end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+
+_SHORT_NS = 2**31
+
+
+class ColumnStore:
+    """Rows of numbers, kept column by column: what is read of a log is used a column at a time.
+
+    Single bytes are kept row by row: they are text or records, not columns.
+    """
+
+    def __init__(self, dtype: str, width: int, capacity: int) -> None:
+        """Reserve memory; none of it is used before rows come.
+
+        Args:
+            dtype: numpy type string of a number.
+            width: Numbers a row.
+            capacity: Rows to expect; more may come, at the price of a copy.
+        """
+        self._dtype = np.dtype(dtype)
+        self._by_row = self._dtype.itemsize == 1
+        self._width = width
+        self._capacity = max(capacity, 1)
+        self._data = self._new(self._capacity)
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return self._count
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add rows.
+
+        Args:
+            rows: Shape (n, width), or (n,) where the width is 1.
+        """
+        stop = self._count + len(rows)
+        if stop > self._capacity:
+            self._capacity = max(2 * self._capacity, stop)
+            old = self.values()
+            self._data = self._new(self._capacity)
+            self._part(0, self._count)[...] = old
+        self._part(self._count, stop)[...] = rows.reshape(len(rows), self._width)
+        self._count = stop
+
+    def values(self) -> NDArray[Any]:
+        """All rows, shape (n, width): a view; columns are contiguous, or rows for bytes."""
+        return self._part(0, self._count)
+
+    def column(self) -> NDArray[Any]:
+        """The first column, shape (n,): a view."""
+        return self.values()[:, 0]
+
+    def _new(self, capacity: int) -> NDArray[Any]:
+        shape = (capacity, self._width) if self._by_row else (self._width, capacity)
+        return np.empty(shape, dtype=self._dtype)
+
+    def _part(self, start: int, stop: int) -> NDArray[Any]:
+        return self._data[start:stop] if self._by_row else self._data[:, start:stop].T
+
+
+class TimeStore:
+    """Stamps and log times of messages.
+
+    Log times are seldom wanted, so they are kept as their distance from the stamps, in 32 bits as
+    long as it is below 2 s.
+    """
+
+    def __init__(self, capacity: int, *, stamped: bool) -> None:
+        """Start empty.
+
+        Args:
+            capacity: Messages to expect.
+            stamped: Whether the messages have stamps; without, the log times stand for them.
+        """
+        self._stamps = ColumnStore("<i8", 1, capacity)
+        self._behind = ColumnStore("<i4", 1, capacity) if stamped else None
+        self._is_short = True
+
+    def append(self, log_ns: IntArray, stamp_ns: IntArray | None) -> None:
+        """Add messages.
+
+        Args:
+            log_ns: Log times [Unix ns], shape (n,).
+            stamp_ns: Stamps [ns], shape (n,); None where they have none.
+        """
+        if self._behind is None or stamp_ns is None:
+            self._stamps.append(log_ns)
+            return
+        behind = log_ns - stamp_ns
+        far = len(behind) and (behind.min() < -_SHORT_NS or behind.max() >= _SHORT_NS)
+        if far and self._is_short:
+            wide = ColumnStore("<i8", 1, len(self._behind) + len(behind))
+            wide.append(self._behind.column())
+            self._behind, self._is_short = wide, False
+        self._stamps.append(stamp_ns)
+        self._behind.append(behind)
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self._stamps)
+
+    def stamps(self) -> IntArray:
+        """Stamps [ns], shape (n,), or log times where there are none: a view."""
+        return self._stamps.column()
+
+    def log(self) -> IntArray:
+        """Log times [Unix ns], shape (n,)."""
+        if self._behind is None:
+            return self._stamps.column()
+        return self._stamps.column() + self._behind.column()
