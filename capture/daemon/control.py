@@ -1,0 +1,279 @@
+"""The control socket: requests come in while the recording runs, and never hold it up.
+
+A Unix stream socket of mode 0600, so that only the recorder's own user (and root) can speak to it.
+Each line is a JSON object, ``{"do": "mark", "text": "slipped"}``; each gets one line back,
+``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``, in the order of the requests. A client
+may stay connected and send as many as it likes. The recorder calls :meth:`ControlServer.poll` once
+a tick: it takes what has come, within a budget, and waits for nobody.
+"""
+
+from __future__ import annotations
+
+import json
+import selectors
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any, Final, cast
+
+from ..errors import UndulogError
+from .control_socket import listen, release
+
+MAX_CLIENTS = 16
+"""More than these and the one that was silent for longest is let go."""
+
+BUFFER = 64 * 1024
+"""Longest request, and the most replies that wait for a client that doesn't read [B]."""
+
+BUDGET_NS = 1_000_000
+"""After so long in one poll the remaining requests wait for the next one [ns]."""
+
+_READ = 16 * 1024
+_TOO_LONG = f"a request is longer than {BUFFER} bytes"
+
+Reply = Mapping[str, Any]
+
+
+class _Later:
+    """The type of :data:`LATER`."""
+
+
+LATER: Final = _Later()
+"""A handler's answer to a request whose reply comes with :meth:`ControlServer.close`."""
+
+Handler = Callable[[Mapping[str, Any]], "Reply | _Later"]
+"""Does what a request asks; raises an UndulogError to refuse."""
+
+
+class _Client:
+    """One connection: bytes that came and bytes that wait to go."""
+
+    def __init__(self, connection: socket.socket, number: int) -> None:
+        self.socket = connection
+        self.heard = number  # the poll in which it last said something
+        self.incoming = bytearray()
+        self.outgoing = bytearray()
+        self.ended = False  # it will send no more
+        self.closing = False  # we take no more from it
+        self.waits = False  # for the end of the recording
+        self.more = False  # a whole request is left from the last poll
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a reply still fits."""
+        return len(self.outgoing) < BUFFER
+
+
+class ControlServer:
+    """Serves the control socket from the recorder's loop."""
+
+    def __init__(self, path: Path, handler: Handler) -> None:
+        """Listen.
+
+        Args:
+            path: Where; its folder must be there.
+            handler: Does what is asked. What it raises of :class:`UndulogError` is the reply's
+                ``error``; other exceptions are mistakes and come out of :meth:`poll`.
+
+        Raises:
+            ControlError: If another recorder listens there, something else is in the way, or the
+                socket can't be made.
+        """
+        self.path = path
+        self.requests = 0
+        """Requests answered so far."""
+        self._handler = handler
+        self._listener, self._identity = listen(path, backlog=MAX_CLIENTS)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._clients: dict[socket.socket, _Client] = {}
+        self._polls = 0
+        self._open = True
+
+    @property
+    def clients(self) -> int:
+        """Number of connections."""
+        return len(self._clients)
+
+    def poll(self) -> None:
+        """Take and answer what has come; returns at once."""
+        self._polls += 1
+        ready = self._selector.select(0)
+        busy = [client for client in self._clients.values() if client.more and client.has_room]
+        if not ready and not busy:
+            return
+        end_ns = perf_counter_ns() + BUDGET_NS
+        for key, events in ready:
+            if key.fileobj is self._listener:
+                self._accept()
+                continue
+            client = self._clients.get(cast("socket.socket", key.fileobj))
+            if client is not None:
+                if events & selectors.EVENT_READ:
+                    self._receive(client)
+                busy.append(client)
+        # The one that is first served changes, so that none can keep the budget for itself.
+        busy = list(dict.fromkeys(busy))
+        first = self._polls % len(busy) if busy else 0
+        for client in busy[first:] + busy[:first]:
+            if client.socket in self._clients:
+                self._answer(client, end_ns)
+                self._send(client)
+
+    def close(self, farewell: Reply | None = None) -> None:
+        """Stop listening and let everybody go; safe to call twice.
+
+        Args:
+            farewell: The reply to those whose request was answered with :data:`LATER`.
+        """
+        if not self._open:
+            return
+        self._open = False
+        release(self.path, self._listener, self._identity)
+        for client in list(self._clients.values()):
+            if client.waits and farewell is not None:
+                client.outgoing += _line({"ok": True, **farewell})
+            self._send(client)
+            self._drop(client)
+        self._selector.close()
+
+    # -- one client ------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except BlockingIOError:
+                return
+            except OSError:
+                # The caller gave up already, or we are out of descriptors: a recorder without
+                # its control socket goes on, and the caller sees that nobody answers.
+                return
+            if len(self._clients) >= MAX_CLIENTS:
+                silent = min(self._clients.values(), key=lambda client: client.heard)
+                silent.outgoing += _refusal(f"{MAX_CLIENTS} others are connected")
+                self._send(silent)
+                self._drop(silent)
+            connection.setblocking(False)
+            self._clients[connection] = _Client(connection, self._polls)
+            self._selector.register(connection, selectors.EVENT_READ)
+
+    def _receive(self, client: _Client) -> None:
+        try:
+            data = client.socket.recv(_READ)
+        except BlockingIOError:
+            return
+        except OSError:  # reset by the client: nobody is left to tell
+            self._drop(client)
+            return
+        if not data:
+            client.ended = True  # or it only stops sending, and waits for its replies
+            return
+        client.heard = self._polls
+        client.incoming += data
+
+    def _answer(self, client: _Client, end_ns: int) -> None:
+        """Answer the whole requests that have come, as far as budget and buffer go."""
+        client.more = False
+        if client.waits:
+            return
+        for line in _lines(client):
+            if line.strip():
+                reply = self._reply(line)
+                if isinstance(reply, bytes):
+                    client.outgoing += reply
+                else:
+                    client.waits = True
+            if client.waits or not client.has_room or perf_counter_ns() > end_ns:
+                client.more = not client.waits and _has_request(client)
+                return
+        if len(client.incoming) > BUFFER:
+            client.outgoing += _refusal(_TOO_LONG)
+            client.incoming.clear()
+            client.closing = True
+
+    def _reply(self, line: bytes) -> bytes | _Later:
+        self.requests += 1
+        if len(line) > BUFFER:
+            return _refusal(_TOO_LONG)
+        try:
+            request = json.loads(line, parse_constant=_no_constant)
+        except (ValueError, RecursionError) as error:
+            return _refusal(f"not JSON: {error}")
+        if not isinstance(request, dict):
+            return _refusal('a request is a JSON object such as {"do": "status"}')
+        try:
+            reply = self._handler(cast("dict[str, Any]", request))
+        except UndulogError as error:
+            return _refusal(str(error))
+        if isinstance(reply, _Later):
+            return reply
+        data = _line({"ok": True, **reply})
+        return data if len(data) <= BUFFER else _refusal(f"the reply has {len(data)} bytes")
+
+    def _send(self, client: _Client) -> None:
+        """Send what the socket takes; listen to the client only while its replies get through."""
+        try:
+            while client.outgoing:
+                sent = client.socket.send(client.outgoing)
+                del client.outgoing[:sent]
+        except BlockingIOError:
+            pass  # the rest goes when the client reads
+        except OSError:  # it has gone
+            self._drop(client)
+            return
+        finished = client.closing or (client.ended and not client.incoming and not client.waits)
+        if finished and not client.outgoing:
+            self._drop(client)
+            return
+        listening = client.has_room and not client.ended and not client.closing
+        wanted = selectors.EVENT_READ if listening and len(client.incoming) <= BUFFER else 0
+        wanted |= selectors.EVENT_WRITE if client.outgoing else 0
+        self._watch(client, wanted)
+
+    def _watch(self, client: _Client, events: int) -> None:
+        watched = self._selector.get_map().get(client.socket)
+        if watched is not None and watched.events == events:
+            return
+        if watched is not None and events:
+            self._selector.modify(client.socket, events)
+        elif watched is not None:
+            self._selector.unregister(client.socket)
+        elif events:
+            self._selector.register(client.socket, events)
+
+    def _drop(self, client: _Client) -> None:
+        if self._clients.pop(client.socket, None) is None:
+            return
+        with suppress(KeyError):  # it may be unwatched: full, or ended
+            self._selector.unregister(client.socket)
+        client.socket.close()
+
+
+def _lines(client: _Client) -> Iterator[bytes]:
+    """The requests that have come whole, each taken off the buffer as it is handed out."""
+    while _has_request(client):
+        at = client.incoming.find(b"\n")
+        end = len(client.incoming) if at < 0 else at + 1
+        line = bytes(client.incoming[:end])
+        del client.incoming[:end]
+        yield line
+
+
+def _has_request(client: _Client) -> bool:
+    # The last request of a client that has ended may lack its newline.
+    return b"\n" in client.incoming or (client.ended and bool(client.incoming))
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _line(reply: Reply) -> bytes:
+    return json.dumps(reply, allow_nan=False).encode() + b"\n"
+
+
+def _refusal(error: str) -> bytes:
+    return _line({"ok": False, "error": error})
