@@ -61,6 +61,10 @@ class ClockEstimate:
         Returns:
             Keys ``NAME.offset_ns`` and so on; what isn't known is left out.
         """
+        return {f"{name}.{key}": value for key, value in self.facts().items()}
+
+    def facts(self) -> dict[str, str]:
+        """The same, without the name of a source."""
         facts: dict[str, str] = {
             "samples": str(self.samples),
             "resets": str(self.resets),
@@ -72,7 +76,7 @@ class ClockEstimate:
         if self.drift_ppm is not None and self.drift_uncertainty_ppm is not None:
             facts["drift_ppm"] = f"{self.drift_ppm:.3f}"
             facts["drift_uncertainty_ppm"] = f"{self.drift_uncertainty_ppm:.2g}"
-        return {f"{name}.{key}": value for key, value in facts.items()}
+        return facts
 
 
 class SourceClock:

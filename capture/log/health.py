@@ -52,6 +52,10 @@ VERDICTS = ("good", "degraded", "bad")
 VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 
+RECORDER_TOPICS = ("/rosout", "/diagnostics", "/clock/")
+"""What a recorder says of itself, many voices on one topic: an event may be told late, and a clock
+that was not read again repeats its last stamp. It has no rhythm that could be disturbed."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -129,6 +133,15 @@ def judge_channel(health: ChannelHealth) -> list[Finding]:
     return found
 
 
+def has_rhythm(topic: str) -> bool:
+    """Whether a topic is one whose rhythm is judged.
+
+    Args:
+        topic: Its name.
+    """
+    return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
+
+
 def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Finding]:
     """Findings on the rhythm of one series.
 
@@ -138,10 +151,10 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Findi
         end_ns: Log time of its last message [Unix ns].
 
     Returns:
-        The findings; none for view aids.
+        The findings; none for view aids and for what a recorder says of itself.
     """
     timing, label = health.timing, health.label
-    if health.topic in VIEW_AIDS or timing.median_s is None:
+    if timing.median_s is None or not has_rhythm(health.topic):
         return []
     found: list[Finding] = []
     when = _at(timing.longest_at_ns, timing.first_ns)
