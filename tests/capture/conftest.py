@@ -1,0 +1,118 @@
+"""What the tests of sources share: a recording, random bus traffic, and patience."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture import SessionWriter
+from capture.log.frames import EXTENDED_FLAG, REMOTE_FLAG, FrameArray, empty_frames
+from capture.sources.contract import Source, SourceContext, SourceEvent
+
+PATIENCE_S = 90.0
+
+
+@dataclass
+class Heard:
+    """What a source gave: frames in order, events in order."""
+
+    source: Source
+    arrays: list[FrameArray] = field(default_factory=list)
+    events: list[SourceEvent] = field(default_factory=list)
+
+    def poll(self) -> None:
+        polled = self.source.poll()
+        self.arrays += polled.frames
+        self.events += polled.events
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Poll until something is so; fails after a long time."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < deadline, (len(self.frames), self.texts, self.source.counts)
+            self.poll()
+            time.sleep(0.002)
+
+    def until_frames(self, count: int) -> FrameArray:
+        self.until(lambda: sum(map(len, self.arrays)) >= count)
+        self.poll()
+        return self.frames
+
+    def until_event(self, part: str) -> SourceEvent:
+        self.until(lambda: any(part in event.text for event in self.events))
+        return next(event for event in self.events if part in event.text)
+
+    @property
+    def frames(self) -> FrameArray:
+        return np.concatenate([empty_frames(0), *self.arrays])
+
+    @property
+    def texts(self) -> list[str]:
+        return [event.text for event in self.events]
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> Iterator[SourceContext]:
+    """A recording that has begun."""
+    epoch_ns, start_ns = time.time_ns(), time.monotonic_ns()
+    path = tmp_path / "session.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=epoch_ns) as writer:
+        yield SourceContext(lambda: epoch_ns + time.monotonic_ns() - start_ns, writer)
+
+
+@pytest.fixture
+def listen(context: SourceContext) -> Iterator[Callable[[Source], Heard]]:
+    """Start a source; it is stopped at the end, whatever happens."""
+    started: list[Source] = []
+
+    def start(source: Source) -> Heard:
+        started.append(source)
+        source.start(context)
+        return Heard(source)
+
+    yield start
+    for source in started:
+        source.stop()
+        source.stop()  # safe to call twice
+
+
+@pytest.fixture
+def traffic() -> Callable[[int], FrameArray]:
+    """Random frames of both identifier widths and all lengths, a remote request now and then."""
+
+    def make(count: int) -> FrameArray:
+        rng = np.random.default_rng(count)
+        frames = empty_frames(count)
+        extended = rng.random(count) < 0.3
+        remote = rng.random(count) < 0.02
+        frames["id_flags"] = np.where(
+            extended,
+            rng.integers(0, 2**29, count) | EXTENDED_FLAG,
+            rng.integers(0, 2**11, count),
+        ) | (remote * REMOTE_FLAG)
+        frames["dlc"] = rng.integers(0, 9, count)
+        data = rng.integers(0, 256, (count, 8))
+        data[np.arange(8) >= frames["dlc"][:, None]] = 0
+        data[remote] = 0
+        frames["data"] = data
+        frames["t_device_ns"] = 1_700_000_000_123_456_000 + np.cumsum(
+            rng.integers(1, 9000, count) * 1000
+        )
+        return frames
+
+    return make
+
+
+@pytest.fixture
+def same() -> Callable[[FrameArray, FrameArray], bool]:
+    """Whether two lots of frames agree in everything but times."""
+
+    def compare(found: FrameArray, truth: FrameArray) -> bool:
+        return len(found) == len(truth) and all(
+            np.array_equal(found[name], truth[name]) for name in ("id_flags", "dlc", "data")
+        )
+
+    return compare

@@ -1,0 +1,331 @@
+"""A real pseudo-terminal with an slcan adapter at its other end."""
+
+import os
+import select
+import threading
+import tty
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture.errors import SourceError, UsageError
+from capture.log.frames import EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, empty_frames
+from capture.robot import ClockDomain
+from capture.sources.address import parse_address
+from capture.sources.events import Tally
+from capture.sources.registry import open_source
+from capture.sources.slcan_text import STAMP_PERIOD_MS, SlcanText
+
+
+def lines(frames, stamps_ms=None) -> bytes:
+    """Frames as the protocol's description has them."""
+    out = []
+    for number, frame in enumerate(frames):
+        flags, length = int(frame["id_flags"]), int(frame["dlc"])
+        extended, remote = flags & EXTENDED_FLAG, flags & REMOTE_FLAG
+        letter = "tTrR"[bool(extended) + 2 * bool(remote)]
+        identifier = f"{flags & ID_MASK:0{8 if extended else 3}X}"
+        data = "" if remote else bytes(frame["data"][:length]).hex().upper()
+        stamp = "" if stamps_ms is None else f"{int(stamps_ms[number]) % STAMP_PERIOD_MS:04X}"
+        out.append(f"{letter}{identifier}{length}{data}{stamp}\r")
+    return "".join(out).encode()
+
+
+class Adapter:
+    """An adapter on a pseudo-terminal: takes commands, sends when its channel is open."""
+
+    def __init__(self, link: Path, *, refuses: bytes = b"", answers: bool = True) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(self.slave))
+        self.link = link
+        self.refuses, self.answers = refuses, answers
+        self.commands: list[bytes] = []
+        self.opened = threading.Event()
+        self.queue = b""
+        self.lock = threading.Lock()
+        self.plugged = True
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def send(self, data: bytes) -> None:
+        with self.lock:
+            self.queue += data
+
+    def run(self) -> None:
+        text = b""
+        os.set_blocking(self.master, False)
+        while self.plugged:
+            ready = select.select([self.master], [], [], 0.002)[0]
+            if ready:
+                text += os.read(self.master, 4096)
+            *commands, text = text.split(b"\r")
+            for command in filter(None, commands):
+                self.commands.append(command)
+                if self.answers:
+                    bad = command[:1] == self.refuses or (
+                        command == b"C" and not self.opened.is_set()
+                    )
+                    os.write(self.master, b"\a" if bad else b"\r")
+                if command == b"C":
+                    self.opened.clear()
+                elif command in (b"L", b"O") and command != self.refuses:
+                    self.opened.set()
+            with self.lock:
+                if self.opened.is_set() and self.queue:
+                    try:
+                        self.queue = self.queue[os.write(self.master, self.queue[:3000]) :]
+                    except BlockingIOError:
+                        pass
+
+    def unplug(self) -> None:
+        if self.plugged:
+            self.plugged = False
+            self.thread.join()
+            self.link.unlink(missing_ok=True)
+            os.close(self.master)
+            os.close(self.slave)
+
+
+@pytest.fixture
+def plug(tmp_path):
+    adapters = []
+
+    def make(**kwargs) -> Adapter:
+        adapters.append(Adapter(tmp_path / "ttyACM0", **kwargs))
+        return adapters[-1]
+
+    yield make
+    for adapter in adapters:
+        adapter.unplug()
+
+
+def source_at(tmp_path: Path, query: str = "bitrate=1000000"):
+    return open_source(parse_address(f"can:slcan:{tmp_path}/ttyACM0?{query}"))
+
+
+def test_twenty_thousand_frames_arrive_as_sent(plug, tmp_path, listen, traffic, same) -> None:
+    adapter = plug()
+    truth = traffic(20_000)
+    heard = listen(source_at(tmp_path))
+    heard.until_event("connected")
+    assert heard.source.connected
+    assert heard.source.clock is ClockDomain.HOST
+    adapter.send(lines(truth))
+    found = heard.until_frames(len(truth))
+    assert same(found, truth)
+    assert np.array_equal(found["t_device_ns"], found["t_host_ns"])
+    assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
+    assert heard.source.counts.frames == 20_000
+    assert heard.source.counts.malformed == 0
+    assert heard.source.counts.dropped is None
+
+
+def test_it_listens_only_and_never_transmits(plug, tmp_path, listen, traffic) -> None:
+    adapter = plug()
+    heard = listen(source_at(tmp_path))
+    assert "listen-only, 1000000 bit/s" in heard.until_event("connected").text
+    adapter.send(lines(traffic(100)))
+    heard.until_frames(100)
+    heard.source.stop()
+    heard.until(lambda: adapter.commands[-1] == b"C")
+    assert [c for c in adapter.commands if c != b"C"] == [b"S8", b"L"]
+    assert heard.source.finished
+    assert not heard.source.connected
+
+
+def test_the_adapters_clock_runs_on_over_the_minute(plug, tmp_path, listen, traffic, same) -> None:
+    adapter = plug()
+    truth = traffic(20_000)
+    stamps_ms = 51_234 + 7 * np.arange(len(truth))
+    heard = listen(source_at(tmp_path, "bitrate=500000&timestamps=1"))
+    heard.until_event("connected")
+    adapter.send(lines(truth, stamps_ms))
+    found = heard.until_frames(len(truth))
+    assert same(found, truth)
+    assert heard.source.clock is ClockDomain.DEVICE
+    assert np.array_equal(found["t_device_ns"], stamps_ms * 1_000_000)
+    assert [c for c in adapter.commands if c != b"C"] == [b"S6", b"Z1", b"L"]
+
+
+def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
+    text, tally = SlcanText(stamps=True), Tally(lambda: 0)
+    true_s = np.array([3.0, 59.9, 60.1, 700.0, 3599.999, 3600.002, 90_000.0])
+    found = [
+        text.feed(b"t1230%04X\r" % (round(s * 1000) % STAMP_PERIOD_MS), 10**18 + int(s * 1e9), tally)
+        for s in true_s + 0.0
+    ]
+    assert [int(f["t_device_ns"][0]) for f in found] == [round(s * 1000) * 10**6 for s in true_s]
+
+
+def test_an_adapter_that_was_asked_for_stamps_and_gives_none(traffic, same) -> None:
+    truth = traffic(50)
+    frames = SlcanText(stamps=True).feed(lines(truth), 77, Tally(lambda: 0))
+    assert same(frames, truth)
+    assert set(frames["t_device_ns"].tolist()) == {77}
+
+
+def test_stamps_that_nobody_asked_for_are_not_data(traffic, same) -> None:
+    truth = traffic(50)
+    frames = SlcanText(stamps=False).feed(lines(truth, np.arange(50)), 77, Tally(lambda: 0))
+    assert same(frames, truth)
+    assert set(frames["t_device_ns"].tolist()) == {77}
+
+
+def test_noise_costs_its_own_line_only(plug, tmp_path, listen, traffic, same) -> None:
+    truth = traffic(1000)
+    noise = [
+        b"\xff\xfe\x80\r",  # no text in any encoding
+        b"t1232A\xff22\r",
+        b"t12\r",
+        b"t8000\r",  # identifier beyond 11 bits
+        b"TFFFFFFFF0\r",  # and beyond 29
+        b"t1239112233445566778899\r",  # nine bytes
+        b"t1232112\r",  # a digit lost
+        b"q\r",
+        b"X" * 5000 + b"\r",
+    ]
+    good = lines(truth).split(b"\r")[:-1]
+    rng = np.random.default_rng(0)
+    places = set(rng.choice(1000, len(noise), replace=False).tolist())
+    mixed, left = b"", list(noise)
+    for number, line in enumerate(good):
+        if number in places:
+            mixed += left.pop()
+        mixed += line + b"\r" + (b"z\r" if number % 100 == 0 else b"\r")
+    adapter = plug()
+    heard = listen(source_at(tmp_path))
+    adapter.send(mixed + b"\a")
+    assert same(heard.until_frames(1000), truth)
+    heard.until(lambda: heard.source.counts.malformed == len(noise) + 1)
+    heard.until_event("bell")
+    assert heard.source.counts.frames == 1000
+    heard.until_event("malformed line")
+
+
+def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
+    truth = traffic(300)
+    stream = lines(truth) + b"\xff\r" + lines(truth)
+    whole = SlcanText(stamps=False).feed(stream, 5, Tally(lambda: 0))
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        cuts = np.sort(rng.integers(0, len(stream), rng.integers(1, 400)))
+        text, tally = SlcanText(stamps=False), Tally(lambda: 0)
+        borders = [0, *cuts.tolist(), len(stream)]
+        parts = [
+            text.feed(stream[a:b], 5, tally) for a, b in zip(borders, borders[1:], strict=False)
+        ]
+        assert np.concatenate(parts).tobytes() == whole.tobytes()
+        assert tally.counts.malformed == 1
+
+
+def test_can_fd_frames_are_left_out_and_told(traffic, same) -> None:
+    truth = traffic(3)
+    tally = Tally(lambda: 0)
+    stream = lines(truth) + b"d123C" + b"00" * 24 + b"\rB123456789" + b"11" * 12 + b"\r"
+    assert same(SlcanText(stamps=False).feed(stream, 5, tally), truth)
+    assert [event.text for event in tally.events.take()] == ["CAN FD frame left out (2 times)"]
+    assert tally.counts.malformed == 0
+
+
+def test_unplugged_and_plugged_in_again(plug, tmp_path, listen, traffic, same) -> None:
+    first, second = traffic(500), traffic(700)
+    adapter = plug()
+    heard = listen(source_at(tmp_path))
+    adapter.send(lines(first))
+    heard.until_frames(500)
+    adapter.unplug()
+    heard.until_event("lost")
+    assert not heard.source.connected
+    for _ in range(100):
+        heard.poll()
+    adapter = plug()
+    heard.until_event("is back after")
+    adapter.send(lines(second))
+    assert same(heard.until_frames(1200), np.concatenate([first, second]))
+    assert heard.source.counts.reconnects == 1
+    assert [event.level for event in heard.events] == ["info", "warn", "info"]
+    assert not heard.source.finished
+
+
+def test_an_adapter_that_is_not_there_yet_is_waited_for(
+    plug, tmp_path, listen, traffic, same
+) -> None:
+    heard = listen(source_at(tmp_path))
+    assert "No such file" in heard.until_event("waits for").text
+    assert not heard.source.connected
+    truth = traffic(100)
+    plug().send(lines(truth))
+    assert same(heard.until_frames(100), truth)
+    assert heard.source.counts.reconnects == 0
+
+
+def test_an_adapter_without_listen_only_is_not_opened_otherwise(plug, tmp_path, listen) -> None:
+    adapter = plug(refuses=b"L")
+    heard = listen(source_at(tmp_path))
+    assert "listen_only=0" in heard.until_event("refuses").text
+    assert b"O" not in adapter.commands
+
+
+def test_listen_only_can_be_given_up(plug, tmp_path, listen, traffic, same) -> None:
+    adapter = plug(refuses=b"L")
+    truth = traffic(100)
+    heard = listen(source_at(tmp_path, "listen_only=0"))
+    assert "acknowledges" in heard.until_event("connected").text
+    adapter.send(lines(truth))
+    assert same(heard.until_frames(100), truth)
+    assert [c for c in adapter.commands if c != b"C"] == [b"O"]
+
+
+def test_an_adapter_that_never_answers(plug, tmp_path, listen, traffic, same) -> None:
+    adapter = plug(answers=False)
+    truth = traffic(100)
+    heard = listen(source_at(tmp_path))
+    adapter.send(lines(truth))
+    assert same(heard.until_frames(100), truth)
+
+
+def test_what_can_never_work_is_said_at_once(tmp_path, context) -> None:
+    (tmp_path / "ttyACM0").write_text("a file")
+    with pytest.raises(SourceError, match="is no serial device"):
+        source_at(tmp_path)
+    with pytest.raises(SourceError, match="is no serial device"):
+        open_source(parse_address("can:slcan:/dev/null")).start(context)
+    with pytest.raises(UsageError, match=r"bitrate 123 is not one of 10000, 20000"):
+        source_at(tmp_path, "bitrate=123")
+    with pytest.raises(UsageError, match=r"tty_baud 5 is not one of"):
+        source_at(tmp_path, "tty_baud=5")
+    with pytest.raises(UsageError, match=r"no option 'bitrat'.*did you mean bitrate"):
+        source_at(tmp_path, "bitrat=1000000")
+
+
+def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, same) -> None:
+    pytest.importorskip("serial")
+    from can.interfaces.slcan import slcanBus
+
+    truth = traffic(1000)
+    adapter = plug()
+    bus = slcanBus(str(tmp_path / "ttyACM0"), bitrate=500_000, sleep_after_open=0, listen_only=True)
+    adapter.send(lines(truth))
+    theirs = []
+    while len(theirs) < len(truth):
+        message = bus.recv(60)
+        assert message is not None
+        theirs.append(message)
+    bus.shutdown()
+    frames = empty_frames(len(theirs))
+    frames["id_flags"] = [
+        m.arbitration_id
+        | m.is_extended_id * EXTENDED_FLAG
+        | m.is_remote_frame * REMOTE_FLAG
+        for m in theirs
+    ]
+    frames["dlc"] = [m.dlc for m in theirs]
+    frames["data"] = [list(bytes(m.data).ljust(8, b"\0")) for m in theirs]
+    assert same(frames, truth)
+    heard = listen(source_at(tmp_path))
+    heard.until_event("connected")
+    adapter.send(lines(truth))
+    assert same(heard.until_frames(1000), frames)

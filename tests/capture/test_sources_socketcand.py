@@ -1,0 +1,307 @@
+"""A real socketcand server over TCP, read by us and by python-can's own client."""
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import can
+import numpy as np
+import pytest
+
+from capture.errors import UsageError
+from capture.log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, empty_frames
+from capture.robot import ClockDomain
+from capture.sources.address import parse_address
+from capture.sources.events import Tally
+from capture.sources.registry import open_source
+from capture.sources.socketcand_text import SocketcandText
+
+
+def messages(frames, blank: str = "") -> bytes:
+    """Frames as socketcand writes them, remote requests among them."""
+    out = []
+    for frame in frames:
+        flags, length, t_ns = (int(frame[key]) for key in ("id_flags", "dlc", "t_device_ns"))
+        identifier = f"{flags & ID_MASK:0{8 if flags & EXTENDED_FLAG else 3}X}"
+        stamp = f"{t_ns // 10**9}.{t_ns % 10**9 // 1000:06d}"
+        if flags & REMOTE_FLAG:
+            out.append(f"< rtr {identifier} {stamp} {length} >")
+        else:
+            data = blank.join(f"{byte:02X}" for byte in frame["data"][:length].tolist())
+            out.append(f"< frame {identifier} {stamp} {data} >")
+    return "".join(out).encode()
+
+
+class Server:
+    """Serves a stream to each client that asks for can0 in raw mode."""
+
+    def __init__(self, port: int = 0, hello: bytes = b"< hi >", pause_s: float = 0.0) -> None:
+        self.listener = socket.create_server(("127.0.0.1", port))
+        self.port = self.listener.getsockname()[1]
+        self.hello, self.pause_s = hello, pause_s
+        self.stream = b""
+        self.pieces: list[int] = []
+        self.heard: list[bytes] = []
+        self.clients: list[socket.socket] = []
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self) -> None:
+        while True:
+            try:
+                client, _ = self.listener.accept()
+            except OSError:
+                return
+            client.settimeout(60)
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.clients.append(client)
+            try:
+                self.serve(client)
+            except OSError:
+                continue
+
+    def serve(self, client: socket.socket) -> None:
+        client.sendall(self.hello)
+        for expected in (b"< open can0 >", b"< rawmode >"):
+            asked = client.recv(1000)
+            self.heard.append(asked)
+            if asked != expected:
+                client.sendall(b"< error could not open bus >")
+                return
+            client.sendall(b"< ok >")
+        time.sleep(self.pause_s)
+        at = 0
+        for size in [*self.pieces, len(self.stream)]:
+            client.sendall(self.stream[at : at + size])
+            at += size
+
+    def close(self) -> None:
+        self.listener.shutdown(socket.SHUT_RDWR)
+        self.listener.close()
+        for client in self.clients:
+            client.close()
+        self.thread.join()
+
+
+@pytest.fixture
+def serve():
+    servers = []
+
+    def make(*args, **kwargs) -> Server:
+        servers.append(Server(*args, **kwargs))
+        return servers[-1]
+
+    yield make
+    for server in servers:
+        if server.thread.is_alive():
+            server.close()
+
+
+def source_at(port: int, channel: str = "can0"):
+    return open_source(parse_address(f"can:socketcand:{channel}?host=127.0.0.1&port={port}"))
+
+
+@pytest.mark.parametrize("blank", ["", " "])
+def test_twenty_thousand_frames_and_their_times_to_the_microsecond(
+    serve, listen, traffic, same, blank
+) -> None:
+    truth = traffic(20_000)
+    server = serve()
+    server.stream = messages(truth, blank)
+    server.pieces = np.random.default_rng(1).integers(1, 3000, 400).tolist()
+    heard = listen(source_at(server.port))
+    found = heard.until_frames(len(truth))
+    assert same(found, truth)
+    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    assert heard.source.clock is ClockDomain.DEVICE
+    assert heard.source.counts.malformed == 0
+    assert server.heard == [b"< open can0 >", b"< rawmode >"]
+
+
+def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same) -> None:
+    truth = traffic(20_000)
+    truth = truth[(truth["id_flags"] & REMOTE_FLAG) == 0]  # it knows no remote requests
+    server = serve(pause_s=0.3)  # it can't bear frames right behind the last answer
+    server.stream = messages(truth)
+    bus = can.Bus(interface="socketcand", host="127.0.0.1", port=server.port, channel="can0")
+    theirs = []
+    while len(theirs) < len(truth):
+        message = bus.recv(60)
+        assert message is not None
+        theirs.append(message)
+    bus.shutdown()
+    frames = empty_frames(len(theirs))
+    frames["id_flags"] = [m.arbitration_id | m.is_extended_id * EXTENDED_FLAG for m in theirs]
+    frames["dlc"] = [m.dlc for m in theirs]
+    frames["data"] = [list(bytes(m.data).ljust(8, b"\0")) for m in theirs]
+    heard = listen(source_at(server.port))
+    found = heard.until_frames(len(truth))
+    assert same(found, frames)
+    times_s = np.array([m.timestamp for m in theirs])
+    assert np.abs(found["t_device_ns"] / 1e9 - times_s).max() < 1e-6
+
+
+def test_error_frames_are_frames_and_events(serve, listen, traffic, same) -> None:
+    truth = traffic(10)
+    server = serve()
+    server.stream = (
+        messages(truth[:5])
+        + b"< error 040 1700000001.000001 >< error 020 1700000001.000002 >"
+        + messages(truth[5:])
+    )
+    heard = listen(source_at(server.port))
+    found = heard.until_frames(12)
+    errors = found[5:7]
+    assert errors["id_flags"].tolist() == [ERROR_FLAG | 0x40, ERROR_FLAG | 0x20]
+    assert errors["t_device_ns"].tolist() == [1700000001000001000, 1700000001000002000]
+    assert same(np.delete(found, [5, 6]), truth)
+    assert heard.source.counts.error_frames == 2
+    told = [(event.level, event.text) for event in heard.events[1:]]
+    assert ("error", "bus-off: the controller left the bus") in told
+    assert ("warn", "error frame: no acknowledgement") in told
+    heard.until_frames(12)
+    server.stream = b""
+    theirs = can.interfaces.socketcand.socketcand.convert_ascii_message_to_can_message(
+        "< error 040 1700000001.000001 >"
+    )
+    assert theirs.is_error_frame
+    assert theirs.arbitration_id == int(errors["id_flags"][0]) & ID_MASK
+
+
+def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
+    truth = traffic(200)
+    stream = messages(truth) + b"< frame 12Z 1.0 00 >" + messages(truth, " ") + b"< ok >"
+    whole = SocketcandText().feed(stream, 5, Tally(lambda: 0))
+    assert len(whole) == 400
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        cuts = np.sort(rng.integers(0, len(stream), rng.integers(1, 400)))
+        text, tally = SocketcandText(), Tally(lambda: 0)
+        borders = [0, *cuts.tolist(), len(stream)]
+        parts = [
+            text.feed(stream[a:b], 5, tally) for a, b in zip(borders, borders[1:], strict=False)
+        ]
+        assert np.concatenate(parts).tobytes() == whole.tobytes()
+        assert tally.counts.malformed == 1
+
+
+def test_noise_costs_its_own_message_only(traffic, same) -> None:
+    truth = traffic(1000)
+    noise = [
+        b"< frame 123 1.000000 11",  # cut short: the next one begins
+        b"ame 123 1.000000 11 >",  # its beginning lost
+        b"< frame FFF 1.000000 11 >",  # beyond 11 bits
+        b"< frame 123 1.000000 1 >",  # half a byte
+        b"< frame 123 x.000000 11 >",
+        b"< frame \xff\xfe 1.000000 11 >",
+        b"< what >",
+        b"<" + b"Y" * 5000 + b">",
+    ]
+    good = [messages(truth[k : k + 1]) for k in range(1000)]
+    for number, piece in enumerate(noise):
+        good[100 * number + 50] = piece + good[100 * number + 50]
+    text, tally = SocketcandText(), Tally(lambda: 0)
+    stream = b"".join(good)
+    parts = [text.feed(stream[k : k + 1400], 5, tally) for k in range(0, len(stream), 1400)]
+    found = np.concatenate(parts)
+    assert same(found, truth)
+    assert tally.counts.malformed == len(noise)
+
+
+def test_other_decimals_and_other_widths() -> None:
+    text, tally = SocketcandText(), Tally(lambda: 0)
+    found = text.feed(
+        b"< frame 7 23.4 11 >< frame 123 23.424242 >< frame 00000123 5.123456789 1122 >", 5, tally
+    )
+    assert found["t_device_ns"].tolist() == [23_400_000_000, 23_424_242_000, 5_123_456_789]
+    assert found["id_flags"].tolist() == [7, 0x123, 0x123 | EXTENDED_FLAG]
+    assert found["dlc"].tolist() == [1, 0, 2]
+    assert tally.counts.malformed == 0
+
+
+def test_can_fd_frames_are_left_out_and_told(traffic, same) -> None:
+    truth = traffic(3)
+    tally = Tally(lambda: 0)
+    stream = messages(truth) + b"< frame 123 1.000000 " + b"AB" * 12 + b" >"
+    assert same(SocketcandText().feed(stream, 5, tally), truth)
+    assert [event.text for event in tally.events.take()] == ["CAN FD frame left out"]
+    assert tally.counts.malformed == 0
+
+
+KILLED = """
+import socket, sys, time
+server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
+print(server.getsockname()[1], flush=True)
+client, _ = server.accept()
+client.sendall(b"< hi >")
+client.recv(100)
+client.sendall(b"< ok >")
+client.recv(100)
+client.sendall(b"< ok >" + sys.argv[2].encode())
+time.sleep(600)
+"""
+
+
+def spawn(port: int, stream: bytes) -> tuple[subprocess.Popen[str], int]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(port), stream.decode()],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    return process, int(process.stdout.readline())
+
+
+def test_the_server_is_killed_and_comes_back(listen, traffic, same) -> None:
+    first, second = traffic(100), traffic(200)
+    process, port = spawn(0, messages(first))
+    try:
+        heard = listen(source_at(port))
+        heard.until_frames(100)
+        process.kill()
+        heard.until_event("lost can0 at 127.0.0.1")
+        assert not heard.source.connected
+        for _ in range(100):
+            heard.poll()
+    finally:
+        process.kill()
+        process.communicate()
+    process, _ = spawn(port, messages(second))
+    try:
+        assert same(heard.until_frames(300), np.concatenate([first, second]))
+    finally:
+        process.kill()
+        process.communicate()
+    assert heard.source.counts.reconnects == 1
+    levels = [event.level for event in heard.events]
+    assert levels[:3] == ["info", "warn", "info"]
+    heard.until_event("is back after")
+
+
+def test_a_server_that_comes_later(listen, serve, traffic, same) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as reserved:
+        port = reserved.getsockname()[1]
+    heard = listen(source_at(port))
+    assert "Connection refused" in heard.until_event("waits for").text
+    truth = traffic(50)
+    server = serve(port)
+    server.stream = messages(truth)
+    assert same(heard.until_frames(50), truth)
+
+
+def test_something_else_at_the_port_or_another_bus_is_told(listen, serve) -> None:
+    heard = listen(source_at(serve(hello=b"HTTP/1.1 400 >").port))
+    assert "HTTP" in heard.until_event("waits for").text
+    heard = listen(source_at(serve().port, "can7"))
+    assert "could not open bus" in heard.until_event("waits for").text
+
+
+def test_options_are_checked() -> None:
+    with pytest.raises(UsageError, match="port=x is not a whole number"):
+        open_source(parse_address("can:socketcand:can0?port=x"))
+    with pytest.raises(UsageError, match="port 70000 is not one of"):
+        open_source(parse_address("can:socketcand:can0?port=70000"))
+    with pytest.raises(UsageError, match="no option 'hots'; valid: host, port"):
+        open_source(parse_address("can:socketcand:can0?hots=x"))
