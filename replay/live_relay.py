@@ -21,7 +21,7 @@ import rerun as rr
 
 from capture.daemon.live_wire import Kind, LiveMessage, read_records
 from capture.errors import DataError, LogWriteError, UndulogError
-from capture.interruption import interruptible
+from capture.interruption import StopRequest, interruptible
 from capture.part_file import part_file
 
 from .live_decode import LiveLog
@@ -231,9 +231,9 @@ def relay_to_viewer(path: Path, viewer: LiveViewer | None, address: str) -> Rela
         UsageError: If the socket can't be made.
         UndulogError: If drawing fails.
     """
-    with Inbox(path) as inbox:
+    with interruptible() as request, Inbox(path) as inbox:
         relay = Relay(inbox, lambda rec: rec.connect_grpc(address))
-        return _run(relay, viewer)
+        return _run(relay, request, viewer)
 
 
 def relay_to_file(path: Path, output: Path) -> RelayReport:
@@ -252,6 +252,7 @@ def relay_to_file(path: Path, output: Path) -> RelayReport:
         LogWriteError: If the file can't be written.
     """
     with ExitStack() as stack:
+        request = stack.enter_context(interruptible())
         draft = stack.enter_context(part_file(output))
         inbox = stack.enter_context(Inbox(path))
 
@@ -261,7 +262,7 @@ def relay_to_file(path: Path, output: Path) -> RelayReport:
             except (RuntimeError, OSError) as error:
                 raise LogWriteError(output, f"can't be written: {error}") from error
 
-        report = _run(Relay(inbox, save, one_session=True), None, until_end=True)
+        report = _run(Relay(inbox, save, one_session=True), request, None, until_end=True)
         if not report.sessions:
             raise DataError(f"{path}: no recording was heard; nothing is written")
         require_whole(draft, output)
@@ -287,20 +288,21 @@ class _Painter(threading.Thread):
             self.error = error
 
 
-def _run(relay: Relay, viewer: LiveViewer | None, *, until_end: bool = False) -> RelayReport:
+def _run(
+    relay: Relay, request: StopRequest, viewer: LiveViewer | None, *, until_end: bool = False
+) -> RelayReport:
     """Draw until told to stop, or until the viewer or (if so wanted) the session has ended."""
     painter = _Painter(relay)
-    with interruptible() as request:
-        painter.start()
-        while painter.is_alive() and not request.requested:
-            if (viewer is not None and viewer.ended) or (until_end and relay.ended):
-                break
-            time.sleep(_LOOK_S)
-        painter.stop.set()
+    painter.start()
+    while painter.is_alive() and not request.requested:
+        if (viewer is not None and viewer.ended) or (until_end and relay.ended):
+            break
+        time.sleep(_LOOK_S)
+    painter.stop.set()
+    painter.join(_GRACE_S)
+    if painter.is_alive() and viewer is not None:
+        viewer.close()  # it takes nothing: what waits for it is let go
         painter.join(_GRACE_S)
-        if painter.is_alive() and viewer is not None:
-            viewer.close()  # it takes nothing: what waits for it is let go
-            painter.join(_GRACE_S)
     if painter.error is not None:
         raise painter.error
     if painter.is_alive():

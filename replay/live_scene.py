@@ -63,6 +63,7 @@ class LiveScene:
         self._of_joints: dict[str, bool] = {}
         self._places: joints.Places | None = None
         self._start: Start | None = None
+        self._origin_ns: int | None = None
         self._limit_w: float | None = None
         self._mode: str | None = None
         self._modes = 0
@@ -205,43 +206,50 @@ class LiveScene:
         commands = self._window.tracks("/joint_commands")
         drive = power.mechanical_power(self._window.columns)
         upto_ns = self._window.ready_ns([positions, drive], head.t_ns)
-        rows = self._slots(head.t_ns, self._fresh.rows("body", head.t_ns, upto_ns))
-        if not rows.size:
+        fresh = self._fresh.rows("body", head.t_ns, upto_ns)
+
+        def motion_of(rows: IntArray) -> Motion:
+            rows = rows[(rows >= fresh.start) & (rows < fresh.stop)]
+            names, t_ns = robot.joint_names, head.t_ns[rows]
+            return Motion(
+                robot=robot,
+                t_ns=t_ns,
+                head_position=head.position[rows],
+                head_quaternion=head.quaternion[rows],
+                angles=resampled(positions, names, t_ns, interpolate),
+                commands=resampled(commands, names, t_ns, hold) if commands else None,
+                power_w=resampled(drive, names, t_ns, interpolate) if drive else None,
+            )
+
+        chosen = self._slots(head.t_ns, BODY_RATE_HZ)
+        motion = motion_of(chosen)
+        ghost = motion_of(chosen[self._slots(head.t_ns[chosen], body.COMMANDED_RATE_HZ)])
+        if not motion.t_ns.size:
             return
-        names, t_ns = robot.joint_names, head.t_ns[rows]
-        motion = Motion(
-            robot=robot,
-            t_ns=t_ns,
-            head_position=head.position[rows],
-            head_quaternion=head.quaternion[rows],
-            angles=resampled(positions, names, t_ns, interpolate),
-            commands=resampled(commands, names, t_ns, hold) if commands else None,
-            power_w=resampled(drive, names, t_ns, interpolate) if drive else None,
-        )
         if self._start is None:
             self._start = start_of(
-                HeadPath(t_ns, motion.head_position, motion.head_quaternion, head.tracked)
+                HeadPath(motion.t_ns, motion.head_position, motion.head_quaternion, head.tracked)
             )
             self._rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._scale(drive)
         body.log_body(self._rec, self._clock, motion, limit_w=self._limit_w)
-        body.log_ghost(self._rec, self._clock, motion)
-        self._draw_ranges(motion)
+        body.log_ghost(self._rec, self._clock, ghost)
+        self._draw_ranges(ghost)
         if self._places is not None:
             markers.log_markers(self._rec, self._clock, motion, self._places, palette)
         if head.tracked:
             self._draw_trail(motion)
 
-    def _slots(self, t_ns: IntArray, rows: slice) -> IntArray:
-        """At most 50 of the rows a second, as :func:`replay.sampling.decimate` would choose them.
+    def _slots(self, t_ns: IntArray, rate_hz: float) -> IntArray:
+        """At most so many of the rows a second, as :func:`replay.sampling.decimate` chooses them.
 
-        The slots start with the session, so that it doesn't matter where a batch ends.
+        The slots start with the first row of all, so that it doesn't matter where a batch ends.
         """
-        period = round(1e9 / BODY_RATE_HZ)
-        slot = (t_ns - self._clock.start_ns + period // 4) // period
-        first = np.flatnonzero(np.diff(slot, prepend=slot[:1] - 1))
-        inside = (first >= rows.start) & (first < rows.stop)
-        return np.asarray(first[inside], dtype=np.int64)
+        if self._origin_ns is None and t_ns.size:
+            self._origin_ns = int(t_ns[0])
+        period = round(1e9 / rate_hz)
+        slot = (t_ns - (self._origin_ns or 0) + period // 4) // period
+        return np.flatnonzero(np.diff(slot, prepend=slot[:1] - 1)).astype(np.int64)
 
     def _scale(self, drive: tuple[Track, ...]) -> None:
         """Let the colours' full power grow with what was seen, in steps of 1, 2, 5."""
