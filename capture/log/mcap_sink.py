@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.records import Attachment, Channel, Metadata, Schema
-from mcap.writer import Writer
 
 from ..errors import DataError, LogWriteError, OutputExistsError
+from .mcap_writer import McapWriter
 from .sink import Description
 
 PROFILE = "ros2"
@@ -34,7 +34,7 @@ class McapSink:
         self.path = Path(path)
         self._open = True
         self._stream = create_file(self.path, force=force)
-        self._writer = Writer(_Guarded(self._stream, self.path))  # pyright: ignore[reportArgumentType] a binary stream, as the writer uses it
+        self._writer = McapWriter(_Guarded(self._stream, self.path))
         self._writer.start(profile=PROFILE, library=library_name())
 
     def define(self, record: Description) -> None:
@@ -100,7 +100,7 @@ def library_name() -> str:
     return f"undulog/{version('undulog')}"
 
 
-def write_description(writer: Writer, record: Description) -> None:
+def write_description(writer: McapWriter, record: Description) -> None:
     """Write a record that explains messages.
 
     Args:

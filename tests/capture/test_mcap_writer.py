@@ -1,0 +1,87 @@
+"""Our MCAP writer against the mcap library's: the same calls give the same bytes."""
+
+import io
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from capture.log.mcap_writer import McapWriter
+
+NUMBER = st.integers(0, 2**64 - 1)
+CALLS = st.lists(
+    st.one_of(
+        st.tuples(
+            st.just("message"), st.integers(0, 9), NUMBER, st.binary(max_size=80), NUMBER,
+            st.integers(0, 2**32 - 1),
+        ),
+        st.tuples(st.just("schema"), st.text(max_size=5), st.binary(max_size=30)),
+        st.tuples(st.just("channel"), st.text(max_size=5)),
+        st.tuples(st.just("attachment"), NUMBER, st.text(max_size=5), st.binary(max_size=50)),
+        st.tuples(st.just("metadata"), st.dictionaries(st.text(max_size=3), st.text(max_size=3))),
+        st.just(("flush",)),
+    ),
+    max_size=40,
+)  # fmt: skip
+
+
+def written(kind, calls, chunk_size):
+    stream = io.BytesIO()
+    writer = kind(stream, chunk_size=chunk_size)
+    writer.start("ros2", "a library")
+    schema = writer.register_schema("a", "ros2msg", b"float64 x")
+    ids = [writer.register_channel("/a", "cdr", schema, {"unit": "m"})]
+    for name, *values in calls:
+        if name == "message":
+            channel, log_time, data, publish_time, sequence = values
+            channel = ids[channel % len(ids)]
+            writer.add_message(channel, log_time, data, publish_time, sequence)
+        elif name == "schema":
+            schema = writer.register_schema(values[0], "ros2msg", values[1])
+        elif name == "channel":
+            ids.append(writer.register_channel(values[0], "cdr", schema, {}))
+        elif name == "attachment":
+            writer.add_attachment(values[0], values[0] // 2, values[1], "text/plain", values[2])
+        elif name == "metadata":
+            writer.add_metadata("facts", values[0])
+        else:
+            writer.flush()
+    writer.finish()
+    return stream.getvalue(), ids
+
+
+@settings(max_examples=300, deadline=None)
+@given(calls=CALLS, chunk_size=st.integers(1, 400))
+def test_the_bytes_are_those_of_the_library(calls, chunk_size):
+    ours, theirs = (written(kind, calls, chunk_size) for kind in (McapWriter, Writer))
+    assert ours == theirs
+
+
+def test_a_long_file_of_many_channels():
+    rng = np.random.default_rng(1)
+    calls = [("channel", f"/t{k}") for k in range(30)]
+    calls += [
+        ("message", int(k), 10**18 + i * 1000, rng.bytes(int(k) * 7), 10**18 + i, i)
+        for i, k in enumerate(rng.integers(0, 31, 20_000))
+    ]
+    ours, theirs = (written(kind, calls, 1 << 17)[0] for kind in (McapWriter, Writer))
+    assert ours == theirs
+    summary = make_reader(io.BytesIO(ours)).get_summary()
+    assert summary.statistics.message_count == 20_000
+
+
+def test_a_number_out_of_range_leaves_the_chunk_as_it_was():
+    stream = io.BytesIO()
+    writer = McapWriter(stream)
+    writer.start("", "")
+    channel = writer.register_channel("/a", "cdr", 0)
+    writer.add_message(channel, 5, b"x", 5, 0)
+    with pytest.raises(struct.error):
+        writer.add_message(channel, 2**64, b"y", 5, 1)
+    writer.finish()
+    stream.seek(0)
+    assert [m.data for _, _, m in make_reader(stream).iter_messages()] == [b"x"]
