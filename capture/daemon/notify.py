@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections.abc import Mapping
 
 _LONGEST_STATUS = 512
@@ -62,15 +63,18 @@ class Notifier:
         if text != self._status:
             self._send(*self._status_line(text))
 
-    def beat(self, now_ns: int) -> None:
+    def alive(self, now_ns: int | None = None) -> None:
         """Say that the loop is alive, as often as the manager's watchdog needs it.
 
         Called every tick from the very loop that must not hang, never from a thread of its own.
 
         Args:
-            now_ns: A monotonic clock [ns].
+            now_ns: A monotonic clock [ns]; the system's by default.
         """
-        if self.watchdog_ns is not None and now_ns >= self._next_beat_ns and self._socket:
+        if self.watchdog_ns is None or self._socket is None:
+            return
+        now_ns = time.monotonic_ns() if now_ns is None else now_ns
+        if now_ns >= self._next_beat_ns:
             self._next_beat_ns = now_ns + int(self.watchdog_ns * _WATCHDOG_PART)
             self._send("WATCHDOG=1")
 

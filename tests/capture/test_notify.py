@@ -91,7 +91,7 @@ def test_the_watchdog_is_fed_at_half_its_time_by_the_loop_s_clock(manager, notif
     sent_ns = []
     for tick in range(2000):  # 10 s in ticks of 5 ms
         now_ns = 7_000_000_000 + tick * 5_000_000
-        notifier.beat(now_ns)
+        notifier.alive(now_ns)
         if heard(listener) == [["WATCHDOG=1"]]:
             sent_ns.append(now_ns)
     assert len(sent_ns) == 10
@@ -112,7 +112,7 @@ def test_a_watchdog_that_is_not_ours_or_no_time_is_not_fed(manager, environ, not
     name, listener = manager
     notifier = notifier_of({"NOTIFY_SOCKET": name, **environ})
     assert notifier.watchdog_ns is None
-    notifier.beat(10**12)
+    notifier.alive(10**12)
     assert heard(listener) == []
 
 
@@ -121,7 +121,7 @@ def test_without_a_manager_nothing_happens(name, notifier_of):
     notifier = notifier_of({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "1000"})
     assert not notifier.active
     notifier.ready("x")
-    notifier.beat(10**12)
+    notifier.alive(10**12)
     notifier.stopping()
     assert notifier.failed == 0
 
