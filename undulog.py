@@ -23,6 +23,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "capture.log_check:log_check",
         "Say whether a session is good, degraded or bad, and why.",
     ),
+    "log recover": (
+        "capture.log_recover:log_recover",
+        "Write a whole file from what a crash left.",
+    ),
     "log cut": ("capture.log_tools:log_cut", "Write a part of a log to a new file."),
     "log merge": ("capture.log_tools:log_merge", "Put several logs into one new file."),
     "log export": ("capture.cli:export_log", "Write frames or joint columns for other tools."),

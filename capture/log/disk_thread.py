@@ -10,11 +10,11 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from mcap.records import Metadata
-from mcap.writer import Writer
 
 from ..errors import LogWriteError
 from .ballast import FULL, Ballast
 from .mcap_sink import write_description
+from .mcap_writer import McapWriter
 from .part_names import PART_RECORD
 from .part_stream import PartStream
 from .wal import WriteAheadLog
@@ -38,7 +38,7 @@ class _Finish:
     """The end of a part; from here on its writer belongs to the thread."""
 
     part: PartStream
-    writer: Writer
+    writer: McapWriter
     last: tuple[Metadata, ...]
     covered: int
 
@@ -72,9 +72,9 @@ class DiskThread:
         return self._failure
 
     @property
-    def shortage(self) -> LogWriteError | None:
-        """Set when the disk was full and the ballast had to go: it is time to end."""
-        return self._shortage
+    def trouble(self) -> LogWriteError | None:
+        """Why recording must end: the failure, or a disk so full that the ballast had to go."""
+        return self._failure or self._shortage
 
     @property
     def backlog(self) -> int:
@@ -93,7 +93,7 @@ class DiskThread:
         self._queue.put(_Bytes(part, pieces, covered))
 
     def finish(
-        self, part: PartStream, writer: Writer, last: tuple[Metadata, ...], covered: int
+        self, part: PartStream, writer: McapWriter, last: tuple[Metadata, ...], covered: int
     ) -> None:
         """Hand over a part to be finalised.
 

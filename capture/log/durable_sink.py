@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import TypeAlias
 
 from mcap.records import Header, Metadata
-from mcap.writer import Writer
 
 from ..errors import DataError, LogWriteError, OutputExistsError, UndulogError
 from .ballast import Ballast
 from .disk_thread import DiskThread
 from .mcap_sink import PROFILE, library_name, write_description, write_error
+from .mcap_writer import McapWriter
 from .part_names import PART_RECORD, later_parts, part_path
 from .part_stream import PartStream
 from .sink import Description
@@ -75,7 +75,8 @@ class DurableSink:
                 writes it.
             DataError: If a size or time makes no sense.
         """
-        if (split_size or 1) < 1 or (split_ns or 1) < 1 or not flush_interval_s > 0 or ballast < 0:
+        limits = [value for value in (split_size, split_ns) if value is not None]
+        if min(limits, default=1) < 1 or not flush_interval_s > 0 or ballast < 0:
             raise DataError("sizes and times of a recording are positive")
         self.path = Path(path)
         self.tap = tap
@@ -87,6 +88,7 @@ class DurableSink:
         self._due = time.monotonic() + flush_interval_s
         self._known: list[Description] = []
         self._messages: int = 0
+        self._refused: LogWriteError | None = None
         self._part_began: int = 0
         self._finished_bytes = 0
         self._split_trouble: UndulogError | None = None
@@ -153,7 +155,7 @@ class DurableSink:
     @property
     def shortage(self) -> LogWriteError | None:
         """Why recording must end soon, or has ended: no space, or a disk that fails."""
-        return self._disk.failure or self._disk.shortage or self._wal.shortage
+        return self._disk.trouble or self._refused or self._wal.shortage
 
     # -- writing ---------------------------------------------------------------------------
 
@@ -195,11 +197,15 @@ class DurableSink:
                 all before it were.
             DataError: If a number is out of range.
         """
-        if self._disk.shortage is not None or self._disk.failure is not None or not self._open:
+        if self._disk.trouble is not None or self._refused is not None or not self._open:
             self._refuse()
         if log_time_ns >= self._split_at_ns:
             self._split_by_time(log_time_ns)
-        self._wal.append(channel_id, log_time_ns, publish_time_ns, sequence, payload)
+        try:
+            self._wal.append(channel_id, log_time_ns, publish_time_ns, sequence, payload)
+        except LogWriteError as error:
+            self._refused = error  # for good: a gap in what was accepted would be worse
+            raise
         part = self._part
         size = part.size
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
@@ -300,8 +306,8 @@ class DurableSink:
 
     # -- inside ----------------------------------------------------------------------------
 
-    def _new_writer(self) -> Writer:
-        writer = Writer(self._part, chunk_size=CHUNK_SIZE)  # pyright: ignore[reportArgumentType] a binary stream, as the writer uses it
+    def _new_writer(self) -> McapWriter:
+        writer = McapWriter(self._part, chunk_size=CHUNK_SIZE)
         writer.start(profile=PROFILE, library=library_name())
         return writer
 
@@ -345,7 +351,7 @@ class DurableSink:
 
     def _refuse(self) -> None:
         self._refuse_closed()
-        trouble = self._disk.failure or self._disk.shortage
+        trouble = self._disk.trouble or self._refused
         if trouble is not None:
             raise LogWriteError(trouble.path, _reason(trouble))
 

@@ -1,0 +1,77 @@
+"""A recorder for tests that kill it: run as a script, and imported for the truth.
+
+It is no test module: a child process runs it, and each message can be told again from its number.
+"""
+
+import os
+import random
+import struct
+import sys
+
+from mcap.records import Channel, Metadata, Schema
+
+from capture.log.durable_sink import DurableSink
+from capture.log.schemas import schema_text
+
+EPOCH_NS = 1_700_000_000_000_000_000
+STRING = "std_msgs/msg/String"
+TOPICS = ("/a", "/b", "/rare")
+
+
+def message(number):
+    """Channel, sequence, log time, publish time and payload of the message with that number."""
+    rng = random.Random(number)
+    if number % 50 == 49:
+        channel, sequence = 3, number // 50
+    elif number % 2:
+        channel, sequence = 2, number // 2 - number // 50
+    else:
+        channel, sequence = 1, number // 2
+    text = rng.randbytes(rng.randrange(0, 300)).hex()
+    payload = b"\0\1\0\0" + struct.pack("<I", len(text) + 1) + text.encode() + b"\0"
+    log_ns = EPOCH_NS + number * 1_000_000
+    return channel, sequence, log_ns, log_ns - 500, payload
+
+
+def truth(count):
+    """All messages of a session, as a reader tells them."""
+    found = (message(number) for number in range(count))
+    return [(TOPICS[c - 1], s, t, p, data) for c, s, t, p, data in found]
+
+
+def open_sink(path, **options):
+    """A sink with its channels."""
+    sink = DurableSink(path, **options)
+    sink.define(Metadata("undulog", {"session_id": "killed", "epoch_ns": str(EPOCH_NS)}))
+    sink.define(Schema(1, schema_text(STRING).encode(), "ros2msg", STRING))
+    for key, topic in enumerate(TOPICS, start=1):
+        sink.define(Channel(key, topic, "cdr", {}, 1))
+    return sink
+
+
+def write(sink, number):
+    """Write the message with that number."""
+    channel, sequence, log_ns, publish_ns, payload = message(number)
+    sink.write(channel, log_ns, publish_ns, sequence, payload)
+
+
+def main():
+    """Write without end; tell each number after it was accepted."""
+    path, split_size, split_every = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    sink = open_sink(
+        path,
+        segment_size=1 << 16,
+        split_size=split_size or None,
+        sync_interval_s=0.05,
+        flush_interval_s=0.2,
+        ballast=1 << 16,
+    )
+    for number in range(1 << 40):
+        write(sink, number)
+        os.write(1, (number + 1).to_bytes(8, "little"))
+        if split_every and number % split_every == split_every - 1:
+            sink.split()
+
+
+if __name__ == "__main__":
+    main()
