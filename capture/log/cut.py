@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
 from importlib.metadata import version
@@ -33,10 +32,10 @@ from .edit import (
     refuse_output,
     refuse_stopped,
 )
+from .latched import adds_up, is_latched
 from .raw_log import RawLog, RawMessage
 
 _FOREVER_NS = 2**64
-_LATCHED = re.compile(r"durability:\s*(1\b|transient_local)")
 _LOOK_EVERY = 1024
 
 
@@ -81,7 +80,8 @@ def cut_log(
         start_ns = source.start_ns + round(start_s * NS)
         stop_ns = _FOREVER_NS if stop_s is None else source.start_ns + round(stop_s * NS)
         kept = _channels(source, topics)
-        state = _state_before(source, [c for c in kept if _is_latched(source, c)], start_ns)
+        latched = [channel for channel in kept if is_latched(source.type_name(channel), channel)]
+        state = _state_before(source, latched, start_ns)
         with edited_log([source], output, force=force, stop=stop) as log:
             ids = {channel.id: log.channel(source, channel) for channel in kept}
             _copy_records(source, log)
@@ -153,22 +153,6 @@ def _channels(source: RawLog, topics: Sequence[str]) -> list[Channel]:
     ]
 
 
-def _is_latched(source: RawLog, channel: Channel) -> bool:
-    """Whether a topic's last message stays in force until the next.
-
-    A String, static transforms, or what a ROS 2 recorder noted as durability transient local
-    (``offered_qos_profiles``, https://github.com/ros2/rosbag2).
-    """
-    if source.type_name(channel) == "std_msgs/msg/String":
-        return True
-    offered = channel.metadata.get("offered_qos_profiles", "")
-    return _adds_up(channel) or bool(_LATCHED.search(offered))
-
-
-def _adds_up(channel: Channel) -> bool:
-    return channel.topic.endswith("/tf_static")
-
-
 def _state_before(source: RawLog, latched: Collection[Channel], start_ns: int) -> list[RawMessage]:
     """The last message of each latched channel before a time, in order of time.
 
@@ -176,7 +160,7 @@ def _state_before(source: RawLog, latched: Collection[Channel], start_ns: int) -
     """
     if start_ns <= source.start_ns:
         return []
-    adding_up = {channel.id for channel in latched if _adds_up(channel)}
+    adding_up = {channel.id for channel in latched if adds_up(channel)}
     latest = {channel.id for channel in latched} - adding_up
     static: dict[bytes, RawMessage] = {}
     if adding_up:
