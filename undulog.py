@@ -17,6 +17,7 @@ from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
 from capture.errors import MissingExtraError, UndulogError
 
 VERBS: dict[str, tuple[str, str]] = {
+    "record": ("capture.record_cli:record", "Record a robot, or its twin, into a session."),
     "import": ("capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
     "log info": ("capture.log_info:log_info", "Say what a log holds."),
     "log check": (

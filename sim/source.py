@@ -101,6 +101,7 @@ class TwinSource:
                 break
             if isinstance(item, Sample):
                 self._log.write(item)
+                self.counts.dropped = item.tick - self.counts.frames  # ticks are numbered from 0
                 self.counts.frames += 1
                 continue
             self._finished = True

@@ -36,4 +36,6 @@ def free_space(path: Path) -> int:
     try:
         return shutil.disk_usage(path.parent).free
     except OSError as error:
-        raise LogWriteError(path, f"its folder can't be used: {os.strerror(error.errno or 0)}") from error
+        raise LogWriteError(
+            path, f"its folder can't be used: {os.strerror(error.errno or 0)}"
+        ) from error

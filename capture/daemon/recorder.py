@@ -1,4 +1,4 @@
-"""The recorder's loop: one thread, a tick every 5 ms, and nothing in it that waits.
+"""The recorder's loop: one thread, a tick every 10 ms, and nothing in it that waits.
 
 Each tick takes what has come from every source and writes the raw frames; decoding follows in
 slices. What is due once a second is spread over the second's ticks, so that no tick is long.
@@ -21,13 +21,10 @@ from .clock import SessionClock
 from .source_clock import SourceClock
 from .ticks import TickTally
 
-TICK_NS = 5_000_000
-"""Sources are asked this often [ns]."""
+TICK_NS = 10_000_000
+"""Sources are asked this often, and what they have is safe then [ns]."""
 
-RAW_TICKS = 2
-"""Raw frames are written every so many ticks: what came is safe within 10 ms."""
-
-DECODE_TICKS = 10
+DECODE_TICKS = 5
 """Frames are decoded every so many ticks, a backlog in every one."""
 
 _DECODE_BUDGET_NS = 4_000_000
@@ -69,7 +66,7 @@ class Recorder:
         robot: Robot | None,
         decoded: str | None,
         each_tick: Sequence[Callable[[], None]] = (),
-        each_second: Sequence[Callable[[], None]] = (),
+        each_second: Sequence[Callable[[], object]] = (),
     ) -> None:
         """Put a recording together; nothing is opened yet.
 
@@ -92,7 +89,7 @@ class Recorder:
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
         self._each_tick = tuple(each_tick)
-        self._second: dict[int, Callable[[], None]] = {}
+        self._second: dict[int, Callable[[], object]] = {}
         tasks = (self._write_clocks, *each_second)
         for k, task in enumerate(tasks):
             self._second[(k + 1) * _SECOND_TICKS // (len(tasks) + 1)] = task
@@ -190,9 +187,8 @@ class Recorder:
 
     def _tick(self, tick: int) -> None:
         self._poll()
-        if tick % RAW_TICKS == 0:
-            for bus in self.buses.values():
-                bus.write_raw(self._clock.now_ns)
+        for bus in self.buses.values():
+            bus.write_raw(self._clock.now_ns)
         if tick % DECODE_TICKS == 1 or self.backlog > _BACKLOG:
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
