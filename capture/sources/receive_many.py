@@ -11,6 +11,8 @@ import ctypes
 import errno
 import os
 import socket
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -40,6 +42,7 @@ class _Mmsghdr(ctypes.Structure):
         ("control", ctypes.c_size_t),
         ("controllen", ctypes.c_size_t),
         ("flags", ctypes.c_int),
+        ("pad", ctypes.c_int),  # msghdr is a structure of its own, aligned to 8 bytes
         ("size", ctypes.c_uint),
     )
 
@@ -144,23 +147,43 @@ def _is(control: NDArray[np.void], kind: int) -> NDArray[np.bool_]:
     return (control["type"] == kind) & (control["level"] == socket.SOL_SOCKET)
 
 
-def on_session_clock(
-    stamps_ns: NDArray[np.int64], now_ns: int, wall_ns: int, floor_ns: int
-) -> NDArray[np.uint64]:
-    """Bring the kernel's times to the session's clock.
+class ArrivalClock:
+    """Brings the kernel's times, on the wall clock, to the session's clock.
 
-    Args:
-        stamps_ns: Arrival on the computer's wall clock [Unix ns], 0 where unknown, shape (n,).
-        now_ns: The session's clock now [Unix ns].
-        wall_ns: The wall clock now [Unix ns].
-        floor_ns: When the socket was last found empty, on the session's clock [Unix ns]: nothing
-            that it has now came before, whatever a wall clock that was set meanwhile says.
-
-    Returns:
-        Arrival on the session's clock [Unix ns], shape (n,).
+    The two clocks are read one after the other, and a process may be held up in between; so the
+    offset between them is only moved as far as a reading proves it wrong.
     """
-    times = np.where(stamps_ns > 0, stamps_ns + (now_ns - wall_ns), now_ns)
-    return times.clip(floor_ns, now_ns).astype(np.uint64)
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        """Compare the clocks for the first time.
+
+        Args:
+            now_ns: The session's clock [Unix ns].
+        """
+        self._now_ns = now_ns
+        before, wall, after = now_ns(), time.time_ns(), now_ns()
+        self._offset_ns = (before + after) // 2 - wall
+
+    def times(self, stamps_ns: NDArray[np.int64], floor_ns: int) -> NDArray[np.uint64]:
+        """Arrival on the session's clock.
+
+        Args:
+            stamps_ns: Arrival on the wall clock [Unix ns], 0 where unknown, in the order of one
+                socket's queue, shape (n,).
+            floor_ns: Before this time none came, on the session's clock [Unix ns]: the socket was
+                empty then, or gave an earlier packet. It bounds the harm of a wall clock that is
+                set.
+
+        Returns:
+            Arrival on the session's clock [Unix ns], in order, not after now, shape (n,).
+        """
+        before, wall, after = self._now_ns(), time.time_ns(), self._now_ns()
+        self._offset_ns = min(max(self._offset_ns, before - wall), after - wall)
+        times = np.where(stamps_ns > 0, stamps_ns + self._offset_ns, after)
+        # A packet that came before stamps were asked for is stamped when it is fetched, but the
+        # queue keeps the order: it came no later than those behind it.
+        times = np.minimum.accumulate(times[::-1])[::-1]
+        return times.clip(floor_ns, after).astype(np.uint64)
 
 
 def enlarge_buffer(sock: socket.socket, force: int, option: int, size: int) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -25,10 +24,10 @@ from .receive_many import (
     SO_RCVBUFFORCE,
     SO_RXQ_OVFL,
     SO_TIMESTAMPNS,
+    ArrivalClock,
     Batch,
     ReceiveMany,
     enlarge_buffer,
-    on_session_clock,
 )
 
 CAN_MTU = 16
@@ -81,10 +80,11 @@ class SocketcanLink:
         self._tally = tally
         self._receive = ReceiveMany(_PACKETS, CANFD_MTU + 1)
         self._drops = 0
+        self._clock = ArrivalClock(tally.now_ns)
         self._floor_ns = tally.now_ns()
         self._error: OSError | None = None
 
-    def read(self, now_ns: int) -> Sequence[FrameArray]:
+    def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (the kernel has the time)
         """Drain the socket.
 
         Args:
@@ -100,18 +100,20 @@ class SocketcanLink:
             raise self._error
         found: list[FrameArray] = []
         for _ in range(_MOST_BATCHES):
-            wall_ns, now_ns = time.time_ns(), self._tally.now_ns()
+            looked_ns = self._tally.now_ns()
             try:
                 batch = self._receive.receive(self._socket.fileno())
             except OSError as error:
                 self._error = error  # first hand out what came before
                 break
             if len(batch.sizes):
-                times = on_session_clock(batch.stamps_ns, now_ns, wall_ns, self._floor_ns)
+                times = self._clock.times(batch.stamps_ns, self._floor_ns)
+                self._floor_ns = int(times[-1])
                 found.append(frames_of(batch, times))
                 self._count(batch)
+            else:
+                self._floor_ns = looked_ns
             if len(batch.sizes) < self._receive.capacity:
-                self._floor_ns = now_ns
                 break
         if not found and self._error is not None:
             raise self._error

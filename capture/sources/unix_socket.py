@@ -13,7 +13,6 @@ import os
 import select
 import socket
 import stat
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from .contract import Polled, Source, SourceAddress, SourceContext, SourceCounts
 from .events import Tally
 from .options import flag, only
 from .packets import HEAD, LONGEST, MOST_RECORDS, RECORD_SIZE
-from .receive_many import SO_TIMESTAMPNS, Batch, ReceiveMany, on_session_clock
+from .receive_many import SO_TIMESTAMPNS, ArrivalClock, Batch, ReceiveMany
 
 _PACKETS = 128
 _MOST_BATCHES = 64  # in one poll, of one sender: others want to be heard too
@@ -67,6 +66,7 @@ class UnixSource:
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._receive = ReceiveMany(_PACKETS, LONGEST + 1)
+        self._arrivals = ArrivalClock(self._tally.now_ns)
         self._listener: socket.socket | None = None
         self._epoll: select.epoll | None = None
         self._inode: tuple[int, int] | None = None
@@ -120,6 +120,7 @@ class UnixSource:
                 can't be made.
         """
         self._tally = Tally(context.now_ns)
+        self._arrivals = ArrivalClock(context.now_ns)
         _clear(self._address.text, self._path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
@@ -151,11 +152,14 @@ class UnixSource:
         heard = 0
         for fileno, mask in self._epoll.poll(0, _BACKLOG + 1):
             if fileno == self._listener.fileno():
-                self._accept()
-                continue
-            before = len(found)
-            self._drain(self._senders[fileno], bool(mask & _GONE), found)
-            heard += len(found) > before
+                new = self._accept()
+                senders = [(sender, False) for sender in new]
+            else:
+                senders = [(self._senders[fileno], bool(mask & _GONE))]
+            for sender, gone in senders:
+                before = len(found)
+                self._drain(sender, gone, found)
+                heard += len(found) > before
         if not found:
             return Polled((), self._tally.events.take())
         frames = found[0] if len(found) == 1 else np.concatenate(found)
@@ -182,32 +186,35 @@ class UnixSource:
                 if (there.st_dev, there.st_ino) == self._inode:  # not another recorder's
                     self._path.unlink()
 
-    def _accept(self) -> None:
+    def _accept(self) -> list[_Sender]:
+        """Let in who waits."""
+        new: list[_Sender] = []
         if self._listener is None or self._epoll is None:
-            return
+            return new
         while True:
             try:
                 sock, _ = self._listener.accept()
             except BlockingIOError:
-                return
+                return new
             except OSError as error:
                 if error.errno != errno.ECONNABORTED:
                     reason = error.strerror or str(error)
                     self._tally.events.say("error", f"can't accept a sender: {reason}")
-                return
+                return new
             sock.setblocking(False)
             sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             back = self._had_sender and not self._senders
             self._had_sender = True
             self._tally.counts.reconnects += back
             self._tally.events.say("info", "a sender is back" if back else "a sender connected")
-            self._senders[sock.fileno()] = _Sender(sock, self._tally.now_ns())
+            new.append(_Sender(sock, self._tally.now_ns()))
+            self._senders[sock.fileno()] = new[-1]
             self._epoll.register(sock.fileno(), select.EPOLLIN | select.EPOLLRDHUP)
 
     def _drain(self, sender: _Sender, gone: bool, found: list[FrameArray]) -> None:
         """Take a sender's packets; afterwards let it go if it has gone."""
         for _ in range(_MOST_BATCHES):
-            wall_ns, now_ns = time.time_ns(), self._tally.now_ns()
+            looked_ns = self._tally.now_ns()
             try:
                 batch = self._receive.receive(sender.sock.fileno())
             except ConnectionError:
@@ -219,14 +226,15 @@ class UnixSource:
                 self._forget(sender)
                 return
             if len(batch.sizes):
-                times = on_session_clock(batch.stamps_ns, now_ns, wall_ns, sender.floor_ns)
+                times = self._arrivals.times(batch.stamps_ns, sender.floor_ns)
+                sender.floor_ns = int(times[-1])
                 frames = self._unpack(sender, batch, times, gone)
                 if len(frames):
                     found.append(frames)
-            if len(batch.sizes) < self._receive.capacity:
-                sender.floor_ns = now_ns
-                if not gone:
-                    return
+            else:
+                sender.floor_ns = looked_ns
+            if len(batch.sizes) < self._receive.capacity and not gone:
+                return
 
     def _unpack(
         self, sender: _Sender, batch: Batch, times: NDArray[np.uint64], gone: bool

@@ -1,0 +1,340 @@
+"""Other processes, with our sender and with one that knows only the packets' description."""
+
+import json
+import os
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture.errors import DataError, SourceError, UsageError
+from capture.log.frames import ERROR_FLAG, empty_frames
+from capture.robot import ClockDomain
+from capture.sources.address import parse_address
+from capture.sources.registry import open_source
+from capture.sources.sender import FrameSender
+
+# Knows nothing of us but the packets: 32 bytes a frame, packed by struct.
+FOREIGN = """
+import socket, struct, sys
+path, first, count, per_packet, head = sys.argv[1], *map(int, sys.argv[2:6])
+peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+peer.connect(path)
+for start in range(first, first + count, per_packet):
+    numbers = range(start, min(start + per_packet, first + count))
+    packet = struct.pack("<QQ", start, 0) if head else b""
+    for n in numbers:
+        packet += struct.pack("<QQIBB2x8s", 10**18 + n * 1000, 0, n % 2048, n % 9, 0,
+                              (n.to_bytes(8, "little") * 2)[: n % 9].ljust(8, b"\\0"))
+    peer.send(packet)
+peer.close()
+"""
+
+OURS = """
+import json, sys, time
+import numpy as np
+from capture.sources.sender import FrameSender
+frames = np.load(sys.argv[1])
+with FrameSender(sys.argv[2]) as sender:
+    at = 0
+    while at < len(frames):
+        at += sender.send(frames[at : at + 700])
+        time.sleep(0.001)
+    print(json.dumps([sender.accepted, sender.refused]))
+"""
+
+
+def foreign_truth(first: int, count: int):
+    frames = empty_frames(count)
+    for row, n in enumerate(range(first, first + count)):
+        frames["t_device_ns"][row] = 10**18 + n * 1000
+        frames["id_flags"][row], frames["dlc"][row] = n % 2048, n % 9
+        data = (n.to_bytes(8, "little") * 2)[: n % 9].ljust(8, b"\0")
+        frames["data"][row] = list(data)
+    return frames
+
+
+def spawn(code: str, *args: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, args)], stdout=subprocess.PIPE, text=True
+    )
+
+
+def source_at(path: Path, query: str = ""):
+    return open_source(parse_address(f"unix:{path}{query}"))
+
+
+@pytest.fixture
+def peer(tmp_path):
+    """A connected socket of this process."""
+    opened = []
+
+    def connect() -> socket.socket:
+        opened.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        opened[-1].connect(str(tmp_path / "snake.sock"))
+        return opened[-1]
+
+    yield connect
+    for sock in opened:
+        sock.close()
+
+
+@pytest.mark.parametrize(("per_packet", "head"), [(256, 1), (1, 0), (7, 1)])
+def test_twenty_thousand_frames_of_a_foreign_process(
+    tmp_path, listen, same, per_packet, head
+) -> None:
+    path = tmp_path / "snake.sock"
+    heard = listen(source_at(path))
+    process = spawn(FOREIGN, path, 0, 20_000, per_packet, head)
+    truth = foreign_truth(0, 20_000)
+    found = heard.until_frames(20_000)
+    assert process.wait(60) == 0
+    process.communicate()
+    assert same(found, truth)
+    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
+    assert heard.source.counts.frames == 20_000
+    assert heard.source.counts.dropped == (0 if head else None)
+    heard.until_event("disconnected")
+    assert heard.texts[1:] == ["a sender connected", "a sender disconnected"]
+    assert heard.source.clock is ClockDomain.DEVICE
+
+
+def test_what_our_sender_offers_arrives(tmp_path, listen, traffic, same) -> None:
+    truth = traffic(20_000)
+    np.save(tmp_path / "frames.npy", truth)
+    path = tmp_path / "snake.sock"
+    heard = listen(source_at(path))
+    process = spawn(OURS, tmp_path / "frames.npy", path)
+    found = heard.until_frames(20_000)
+    accepted, refused = json.loads(process.communicate(timeout=60)[0])
+    heard.until_event("disconnected")
+    assert accepted == 20_000
+    assert same(found, truth)
+    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    before = 0 if heard.source.counts.dropped == refused else refused
+    assert heard.source.counts.dropped == refused - before  # refused before it was connected
+
+
+def test_frames_that_found_no_room_are_proved_lost(tmp_path, listen, traffic, same) -> None:
+    truth = traffic(200)
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    sender = FrameSender(tmp_path / "snake.sock")
+    sent = []
+    while sender.refused == 0:  # nobody reads: the buffer fills
+        accepted = sender.send(truth)
+        sent.append(truth[:accepted])
+    for _ in range(3):
+        sender.send(truth)
+    found = heard.until_frames(sender.accepted)
+    assert same(found, np.concatenate(sent))
+    assert heard.source.counts.dropped == 0  # not known yet
+    sent.append(truth[: sender.send(truth)])
+    assert same(heard.until_frames(sender.accepted), np.concatenate(sent))
+    assert heard.source.counts.dropped == sender.refused > 0
+    heard.until_event("lost before it reached us")
+    sender.close()
+
+
+def test_the_last_losses_are_told_on_leaving(tmp_path, listen, traffic) -> None:
+    truth = traffic(200)
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    sender = FrameSender(tmp_path / "snake.sock")
+    while sender.refused == 0:
+        sender.send(truth)
+    heard.until_frames(sender.accepted)
+    sender.close()
+    heard.until_event("disconnected")
+    assert heard.source.counts.dropped == sender.refused > 0
+
+
+def test_a_gap_in_the_numbers_is_a_loss(tmp_path, listen, peer) -> None:
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    sock, record = peer(), bytes(empty_frames(1).tobytes())
+    for sequence, dropped in ((1000, 5), (1001, 5), (1012, 5), (1013, 8), (1014, 8), (0, 0)):
+        sock.send(struct.pack("<QQ", sequence, dropped) + record)
+    heard.until_frames(6)
+    assert heard.source.counts.dropped == 10 + 3
+
+
+def test_malformed_packets_are_counted_and_told(tmp_path, listen, peer, traffic, same) -> None:
+    truth = traffic(3)
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    sock = peer()
+    sock.send(truth[:1].tobytes())
+    for bad in (b"x", b"x" * 31, b"x" * 33, b"", bytes(32 * 257), bytes(100_000)):
+        sock.send(bad)
+    sock.send(struct.pack("<QQ", 0, 0))  # a head alone is allowed
+    sock.send(truth[1:].tobytes())
+    assert same(heard.until_frames(3), truth)
+    assert heard.source.counts.malformed == 6
+    heard.until_event("malformed packet")
+    assert heard.source.connected
+
+
+def test_arrival_is_when_it_came_not_when_it_was_fetched(
+    tmp_path, listen, peer, context
+) -> None:
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    sock = peer()
+    heard.until_event("connected")
+    record = empty_frames(1).tobytes()
+    bounds = []
+    for _ in range(20):
+        before_ns = context.now_ns()
+        sock.send(record)
+        bounds.append((before_ns, context.now_ns()))
+        time.sleep(0.002)
+    time.sleep(0.05)
+    found = heard.until_frames(20)
+    slack_ns = 1_000_000  # two clocks are read one after the other
+    for t_ns, (low_ns, high_ns) in zip(found["t_host_ns"].tolist(), bounds, strict=True):
+        assert low_ns - slack_ns <= t_ns <= high_ns + slack_ns
+
+
+def test_two_senders_are_put_in_the_order_of_arrival(tmp_path, listen, peer) -> None:
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    one, two = peer(), peer()
+    heard.until(lambda: heard.texts.count("a sender connected") + len(heard.texts) >= 2)
+    frames = empty_frames(40)
+    frames["id_flags"] = np.arange(40)
+    for number in range(40):
+        (one, two)[number % 3 == 0].send(frames[number : number + 1].tobytes())
+    found = heard.until_frames(40)
+    assert found["id_flags"].tolist() == list(range(40))
+
+
+def test_a_sender_may_leave_and_come_back(tmp_path, listen, same) -> None:
+    path = tmp_path / "snake.sock"
+    heard = listen(source_at(path))
+    for first in (0, 100):
+        process = spawn(FOREIGN, path, first, 100, 10, 1)
+        heard.until_frames(first + 100)
+        heard.until(lambda: not heard.source.connected)
+        assert process.wait(60) == 0
+        process.communicate()
+    assert same(heard.frames, foreign_truth(0, 200))
+    assert heard.source.counts.reconnects == 1
+    heard.until_event("is back")
+    assert heard.source.counts.dropped == 0
+    assert not heard.source.finished
+
+
+def test_a_killed_sender_loses_nothing_that_it_sent(tmp_path, listen, same) -> None:
+    path = tmp_path / "snake.sock"
+    heard = listen(source_at(path))
+    code = FOREIGN.replace("peer.close()", "import os; os.kill(os.getpid(), 9)")
+    process = spawn(code, path, 0, 200, 1, 1)
+    assert process.wait(60) == -9
+    process.communicate()
+    assert same(heard.until_frames(200), foreign_truth(0, 200))
+    heard.until_event("disconnected")
+    assert heard.source.counts.malformed == 0
+
+
+def test_our_sender_waits_for_a_recorder_and_for_the_next_one(tmp_path, context, traffic) -> None:
+    path, truth = tmp_path / "snake.sock", traffic(10)
+    sender = FrameSender(path)
+    assert sender.send(truth) == 0
+    assert not sender.connected
+    for _ in range(2):
+        source = source_at(path)
+        source.start(context)
+        deadline = time.monotonic() + 60
+        while sender.send(truth) == 0:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        frames = np.concatenate([*source.poll().frames])
+        assert len(frames) == 10
+        assert source.counts.dropped == 0  # what was refused without a recorder is not its loss
+        source.stop()
+        while sender.connected:
+            sender.send(truth)
+    sender.close()
+    with pytest.raises(DataError, match="records of 32 bytes"):
+        sender.send(np.zeros(3))
+
+
+def test_error_frames_are_counted(tmp_path, listen, peer) -> None:
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    frames = empty_frames(2)
+    frames["id_flags"] = [ERROR_FLAG | 0x4, 5]
+    frames["dlc"] = 8
+    frames["data"][0, 1] = 0x10
+    peer().send(frames.tobytes())
+    heard.until_frames(2)
+    assert heard.source.counts.error_frames == 1
+    heard.until_event("controller problem, reception error passive")
+
+
+def test_only_we_may_send_and_the_socket_goes_with_the_source(tmp_path, context) -> None:
+    path = tmp_path / "snake.sock"
+    source = source_at(path)
+    source.start(context)
+    mode = path.lstat().st_mode
+    assert stat.S_ISSOCK(mode)
+    assert stat.S_IMODE(mode) == 0o600
+    with pytest.raises(SourceError, match="another program listens at"):
+        source_at(path).start(context)
+    assert path.exists()
+    source.stop()
+    assert not path.exists()
+    assert source.finished
+
+
+def test_a_socket_left_behind_is_replaced_and_nothing_else(tmp_path, context) -> None:
+    path = tmp_path / "snake.sock"
+    code = (
+        "import os, socket, sys\n"
+        "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)\n"
+        "s.bind(sys.argv[1]); s.listen(); os.kill(os.getpid(), 9)\n"
+    )
+    process = spawn(code, path)
+    assert process.wait(60) == -9
+    process.communicate()
+    assert path.exists()
+    source = source_at(path)
+    source.start(context)
+    source.stop()
+    path.write_text("precious")
+    with pytest.raises(SourceError, match="is there already and is no socket"):
+        source_at(path).start(context)
+    assert path.read_text() == "precious"
+    path.unlink()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+        other.bind(str(path))
+        other.listen()
+        with pytest.raises(SourceError, match="another program listens"):
+            source_at(path).start(context)
+    if os.geteuid() == 0:
+        os.chown(path, 12345, 12345)
+        with pytest.raises(SourceError, match="belongs to another user"):
+            source_at(path).start(context)
+
+
+def test_the_successors_socket_is_not_removed(tmp_path, context) -> None:
+    path = tmp_path / "snake.sock"
+    first, second = source_at(path), source_at(path)
+    first.start(context)
+    path.unlink()
+    second.start(context)
+    first.stop()
+    assert path.exists()
+    second.stop()
+
+
+def test_a_place_that_can_not_be_used(tmp_path, context) -> None:
+    for path in (tmp_path / "no" / "folder.sock", tmp_path / ("x" * 120)):
+        with pytest.raises(SourceError, match="can't listen at|No such file"):
+            source_at(path).start(context)
+    with pytest.raises(UsageError, match="clock 'mine' is not one of device, host, simulated"):
+        source_at(tmp_path / "s", "?clock=mine")
+    with pytest.raises(UsageError, match="no option 'speed'"):
+        source_at(tmp_path / "s", "?speed=1")
+    assert source_at(tmp_path / "s", "?clock=host&directions=1").directions
