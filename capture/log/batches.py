@@ -7,20 +7,20 @@ memory that is written for the first time costs a page fault each 4 KiB, as much
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..errors import LogError
-from .chunk import Block, Buffer
+from .chunk import PREFIX_SIZE, Block, Buffer
 from .message_heads import BODY_AT, FIXED_SIZE, HEAD, gather
 from .storage import LogFile
 
-_ARENA_SIZE = 4 << 20
+_ARENA_SIZE = 8 << 20
 
 Window = tuple[int | None, int | None]
 
@@ -46,11 +46,13 @@ class Records:
 
     Attributes:
         offsets: Where they start, shape (n,).
-        heads: Their heads, of :data:`capture.log.message_heads.HEAD`, shape (n,).
+        log_ns: Their log times [Unix ns], shape (n,).
+        lengths: Bytes of each message, shape (n,).
     """
 
     offsets: IntArray
-    heads: NDArray[np.void]
+    log_ns: IntArray
+    lengths: IntArray
 
 
 def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
@@ -119,8 +121,7 @@ def _filled(
             continue
         try:
             if not log_file.inflates(block, _ARENA_SIZE):
-                data, base = log_file.payload(block)
-                stop = block.stop if not block.compression else base + len(data)
+                data, base, stop = log_file.payload_once(block)
                 yield data, [Placed(block, base, stop)]
                 continue
             if at + block.size > len(arena):
@@ -148,45 +149,49 @@ def _records(
     Raises:
         LogError: If an index is damaged or points to something that is no message.
     """
-    offsets = [_offsets(log_file, placed, channel_ids) for channel_ids in wanted]
-    starts = np.concatenate([at for at, _ in offsets])
-    stops = np.concatenate([stop for _, stop in offsets])
-    if not len(starts):
-        return [Records(starts, np.empty(0, HEAD)) for _ in wanted]
-    if (starts + BODY_AT > stops).any():
+    offsets, stops, limits = _offsets(log_file, placed, wanted)
+    if (offsets + BODY_AT > stops).any():
         raise LogError(log_file.path, "a message index points outside its chunk")
-    heads = gather(data, starts, HEAD)
+    heads = gather(data, offsets, HEAD) if len(offsets) else np.empty(0, HEAD)
     lengths = heads["length"]
-    room = (stops - starts - 9).astype(np.uint64)
+    room = (stops - offsets - PREFIX_SIZE).astype(np.uint64)
     if (heads["opcode"] != Opcode.MESSAGE).any() or (
         (lengths < FIXED_SIZE) | (lengths > room)
     ).any():
         raise LogError(log_file.path, "a message index points to something that is not a message")
-    found: list[Records] = []
-    at = 0
-    for each, _ in offsets:
-        found.append(Records(each, heads[at : at + len(each)]))
-        at += len(each)
-    return found
+    log_ns = heads["log"].astype(np.int64)
+    lengths = lengths.astype(np.int64) - FIXED_SIZE
+    return [
+        Records(offsets[a:b], log_ns[a:b], lengths[a:b])
+        for a, b in itertools.pairwise(limits)
+    ]
 
 
 def _offsets(
-    log_file: LogFile, placed: Sequence[Placed], channel_ids: Sequence[int]
-) -> tuple[IntArray, IntArray]:
-    """Where a topic's records start, in file order, and where the payload of each ends."""
-    parts = [log_file.entries(one.block, ids) for one in placed for ids in channel_ids]
-    size = len(channel_ids)
-    counts = [
-        sum(len(part) for part in parts[i * size : i * size + size]) // 16
-        for i in range(len(placed))
-    ]
-    offsets = np.frombuffer(b"".join(parts), dtype="<i8")[1::2]
-    stops = np.repeat(np.array([one.stop for one in placed], dtype=np.int64), counts)
-    bases = np.repeat(np.array([one.base for one in placed], dtype=np.int64), counts)
+    log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+) -> tuple[IntArray, IntArray, list[int]]:
+    """Where the records start, topic by topic and each in file order.
+
+    Returns:
+        The starts, where the payload of each ends, and the topics' limits in both.
+    """
+    ids = [channel_id for channel_ids in wanted for channel_id in channel_ids]
+    by_block = [log_file.entries(one.block, ids) for one in placed]
+    by_channel = list(zip(*by_block, strict=True))
+    counts = np.array([[len(part) // 16 for part in parts] for parts in by_channel], dtype=np.int64)
+    raw = b"".join(part for parts in by_channel for part in parts)
+    offsets = np.frombuffer(raw, dtype="<i8")[1::2]
+    here = np.tile(np.array([(one.base, one.stop) for one in placed]), (len(ids), 1))
+    bases, stops = np.repeat(here, counts.reshape(-1), axis=0).T
     if (offsets < 0).any() or (offsets > stops - bases).any():
         raise LogError(log_file.path, "a message index points outside its chunk")
     offsets = offsets + bases
-    if (offsets[1:] < offsets[:-1]).any():  # not in file order; the blocks are
-        order = np.argsort(offsets, kind="stable")
-        offsets, stops = offsets[order], stops[order]
-    return offsets, stops
+    sums = np.concatenate([[0], np.cumsum(counts.sum(axis=1))])
+    limits: list[int] = sums[np.cumsum([0, *(len(each) for each in wanted)])].tolist()
+    steps_back = offsets[1:] < offsets[:-1]
+    steps_back[[at - 1 for at in limits[1:-1] if 0 < at < len(offsets)]] = False
+    if steps_back.any():  # an index that is not in file order, or a topic of several channels
+        for a, b in itertools.pairwise(limits):
+            order = a + np.argsort(offsets[a:b], kind="stable")
+            offsets[a:b], stops[a:b] = offsets[order], stops[order]
+    return offsets, stops, limits

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 import lz4.frame  # pyright: ignore[reportMissingTypeStubs]
+import numpy as np
 import zstandard
 
 from ..arrays import IntArray
@@ -52,6 +53,20 @@ class Block:
     offsets: dict[int, IntArray] | None = None
     complete: bool = True
     part: int = 0
+
+
+def as_entries(offsets: IntArray) -> bytes:
+    """Message offsets as the entries of a message index, without log times.
+
+    Args:
+        offsets: Shape (n,).
+
+    Returns:
+        Two u64 a message, as in a file.
+    """
+    entries = np.zeros((len(offsets), 2), dtype="<i8")
+    entries[:, 1] = offsets
+    return entries.tobytes()
 
 
 def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:

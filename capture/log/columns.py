@@ -43,6 +43,7 @@ class Group:
     Attributes:
         layout: The layout.
         is_stamped: Whether they have a stamp.
+        strings: The strings that are wanted, by path.
     """
 
     def __init__(self, layout: Layout, paths: frozenset[str] | None, capacity: int) -> None:
@@ -58,6 +59,9 @@ class Group:
         stamps = [pair for pair in _STAMPS if all(path in leaves for path in pair)]
         self._stamp = tuple(leaves[path] for path in stamps[0]) if stamps else ()
         self.is_stamped = bool(stamps)
+        self.strings = {
+            path: text for path, text in layout.strings.items() if paths is None or path in paths
+        }
         self._times = TimeStore(capacity, stamped=self.is_stamped)
         self._order: list[IntArray | range] = []
         self._columns = {
@@ -276,9 +280,7 @@ class _GroupReader:
         self.unread: list[Unread] = []
 
     def add(self, data: Buffer, records: Records, window_ns: Window) -> None:
-        at = records.offsets + BODY_AT
-        log_ns = records.heads["log"].astype(np.int64)
-        lengths = records.heads["length"].astype(np.int64) - FIXED_SIZE
+        at, log_ns, lengths = records.offsets + BODY_AT, records.log_ns, records.lengths
         start, stop = window_ns
         if (start is not None and (log_ns < start).any()) or (
             stop is not None and (log_ns >= stop).any()

@@ -14,7 +14,7 @@ import mmap
 import struct
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TypeVar
@@ -38,7 +38,15 @@ from mcap.records import (
 
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
-from .chunk import PREFIX_SIZE, Block, Buffer, inflate, inflate_zstd_into, walk_records
+from .chunk import (
+    PREFIX_SIZE,
+    Block,
+    Buffer,
+    as_entries,
+    inflate,
+    inflate_zstd_into,
+    walk_records,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_SIZE = 1 + 8 + 20
@@ -171,36 +179,39 @@ class McapFile:
         if block.crc and zlib.crc32(room) != block.crc:
             raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
 
-    def entries(self, block: Block, channel_id: int) -> bytes:
-        """A channel's message index in a block: log time and offset (u64 each) of each message.
+    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
+        """The message index of some channels in a block: log time and offset of each message.
 
         Args:
             block: One of ``blocks``.
-            channel_id: The channel.
+            channel_ids: The channels.
 
         Returns:
-            16 bytes a message, in the order of the index; nothing is checked but its size.
+            For each channel 16 bytes a message (two u64), in the order of the index; nothing is
+            checked but its size.
 
         Raises:
             LogError: If the index or the payload is damaged.
         """
-        if block.offsets is None and block.index_at:
+        if block.offsets is not None or not block.index_at:
+            return [as_entries(self.offsets(block, channel_id)) for channel_id in channel_ids]
+        buffer, end = self._buffer, len(self._buffer)
+        head_size = _INDEX_HEAD.size
+        found: list[bytes] = []
+        for channel_id in channel_ids:
             at = block.index_at.get(channel_id)
             if at is None:
-                return b""
-            if at + _INDEX_HEAD.size > len(self._buffer):
+                found.append(b"")
+                continue
+            if at + head_size > end:
                 raise LogError(self.path, f"an index points to byte {at}, where no record is")
-            opcode, length, found_id, size = _INDEX_HEAD.unpack_from(self._buffer, at)
-            stop = at + _INDEX_HEAD.size + size
-            if opcode != Opcode.MESSAGE_INDEX or stop > len(self._buffer):
+            opcode, length, found_id, size = _INDEX_HEAD.unpack_from(buffer, at)
+            if opcode != Opcode.MESSAGE_INDEX or at + head_size + size > end:
                 raise LogError(self.path, f"no message index at byte {at}")
             if found_id != channel_id or size + 6 != length or size % 16:
                 raise LogError(self.path, f"the message index at byte {at} is damaged")
-            return self._buffer[at + _INDEX_HEAD.size : stop]
-        offsets = self.offsets(block, channel_id)
-        pairs = np.zeros((len(offsets), 2), dtype="<i8")
-        pairs[:, 1] = offsets
-        return pairs.tobytes()
+            found.append(buffer[at + head_size : at + head_size + size])
+        return found
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
         """Where a channel's message records start in a block's payload.

@@ -339,7 +339,7 @@ class Session:
 def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """One layout group as a table."""
     columns: dict[str, Any] = {}
-    for path, text in group.layout.strings.items():
+    for path, text in group.strings.items():
         columns[path] = np.full(len(group), text, dtype=object)
     for path in group.paths:
         values = group.values(path)

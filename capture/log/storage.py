@@ -6,6 +6,7 @@ files' blocks as one more block, in memory; nothing on the disk is changed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -30,7 +31,7 @@ class _Part(Protocol):
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]: ...
     def inflates(self, block: Block, limit: int) -> bool: ...
     def inflate_into(self, block: Block, room: memoryview) -> None: ...
-    def entries(self, block: Block, channel_id: int) -> bytes: ...
+    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]: ...
     def offsets(self, block: Block, channel_id: int) -> IntArray: ...
     def close(self) -> None: ...
 
@@ -195,20 +196,21 @@ class LogFile:
         """
         self._sources[block.part].inflate_into(block, room)
 
-    def entries(self, block: Block, channel_id: int) -> bytes:
-        """A channel's message index in a block: log time and offset (u64 each) of each message.
+    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
+        """The message index of some channels in a block: log time and offset of each message.
 
         Args:
             block: One of ``blocks``.
-            channel_id: The channel.
+            channel_ids: The channels.
 
         Returns:
-            16 bytes a message, in the order of the index; nothing is checked but its size.
+            For each channel 16 bytes a message (two u64), in the order of the index; nothing is
+            checked but its size.
 
         Raises:
             LogError: If the index or the payload is damaged.
         """
-        return self._sources[block.part].entries(block, channel_id)
+        return self._sources[block.part].entries(block, channel_ids)
 
     # -- putting together ------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
-from .chunk import Block, Buffer
+from .chunk import Block, Buffer, as_entries
 from .wal import wal_folder
 from .wal_format import Definition
 from .wal_lock import is_live
@@ -132,12 +132,9 @@ class WalTail:
         """Copy the block."""
         room[:] = self._data[block.start : block.stop]
 
-    def entries(self, block: Block, channel_id: int) -> bytes:
-        """A channel's offsets as a message index without log times, 16 bytes a message."""
-        offsets = self.offsets(block, channel_id)
-        pairs = np.zeros((len(offsets), 2), dtype="<i8")
-        pairs[:, 1] = offsets
-        return pairs.tobytes()
+    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
+        """The offsets of some channels as message indexes without log times."""
+        return [as_entries(self.offsets(block, channel_id)) for channel_id in channel_ids]
 
     def close(self) -> None:
         """Nothing to release."""
