@@ -50,11 +50,12 @@ def record_and_kill(folder, seed, *options):
     command += ["--robot", "snake25", "--bus", "front", "-o", str(session), "--floor", "0"]
     started = []
     try:
-        recorder = subprocess.Popen(
-            [*command, *options, "--quiet", "--socket", str(folder / "control.sock")],
-            cwd=ROOT,
-            stderr=(folder / "recorder.err").open("wb"),
-        )
+        with (folder / "recorder.err").open("wb") as errors:
+            recorder = subprocess.Popen(
+                [*command, *options, "--quiet", "--socket", str(folder / "control.sock")],
+                cwd=ROOT,
+                stderr=errors,
+            )
         started.append(recorder)
         logs = [path.with_suffix(".accepted") for path in sockets]
         for path, log in zip(sockets, logs, strict=True):
