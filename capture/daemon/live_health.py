@@ -213,7 +213,9 @@ class LiveHealth:
     def _topic(
         self, topic: _Topic, measured: ChannelMeasures, joints: list[JointHealth]
     ) -> TopicSnapshot:
-        timings = [series.timing for series in measured.series]
+        # Frames come when a batch is full: their messages have no rhythm of their own.
+        framed = topic.name.startswith("/can/")
+        timings = [] if framed else [series.timing for series in measured.series]
         steady = [timing for timing in timings if timing.regular]
         jitters = [(timing.std_s or 0.0) / timing.median_s for timing in steady if timing.median_s]
         whole = bool(steady) and len(steady) == len(timings)
@@ -251,7 +253,7 @@ class LiveHealth:
             address=address,
             connected=source.connected,
             finished=source.finished,
-            frames=counts.frames,
+            frames=None if source.robot is not None and not counts.frames else counts.frames,
             rate_hz=_Topic(topic, recent=recent).rate_hz() if recent else None,
             age_s=max(self._now_ns - last, 0) / _NS if last else None,
             dropped=counts.dropped,

@@ -47,7 +47,7 @@ class SourceSnapshot:
         address: As the command line named it.
         connected: Whether data can come.
         finished: Whether nothing will come any more.
-        frames: Frames so far.
+        frames: Frames so far; None for a source that writes topics of its own.
         rate_hz: Frames a second over the last seconds; None before there is a rate.
         age_s: Time since the last frame [s]; None before the first.
         dropped: Frames lost before the recorder; None where the source can't tell.
@@ -63,7 +63,7 @@ class SourceSnapshot:
     address: str
     connected: bool
     finished: bool = False
-    frames: int = 0
+    frames: int | None = 0
     rate_hz: float | None = None
     age_s: float | None = None
     dropped: int | None = None

@@ -104,7 +104,7 @@ def _session(snapshot: RecorderSnapshot) -> DiagnosticStatus:
 def _source(source: SourceSnapshot) -> DiagnosticStatus:
     level, message = source_state(source)
     values = {
-        "frames": str(source.frames),
+        "frames": _number(source.frames),
         "rate_hz": _number(source.rate_hz),
         "dropped": _number(source.dropped),
         "malformed": str(source.malformed),

@@ -91,7 +91,8 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
         last: The last one.
 
     Returns:
-        The sources by name; none where the messages are not a recorder's, or can't be decoded.
+        The sources of frames by name; none where the messages are not a recorder's, or can't be
+        decoded.
     """
     try:
         before = {status.name: status.values for status in read_statuses(kind, first)}
@@ -99,6 +100,8 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
     except DataError:
         return ()  # counted as unread where the channel is judged
     late = _number(before.get(RECORDER, NO_VALUES), ELAPSED) > FIRST_S
+    if late and first == last:
+        return ()  # one moment of a recording says nothing of what happened in the file
     found: list[SourceHealth] = []
     for status in after:
         if not status.name.startswith(SOURCE_PREFIX) or "frames" not in status.values:
@@ -143,7 +146,7 @@ def judge_source(source: SourceHealth) -> list[Finding]:
             Finding(
                 2 if part >= BAD_LOSS else 1,
                 f"{label} lost {source.dropped} of {expected} frames before the recorder "
-                f"({part:.2%})",
+                f"({100 * part:.2g}%)",
             )
         )
     if source.malformed:

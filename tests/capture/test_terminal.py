@@ -1,0 +1,358 @@
+"""What an operator sees, on real terminals and pipes, also on those that take nothing."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from capture.daemon.screen import clock_time, plain_line, screen, time_left
+from capture.daemon.snapshot import EventLine, RecorderSnapshot, SourceSnapshot, TopicSnapshot
+from capture.daemon.source_clock import ClockEstimate
+from capture.daemon.statuses import statuses
+from capture.daemon.terminal import Terminal
+from capture.log.diagnostics import ERROR, OK, STALE, WARN
+from capture.log.source_health import measure_sources, read_statuses
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NS = 1_000_000_000
+CLOCK = ClockEstimate(True, 123, -23.42, 0.1, 0.00214, 0.0093, 1_000_000, 1)
+CAN = SourceSnapshot(
+    name="can0",
+    address="can:socketcan:can0",
+    connected=True,
+    frames=1_348_123,
+    rate_hz=1787.4,
+    age_s=0.003,
+    dropped=12,
+    malformed=3,
+    error_frames=2,
+    load=(0.198, 0.241),
+    clock=CLOCK,
+)
+IMU = SourceSnapshot("imu", "unix:/run/imu.sock", connected=False, frames=72, age_s=12.0)
+STATES = TopicSnapshot(
+    "/joint_states", 73_725, 98.3, 0.01, 3, 34, 0.02, 0, ("joint03",), ("joint07",), 50
+)
+SNAPSHOT = RecorderSnapshot(
+    session_id="s",
+    path="/data/run.mcap",
+    robot="snake25",
+    state="recording",
+    now_ns=EPOCH_NS + 754 * NS,
+    elapsed_s=754.2,
+    messages=1_234_567,
+    size=123_456_789,
+    byte_rate=35_200.0,
+    free=12_300_000_000,
+    part=2,
+    verdict="degraded",
+    reasons=tuple(f"reason {k}" for k in range(5)),
+    notes=(),
+    sources=(CAN, IMU),
+    topics=(
+        STATES,
+        *(TopicSnapshot(f"/ir/{k:02d}", 20 * k, 20.0, 0.02, 0, 0, 0.1, 0) for k in range(15)),
+        TopicSnapshot("/rosout", 3, 0.1, 5.0),
+    ),
+    events=(
+        EventLine(EPOCH_NS + 1 * NS, "info", "recorder", "recording can0, imu"),
+        EventLine(EPOCH_NS + 742 * NS, "error", "imu", "the connection is lost"),
+    ),
+    tick_p99_s=0.0021,
+    tick_max_s=0.012,
+)
+
+
+def rows(snapshot: RecorderSnapshot, width: int, height: int | None = None) -> list[str]:
+    return screen(snapshot, width, height).plain.split("\n")
+
+
+def row(lines: list[str], first: str) -> list[str]:
+    (found,) = [line for line in lines if line.startswith(first)]
+    return re.split(r"\s{2,}", found.strip())
+
+
+# -- what is drawn -----------------------------------------------------------------------------
+
+
+def test_the_answer_comes_first_and_everything_is_on_the_screen() -> None:
+    lines = rows(SNAPSHOT, 120)
+    assert lines[0].split() == ["recording", "/data/run.mcap", "snake25", "0:12:34"]
+    assert "123 MB (+35.2 kB/s) | part 2 | 1,234,567 messages" in lines[1]
+    assert "12.3 GB free, full in 4 d" in lines[1]  # 12.3e9 / 35.2e3 = 349,432 s
+    assert lines[2].split()[:2] == ["DEGRADED", "so"]
+    assert "and 2 more" in "\n".join(lines)
+    assert row(lines, "can0") == (
+        ["can0", "on, lost 12", "1787", "12", "3", "24%", "-23.4", "2.14", "1,348,123", "2", "0"]
+    )
+    assert row(lines, "imu")[1] == "not connected"
+    states = "/joint_states|98.3|0.0|3|34|2%|0|73,725|1 frozen, 1 at limits, 50 NaN"
+    assert row(lines, "/joint_states") == states.split("|")
+    assert row(lines, "/ir/ (15)")[1] == "300"  # 15 sensors of one kind are one row
+    assert not any(line.startswith("/rosout") for line in lines)
+    assert lines[-1] == "0:12:22 error imu: the connection is lost"
+
+
+def test_a_good_recording_says_so_in_words() -> None:
+    good = replace(SNAPSHOT, verdict="good", reasons=(), events=(), topics=(), sources=())
+    assert "GOOD" in rows(good, 80)[2]
+    assert "nothing found so far" in rows(good, 80)[2]
+
+
+texts = st.text(max_size=200)
+
+
+@given(st.integers(40, 200), st.integers(8, 60), texts, texts, texts)
+@settings(max_examples=60, deadline=None)
+def test_no_screen_is_wider_than_the_terminal_whatever_names_say(
+    width: int, height: int, reason: str, path: str, said: str
+) -> None:
+    snapshot = replace(
+        SNAPSHOT,
+        path=path,
+        reasons=(reason, "the second"),
+        trouble=said,
+        events=(EventLine(EPOCH_NS, "warn", path, said),),
+        sources=(replace(CAN, name=said), IMU),
+    )
+    lines = rows(snapshot, width, height)
+    assert max(map(len, lines)) <= width
+    assert all(line.isprintable() for line in lines)
+    console = Console(file=io.StringIO(), width=width, force_terminal=True)
+    console.print(screen(snapshot, width, height))
+
+
+def test_a_small_screen_counts_the_topics_that_it_leaves_out() -> None:
+    many = tuple(TopicSnapshot(f"/topic_{k}", 1, 1.0, 0.0) for k in range(40))
+    lines = rows(replace(SNAPSHOT, topics=many), 80, 24)
+    assert len(lines) <= 24
+    shown = sum(line.startswith("/topic_") for line in lines)
+    assert f"and {40 - shown} more" in lines
+
+
+@pytest.mark.parametrize(
+    ("time_s", "clock", "left"),
+    [
+        (0.4, "0:00:00", "0 s"),
+        (59.0, "0:00:59", "59 s"),
+        (3599.0, "0:59:59", "59 min"),
+        (12_000.0, "3:20:00", "3 h 20 min"),
+        (100_000.0, "27:46:40", "27 h"),
+        (400_000.0, "111:06:40", "4 d"),
+    ],
+)
+def test_times_are_shown_in_units_that_matter(time_s: float, clock: str, left: str) -> None:
+    assert (clock_time(time_s), time_left(time_s)) == (clock, left)
+
+
+# -- where it is drawn -------------------------------------------------------------------------
+
+
+@contextmanager
+def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
+    """A real terminal of 100 x 30: the end of whoever looks at it, and the stream."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
+    with os.fdopen(theirs, "w") as stream:
+        try:
+            yield ours, stream
+        finally:
+            os.close(ours)
+
+
+def read_until(number: int, wanted: str, patience_s: float = 30.0) -> str:
+    found, deadline = b"", time.monotonic() + patience_s
+    while wanted.encode() not in found:
+        left_s = deadline - time.monotonic()
+        assert left_s > 0, found
+        if select.select([number], [], [], left_s)[0]:
+            found += os.read(number, 1 << 16)
+    return found.decode()
+
+
+def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    with terminal() as (ours, stream):
+        shown = Terminal(stream)
+        shown.show(SNAPSHOT)
+        said = read_until(ours, "the connection is lost")
+        assert "DEGRADED" in said
+        shown.show(replace(SNAPSHOT, elapsed_s=755.3))
+        assert "0:12:35" in read_until(ours, "the connection is lost")
+        assert shown.close()
+        stream.write("the report\n")
+        stream.flush()
+        assert "\x1b[2K" in read_until(ours, "the report")  # lines of the screen are erased
+
+
+def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As after Ctrl-S: nobody reads, the kernel's buffer is full, a write waits for ever."""
+    monkeypatch.setenv("TERM", "xterm-256color")
+    with terminal() as (ours, stream):
+        shown = Terminal(stream)
+        for second in range(200):
+            shown.show(replace(SNAPSHOT, elapsed_s=float(second)))
+            time.sleep(0.002)
+        assert not shown.close()
+        read_until(ours, "0:03:19")  # Ctrl-Q: it goes on with the latest state
+        deadline = time.monotonic() + 30
+        while not shown.close():
+            assert time.monotonic() < deadline
+            if select.select([ours], [], [], 0)[0]:
+                os.read(ours, 1 << 16)
+
+
+def test_a_process_whose_terminal_is_stuck_can_end() -> None:
+    program = (
+        "import sys, time\n"
+        "from tests_snapshot import SNAPSHOT, Terminal\n"
+        "shown = Terminal(sys.stderr)\n"
+        "for k in range(100):\n"
+        "    shown.show(SNAPSHOT)\n"
+        "    time.sleep(0.002)\n"
+        "print(shown.close())\n"
+    )
+    source = "import importlib.util, sys\nspec = importlib.util.spec_from_file_location("
+    source += f"'tests_snapshot', {__file__!r})\nmodule = importlib.util.module_from_spec(spec)\n"
+    source += "sys.modules['tests_snapshot'] = module\nspec.loader.exec_module(module)\n"
+    with terminal() as (_, stream):
+        done = subprocess.run(
+            [sys.executable, "-c", source + program],
+            stderr=stream,
+            stdout=subprocess.PIPE,
+            env=os.environ | {"TERM": "xterm-256color"},
+            timeout=60,
+            check=False,
+        )
+    assert (done.returncode, done.stdout) == (0, b"False\n")
+
+
+def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once() -> None:
+    number, other = os.pipe()
+    with os.fdopen(other, "w") as stream:
+        shown = Terminal(stream)
+        said = ""
+        for second in range(25):
+            late = EventLine(EPOCH_NS + 13 * NS, "warn", "can0", "a late one")
+            events = (*SNAPSHOT.events, late) if second >= 13 else SNAPSHOT.events
+            shown.show(replace(SNAPSHOT, elapsed_s=float(second), events=events))
+            if second in (0, 10, 13, 20):  # these are waited for; others may be skipped
+                said += read_until(number, "late one" if second == 13 else f"0:00:{second:02d} ")
+        assert shown.close()
+    with os.fdopen(number) as rest:
+        said += rest.read()
+    lines = said.splitlines()
+    assert [line.split()[0] for line in lines if line[0].isdigit()] == [
+        "0:00:00",
+        "0:00:10",
+        "0:00:20",
+    ]
+    assert lines.count("error: imu: the connection is lost") == 1
+    assert lines.count("warn: can0: a late one") == 1
+    assert not any(line.startswith("info") for line in lines)
+
+
+def test_a_terminal_that_has_gone_is_no_trouble() -> None:
+    number, other = os.pipe()
+    os.close(number)
+    with os.fdopen(other, "w") as stream:
+        shown = Terminal(stream)
+        shown.show(SNAPSHOT)
+        shown.show(SNAPSHOT)
+        assert shown.close()
+    text = io.StringIO()
+    quiet = Terminal(text, quiet=True)
+    quiet.show(SNAPSHOT)
+    assert quiet.close()
+    assert text.getvalue() == ""
+
+
+def test_the_line_says_what_matters() -> None:
+    line = plain_line(SNAPSHOT)
+    assert line.startswith("0:12:34 degraded; 1,234,567 messages, 123 MB; can0 connected, lost 12")
+    assert line.endswith("reason 0 (and 4 more)")
+
+
+# -- the same as diagnostics -------------------------------------------------------------------
+
+
+def test_the_statuses_say_what_the_screen_says() -> None:
+    found = {status.name: status for status in statuses(SNAPSHOT)}
+    assert list(found) == [
+        "recorder",
+        "session",
+        "source can0",
+        "source imu",
+        "topics ir",
+        "topics joints",
+    ]
+    assert found["recorder"].level == OK
+    assert found["session"].level == WARN
+    assert found["session"].values["reason.2"] == "reason 1"
+    assert (found["source can0"].level, found["source imu"].level) == (WARN, ERROR)
+    assert found["source can0"].values["clock_drift_ppm"] == "-23.420"
+    assert found["topics ir"].values["topics"] == "15"
+    assert "frozen: joint07" in found["topics joints"].message
+
+
+def test_a_silent_source_is_stale_and_a_full_disk_an_error() -> None:
+    silent = replace(CAN, age_s=3.0, dropped=0)
+    snapshot = replace(SNAPSHOT, sources=(silent,), free=1_000_000)
+    found = {status.name: status for status in statuses(snapshot)}
+    assert (found["source can0"].level, found["source can0"].message) == (STALE, "silent for 3 s")
+    assert (found["recorder"].level, found["recorder"].message) == (
+        ERROR,
+        "the disk is full in 28 s",
+    )
+
+
+def test_what_is_written_is_what_a_check_reads(tmp_path) -> None:
+    """Statuses to a file and back, the counts of the sources included."""
+    from capture import SessionWriter
+    from capture.log.schemas import message_type
+    from capture.log.storage import LogFile
+    from capture.log.topics import Topics
+
+    path = tmp_path / "s.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        writer.diagnostics().write(EPOCH_NS, statuses(SNAPSHOT))
+    log_file = LogFile(path)
+    try:
+        _, message, kind = Topics(log_file, print).first("/diagnostics")
+    finally:
+        log_file.close()
+    assert kind.name == message_type("diagnostic_msgs/msg/DiagnosticArray").name
+    assert read_statuses(kind, message) == statuses(SNAPSHOT)
+    assert measure_sources(kind, message, message) == ()  # one moment, long after the start
+    started = replace(SNAPSHOT, elapsed_s=1.0)
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, force=True) as writer:
+        writer.diagnostics().write(EPOCH_NS, statuses(started))
+    log_file = LogFile(path)
+    try:
+        _, message, kind = Topics(log_file, print).first("/diagnostics")
+    finally:
+        log_file.close()
+    can, imu = measure_sources(kind, message, message)
+    assert (can.frames, can.dropped, can.malformed, can.clock_resets) == (1_348_123, 12, 3, 1)
+    assert (imu.frames, imu.dropped) == (72, None)
