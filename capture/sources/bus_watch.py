@@ -52,16 +52,23 @@ class BusWatch:
             frames: What came, in order.
             tally: Where to count and tell.
         """
-        ids = frames["id_flags"]
-        is_error = (ids & ERROR_FLAG) != 0
-        errors = int(np.count_nonzero(is_error))
-        if self._off and errors < len(frames):
-            self._back(tally)
-        if not errors:
-            return
-        tally.counts.error_frames += errors
-        for frame in frames[is_error]:
+        is_error = (frames["id_flags"] & ERROR_FLAG) != 0
+        places = np.flatnonzero(is_error).tolist()
+        tally.counts.error_frames += len(places)
+        before = -1
+        for place in places:
+            if place > before + 1:
+                self._hear(tally)
+            frame = frames[place]
             self._tell(int(frame["id_flags"]) & ID_MASK, frame["data"].tolist(), tally)
+            before = place
+        if len(frames) > before + 1:
+            self._hear(tally)
+
+    def _hear(self, tally: Tally) -> None:
+        """An ordinary frame came: whoever was off the bus is on it."""
+        if self._off:
+            self._back(tally)
 
     def _tell(self, classes: int, data: list[int], tally: Tally) -> None:
         if classes & RESTARTED:

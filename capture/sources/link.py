@@ -248,6 +248,12 @@ class LinkedSource:
         attempt, self._attempt = self._attempt, None
         try:
             self._link = attempt.result()
+        except SourceError as error:
+            if not self._was_up:
+                raise
+            self._backoff.failed(now_ns)  # what has worked may work again
+            self._complain(str(error))
+            return
         except OSError as error:
             self._backoff.failed(now_ns)
             if not (self._was_up and error.errno in _ABSENT):  # its loss was told

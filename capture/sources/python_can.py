@@ -215,8 +215,11 @@ def open_bus(
         raise failure(error) from error
     except (TypeError, ValueError, KeyError) as error:
         raise SourceError(text, f"python-can refuses the options: {error}") from error
-    except can.CanError as error:
+    except (can.CanError, OSError) as error:
         raise failure(error) from error
+    except Exception as error:  # python-can's own fault, e.g. a name that its driver should bring
+        kind = type(error).__name__
+        raise SourceError(text, f"python-can can't open it: {kind}: {error}") from error
     return PythonCanLink(opened, tally, device_time=device_time, detail=detail)
 
 

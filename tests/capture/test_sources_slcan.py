@@ -1,5 +1,7 @@
 """A real pseudo-terminal with an slcan adapter at its other end."""
 
+import contextlib
+import itertools
 import os
 import select
 import threading
@@ -75,10 +77,8 @@ class Adapter:
                     self.opened.set()
             with self.lock:
                 if self.opened.is_set() and self.queue:
-                    try:
+                    with contextlib.suppress(BlockingIOError):
                         self.queue = self.queue[os.write(self.master, self.queue[:3000]) :]
-                    except BlockingIOError:
-                        pass
 
     def unplug(self) -> None:
         if self.plugged:
@@ -154,7 +154,9 @@ def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
     text, tally = SlcanText(stamps=True), Tally(lambda: 0)
     true_s = np.array([3.0, 59.9, 60.1, 700.0, 3599.999, 3600.002, 90_000.0])
     found = [
-        text.feed(b"t1230%04X\r" % (round(s * 1000) % STAMP_PERIOD_MS), 10**18 + int(s * 1e9), tally)
+        text.feed(
+            b"t1230%04X\r" % (round(s * 1000) % STAMP_PERIOD_MS), 10**18 + int(s * 1e9), tally
+        )
         for s in true_s + 0.0
     ]
     assert [int(f["t_device_ns"][0]) for f in found] == [round(s * 1000) * 10**6 for s in true_s]
@@ -214,9 +216,7 @@ def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
         cuts = np.sort(rng.integers(0, len(stream), rng.integers(1, 400)))
         text, tally = SlcanText(stamps=False), Tally(lambda: 0)
         borders = [0, *cuts.tolist(), len(stream)]
-        parts = [
-            text.feed(stream[a:b], 5, tally) for a, b in zip(borders, borders[1:], strict=False)
-        ]
+        parts = [text.feed(stream[a:b], 5, tally) for a, b in itertools.pairwise(borders)]
         assert np.concatenate(parts).tobytes() == whole.tobytes()
         assert tally.counts.malformed == 1
 
@@ -317,9 +317,7 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, 
     bus.shutdown()
     frames = empty_frames(len(theirs))
     frames["id_flags"] = [
-        m.arbitration_id
-        | m.is_extended_id * EXTENDED_FLAG
-        | m.is_remote_frame * REMOTE_FLAG
+        m.arbitration_id | m.is_extended_id * EXTENDED_FLAG | m.is_remote_frame * REMOTE_FLAG
         for m in theirs
     ]
     frames["dlc"] = [m.dlc for m in theirs]

@@ -1,0 +1,115 @@
+"""Telling without flooding, trying again without hammering, and what error frames mean."""
+
+import numpy as np
+
+from capture.log.frames import ERROR_FLAG, empty_frames
+from capture.sources.backoff import Backoff
+from capture.sources.bus_watch import BUS_OFF, RESTARTED, BusWatch
+from capture.sources.events import EventLog, Tally
+
+S = 1_000_000_000
+
+
+class Clock:
+    """A session's clock that stands still until told."""
+
+    def __init__(self) -> None:
+        self.t_ns = 10**18
+
+    def __call__(self) -> int:
+        return self.t_ns
+
+
+def test_one_text_is_told_once_a_second_with_its_count() -> None:
+    clock = Clock()
+    events = EventLog(clock)
+    told = []
+    for _ in range(2500):  # one each millisecond
+        events.say("warn", "malformed line")
+        told += events.take()
+        clock.t_ns += S // 1000
+    told += events.flush()
+    assert [event.text for event in told] == [
+        "malformed line",
+        "malformed line (1000 times)",
+        "malformed line (1000 times)",
+        "malformed line (499 times)",
+    ]
+    assert [(event.t_ns - 10**18) // 10**6 for event in told] == [0, 1000, 2000, 2500]
+    assert {event.level for event in told} == {"warn"}
+    assert events.flush() == ()
+
+
+def test_different_texts_do_not_hide_each_other() -> None:
+    events = EventLog(Clock())
+    for text in ("a", "b", "a"):
+        events.say("info", text)
+    assert [event.text for event in events.take()] == ["a", "b"]
+    assert [event.text for event in events.flush()] == ["a"]
+
+
+def test_after_a_quiet_second_the_next_is_told_at_once() -> None:
+    clock = Clock()
+    events = EventLog(clock)
+    events.say("info", "a")
+    events.take()
+    clock.t_ns += 2 * S
+    assert events.take() == ()
+    events.say("info", "a", 3)
+    assert [event.text for event in events.take()] == ["a (3 times)"]
+
+
+def test_pauses_double_up_to_five_seconds_and_begin_anew_after_a_steady_connection() -> None:
+    backoff, now = Backoff(), 10**18
+    assert backoff.due(now)
+    pauses = []
+    for _ in range(9):
+        backoff.failed(now)
+        start = now
+        while not backoff.due(now):
+            now += S // 1000
+        pauses.append((now - start) / S)
+    assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
+    backoff.opened(now)
+    backoff.failed(now + S // 2)  # broke down at once: not steady
+    assert not backoff.due(now + S // 2 + 4 * S)
+    now += 10 * S
+    backoff.opened(now)
+    backoff.failed(now + S)
+    assert backoff.due(now + S + S // 10)
+
+
+def errors(*classes: int):
+    frames = empty_frames(len(classes))
+    frames["id_flags"] = np.array(classes) | ERROR_FLAG
+    return frames
+
+
+def test_bus_off_and_back_are_events() -> None:
+    watch, tally = BusWatch(), Tally(Clock())
+    watch.look(errors(BUS_OFF, BUS_OFF), tally)
+    watch.look(errors(RESTARTED), tally)
+    watch.look(errors(BUS_OFF), tally)
+    watch.look(empty_frames(3), tally)  # ordinary frames: it must be back
+    watch.look(empty_frames(3), tally)
+    assert [event.text for event in tally.events.flush()] == [
+        "bus-off: the controller left the bus",
+        "the controller is back on the bus",
+        "bus-off: the controller left the bus",
+        "the controller is back on the bus",
+    ]
+    assert tally.counts.error_frames == 4
+
+
+def test_error_classes_are_spelt_out() -> None:
+    watch, tally = BusWatch(), Tally(Clock())
+    frames = errors(0x4 | 0x8, 0)
+    frames["data"][0, 1] = 0x01 | 0x08
+    watch.look(frames, tally)
+    assert [event.text for event in tally.events.take()] == [
+        (
+            "error frame: controller problem, protocol violation, receive buffer overflow, "
+            "transmission warning level"
+        ),
+        "error frame: no class given",
+    ]

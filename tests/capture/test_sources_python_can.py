@@ -1,0 +1,157 @@
+"""The generic path, over python-can's own in-process bus; what addresses may ask of it."""
+
+import can
+import numpy as np
+import pytest
+
+from capture.errors import SourceError, UsageError
+from capture.log.frames import DIR_RX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
+from capture.robot import ClockDomain
+from capture.sources.address import parse_address
+from capture.sources.can_interfaces import DEVICE_TIME, LISTEN_ONLY, NO_CONTROLLER, known_options
+from capture.sources.can_source import open_can
+from capture.sources.python_can import bus_class, failure, frames_of
+from capture.sources.registry import open_source
+
+
+def message_of(frame) -> can.Message:
+    flags, length = int(frame["id_flags"]), int(frame["dlc"])
+    return can.Message(
+        arbitration_id=flags & ID_MASK,
+        is_extended_id=bool(flags & EXTENDED_FLAG),
+        is_remote_frame=bool(flags & REMOTE_FLAG),
+        dlc=length,
+        data=None if flags & REMOTE_FLAG else frame["data"][:length].tolist(),
+        timestamp=int(frame["t_device_ns"]) / 1e9,
+        check=True,
+    )
+
+
+@pytest.fixture
+def bus():
+    with can.Bus(
+        interface="virtual", channel="snake", ignore_config=True, preserve_timestamps=True
+    ) as bus:
+        yield bus
+
+
+def source_at(query: str = ""):
+    return open_source(parse_address(f"can:virtual:snake{query}"))
+
+
+def test_twenty_thousand_frames_arrive_as_sent(bus, listen, traffic, same) -> None:
+    truth = traffic(20_000)
+    heard = listen(source_at())
+    heard.until_event("connected to virtual snake (never transmits)")
+    for start in range(0, len(truth), 500):
+        for frame in truth[start : start + 500]:
+            bus.send(message_of(frame))
+        heard.poll()
+    found = heard.until_frames(len(truth))
+    assert same(found, truth)
+    assert heard.source.clock is ClockDomain.HOST
+    assert np.array_equal(found["t_device_ns"], found["t_host_ns"])
+    assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
+    assert set(found["dir"].tolist()) == {DIR_RX}
+    assert heard.source.counts.frames == 20_000
+    heard.source.stop()
+    assert bus.recv(0) is None  # it sent nothing
+
+
+def test_the_devices_times_to_the_microsecond(bus, listen, traffic) -> None:
+    truth = traffic(2000)
+    heard = listen(source_at("?device_time=1&preserve_timestamps=1"))
+    heard.until_event("connected")
+    assert heard.source.clock is ClockDomain.DEVICE
+    for frame in truth:
+        bus.send(message_of(frame))
+    found = heard.until_frames(2000)
+    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+
+
+def test_a_driver_without_times_gets_those_of_arrival() -> None:
+    messages = [(123, can.Message(timestamp=0.0)), (456, can.Message(timestamp=1.5))]
+    frames = frames_of(messages, device_time=True)
+    assert frames["t_device_ns"].tolist() == [123, 1_500_000_000]
+
+
+def test_error_frames_and_can_fd_frames(bus, listen) -> None:
+    heard = listen(source_at())
+    heard.until_event("connected")
+    bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=[0] * 8))
+    bus.send(can.Message(arbitration_id=1, is_fd=True, data=[1] * 64))
+    bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=[7]))
+    found = heard.until_frames(2)
+    assert found["id_flags"].tolist() == [ERROR_FLAG | 0x40, 0x123]
+    assert heard.source.counts.error_frames == 1
+    assert heard.source.counts.malformed == 0
+    heard.until_event("CAN FD frame left out")
+    heard.until_event("bus-off")
+    heard.until_event("back on the bus")
+
+
+def test_a_bus_that_fails_is_opened_again(listen, context) -> None:
+    """The driver is closed under the reading thread: what an unplugged adapter looks like."""
+    heard = listen(source_at())
+    heard.until_event("connected")
+    heard.source._link._bus.shutdown()
+    heard.until_event("lost virtual snake")
+    heard.until_event("is back after")
+    assert heard.source.counts.reconnects == 1
+    with can.Bus(interface="virtual", channel="snake", ignore_config=True) as bus:
+        bus.send(can.Message(arbitration_id=5, is_extended_id=False))
+        assert heard.until_frames(1)["id_flags"].tolist() == [5]
+
+
+def test_options_are_converted_and_unknown_ones_refused(context) -> None:
+    with pytest.raises(UsageError, match=r"no option 'rx_queue'.*did you mean rx_queue_size"):
+        source_at("?rx_queue=5")
+    with pytest.raises(UsageError, match="no listen-only for virtual; it does for cantact, kvaser"):
+        source_at("?listen_only=1")
+    with pytest.raises(UsageError, match="state LOUD is not valid; valid: ACTIVE, PASSIVE, ERROR"):
+        open_source(parse_address("can:pcan:PCAN_USBBUS1?state=LOUD"))
+    with pytest.raises(UsageError, match="fd=maybe is neither 1 nor 0"):
+        open_source(parse_address("can:pcan:PCAN_USBBUS1?fd=maybe"))
+    source = open_source(parse_address("can:udp_multicast:239.74.163.2?receive_own_messages=1"))
+    with pytest.raises(SourceError, match=r"can:udp_multicast.*receive"):
+        source.start(context)
+    assert source.finished
+
+
+def test_unknown_interfaces_list_those_there_are() -> None:
+    with pytest.raises(UsageError, match=r"no CAN interface 'socketcam'.*did you mean socketcand?"):
+        open_source(parse_address("can:socketcam:can0"))
+    with pytest.raises(UsageError, match="no channel"):
+        open_source(parse_address("can:pcan"))
+    with pytest.raises(UsageError, match=r"ip link set can0 up type can bitrate 500000"):
+        open_source(parse_address("can:socketcan:can0?bitrate=500000"))
+
+
+def test_an_interface_that_can_not_be_loaded_says_why(context) -> None:
+    with pytest.raises(SourceError, match="python-can can't load canalystii: No module named"):
+        open_source(parse_address("can:canalystii:0"))
+    source = open_source(parse_address("can:kvaser:0"))
+    with pytest.raises(SourceError, match="can:kvaser:0: "):
+        source.start(context)
+
+
+@pytest.mark.parametrize("interface", sorted(LISTEN_ONLY))
+def test_listen_only_options_are_ones_that_the_interface_knows(interface) -> None:
+    try:
+        bus = bus_class("x", interface)
+    except SourceError as error:
+        pytest.skip(str(error))
+    source = open_can(parse_address(f"can:{interface}:0"))
+    assert source.facts["listen_only"] == "yes"
+    assert set(LISTEN_ONLY[interface]) <= known_options(bus) | {"listen_only"}
+
+
+def test_the_tables_name_interfaces_that_exist() -> None:
+    assert set(LISTEN_ONLY) | NO_CONTROLLER | DEVICE_TIME <= set(can.VALID_INTERFACES)
+
+
+def test_a_drivers_error_is_a_lost_connection() -> None:
+    error = failure(can.CanOperationError("the cable", 19))
+    assert isinstance(error, OSError)
+    assert "the cable" in str(error)
+    assert failure(RuntimeError()).strerror == "RuntimeError"

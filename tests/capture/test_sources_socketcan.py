@@ -1,0 +1,188 @@
+"""The kernel's frames and messages, through real sockets of a family that is always there.
+
+A raw CAN socket needs a kernel with CAN. What is read from it, the layout of ``struct can_frame``,
+the control messages with the time and the count of drops, is the same on any datagram socket; the
+frames are packed by python-can.
+"""
+
+import socket
+import time
+
+import can
+import numpy as np
+import pytest
+from can.interfaces.socketcan.socketcan import build_can_frame
+
+from capture.errors import SourceError
+from capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
+from capture.robot import ClockDomain
+from capture.sources.address import parse_address
+from capture.sources.events import Tally
+from capture.sources.receive_many import (
+    SO_RXQ_OVFL,
+    SO_TIMESTAMPNS,
+    ArrivalClock,
+    Batch,
+    ReceiveMany,
+)
+from capture.sources.registry import open_source
+from capture.sources.socketcan import SocketcanLink, frames_of
+
+
+def packed(frame) -> bytes:
+    flags, length = int(frame["id_flags"]), int(frame["dlc"])
+    return build_can_frame(
+        can.Message(
+            arbitration_id=flags & ID_MASK,
+            is_extended_id=bool(flags & EXTENDED_FLAG),
+            is_remote_frame=bool(flags & REMOTE_FLAG),
+            is_error_frame=bool(flags & ERROR_FLAG),
+            dlc=length,
+            data=None if flags & REMOTE_FLAG else frame["data"][:length].tolist(),
+        )
+    )
+
+
+@pytest.fixture
+def pair():
+    """A bound datagram socket that stamps and counts drops, and one connected to it."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs,
+    ):
+        ours.bind(("127.0.0.1", 0))
+        ours.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        ours.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        theirs.connect(ours.getsockname())
+        yield ours, theirs
+
+
+def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same) -> None:
+    ours, theirs = pair
+    truth = traffic(20_000)
+    tally = Tally(time.time_ns)
+    link = SocketcanLink(ours, tally)
+    found = []
+    for start in range(0, len(truth), 50):
+        for frame in truth[start : start + 50]:
+            theirs.send(packed(frame))
+        found += link.read(0)
+    frames = np.concatenate(found)
+    assert same(frames, truth)
+    assert set(frames["dir"].tolist()) == {DIR_RX}
+    assert np.array_equal(frames["t_device_ns"], frames["t_host_ns"])
+    assert (np.diff(frames["t_host_ns"].astype(np.int64)) >= 0).all()
+    assert tally.counts.malformed == 0
+    assert tally.counts.dropped is None
+    link.close()
+
+
+def test_drops_are_those_that_the_kernel_counts(pair, traffic) -> None:
+    ours, theirs = pair
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    frame = packed(traffic(1)[0])
+    tally = Tally(time.time_ns)
+    link = SocketcanLink(ours, tally)
+    got = 0
+    for _ in range(3):
+        for _ in range(500):
+            theirs.send(frame)
+        got += sum(map(len, link.read(0)))
+    theirs.send(frame)  # the count comes with the next packet that finds room
+    got += sum(map(len, link.read(0)))
+    assert 0 < got < 1501
+    assert tally.counts.dropped == 1501 - got
+    assert "dropped by the kernel" in tally.events.flush()[0].text
+    link.close()
+
+
+def test_arrival_is_the_kernels(pair, traffic) -> None:
+    ours, theirs = pair
+    link = SocketcanLink(ours, Tally(time.time_ns))
+    before_ns = time.time_ns()
+    theirs.send(packed(traffic(1)[0]))
+    after_ns = time.time_ns()
+    time.sleep(0.02)
+    (frames,) = link.read(0)
+    slack_ns = 1_000_000
+    assert before_ns - slack_ns <= int(frames["t_host_ns"][0]) <= after_ns + slack_ns
+    link.close()
+
+
+def test_can_fd_frames_and_what_is_no_frame(pair, traffic, same) -> None:
+    ours, theirs = pair
+    truth = traffic(2)
+    tally = Tally(time.time_ns)
+    link = SocketcanLink(ours, tally)
+    theirs.send(packed(truth[0]))
+    theirs.send(build_can_frame(can.Message(is_fd=True, data=[1] * 24)))
+    for odd in (b"", b"x" * 15, b"x" * 200):
+        theirs.send(odd)
+    theirs.send(packed(truth[1]))
+    (frames,) = link.read(0)
+    assert same(frames, truth)
+    assert tally.counts.malformed == 3
+    assert "CAN FD frame left out" in [event.text for event in tally.events.flush()]
+    link.close()
+
+
+def test_frames_of_this_computer_are_told_apart(traffic) -> None:
+    raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
+    batch = Batch(
+        packets=raw,
+        sizes=np.array([16, 16]),
+        flags=np.array([0, socket.MSG_DONTROUTE], dtype=np.int32),
+        stamps_ns=np.array([5, 6]),
+        drops=None,
+    )
+    frames = frames_of(batch, np.array([5, 6], dtype=np.uint64))
+    assert frames["dir"].tolist() == [DIR_RX, DIR_TX]
+
+
+def test_a_socket_that_fails_is_a_lost_connection(pair) -> None:
+    ours, _ = pair
+    link = SocketcanLink(ours, Tally(time.time_ns))
+    link.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        link.read(0)
+
+
+def test_more_packets_than_fit_one_call(pair) -> None:
+    ours, theirs = pair
+    receive = ReceiveMany(8, 16)
+    for number in range(20):
+        theirs.send(bytes([number]) * (number % 5))
+    sizes, firsts = [], []
+    while len(batch := receive.receive(ours.fileno()).sizes):
+        sizes += batch.tolist()
+        firsts.append(len(batch))
+    assert sizes == [number % 5 for number in range(20)]
+    assert firsts == [8, 8, 4]
+
+
+def test_a_wall_clock_that_is_set_can_not_move_arrivals_beyond_what_is_known() -> None:
+    start_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+    clock = ArrivalClock(lambda: 10**18 + time.monotonic_ns() - start_ns)
+    now = 10**18 + time.monotonic_ns() - start_ns
+    hour = 3600 * 10**9
+    stamps = np.array([time.time_ns(), wall_ns + hour, wall_ns - hour, 0])
+    for stamp in stamps:
+        (t_ns,) = clock.times(np.array([stamp]), now - 1_000_000).tolist()
+        later = 10**18 + time.monotonic_ns() - start_ns
+        assert now - 1_000_000 <= t_ns <= later
+    mixed = clock.times(stamps, 0)
+    assert (np.diff(mixed.astype(np.int64)) >= 0).all()
+
+
+def test_a_kernel_without_can_says_so(context) -> None:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        with pytest.raises(SourceError, match="this computer's kernel offers no CAN sockets"):
+            open_source(parse_address("can:socketcan:can0"))
+        return
+    source = open_source(parse_address("can:socketcan:nosuchcan0?directions=1"))
+    assert source.clock is ClockDomain.HOST
+    source.start(context)
+    assert "waits for nosuchcan0" in source.poll().events[0].text
+    source.stop()
