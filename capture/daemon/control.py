@@ -31,6 +31,7 @@ BUDGET_NS = 1_000_000
 """After so long in one poll the remaining requests wait for the next one [ns]."""
 
 _READ = 16 * 1024
+_MOST_FAULTS = 8
 _TOO_LONG = f"a request is longer than {BUFFER} bytes"
 
 Reply = Mapping[str, Any]
@@ -74,8 +75,8 @@ class ControlServer:
 
         Args:
             path: Where; its folder must be there.
-            handler: Does what is asked. What it raises of :class:`UndulogError` is the reply's
-                ``error``; other exceptions are mistakes and come out of :meth:`poll`.
+            handler: Does what is asked. What it raises is the reply's ``error``; what is no
+                :class:`UndulogError` is a mistake of ours and told by :meth:`take_faults` too.
 
         Raises:
             ControlError: If another recorder listens there, something else is in the way, or the
@@ -84,6 +85,7 @@ class ControlServer:
         self.path = path
         self.requests = 0
         """Requests answered so far."""
+        self._faults: list[str] = []
         self._handler = handler
         self._listener, self._identity = listen(path, backlog=MAX_CLIENTS)
         self._selector = selectors.DefaultSelector()
@@ -96,6 +98,15 @@ class ControlServer:
     def clients(self) -> int:
         """Number of connections."""
         return len(self._clients)
+
+    def take_faults(self) -> tuple[str, ...]:
+        """Mistakes of ours that requests brought to light since the last call.
+
+        Returns:
+            One sentence each.
+        """
+        faults, self._faults = tuple(self._faults), []
+        return faults
 
     def poll(self) -> None:
         """Take and answer what has come; returns at once."""
@@ -206,11 +217,15 @@ class ControlServer:
             return _refusal('a request is a JSON object such as {"do": "status"}')
         try:
             reply = self._handler(cast("dict[str, Any]", request))
+            if isinstance(reply, _Later):
+                return reply
+            data = _line({"ok": True, **reply})
         except UndulogError as error:
             return _refusal(str(error))
-        if isinstance(reply, _Later):
-            return reply
-        data = _line({"ok": True, **reply})
+        except Exception as error:  # noqa: BLE001 - the recording goes on, whatever was asked
+            if len(self._faults) < _MOST_FAULTS:
+                self._faults.append(f"a request failed with {error!r}: {line[:80]!r}")
+            return _refusal(f"a mistake of the recorder's own: {error!r}")
         return data if len(data) <= BUFFER else _refusal(f"the reply has {len(data)} bytes")
 
     def _send(self, client: _Client) -> None:

@@ -38,6 +38,8 @@ def echo(request):
         raise DataError("not now")
     if request.get("do") == "big":
         return {"text": "x" * request["size"]}
+    if request.get("do") == "mistake":
+        return {"value": float("nan")} if request.get("nan") else {}["none"]
     if request.get("do") == "later":
         return LATER
     return {"got": dict(request)}
@@ -156,6 +158,19 @@ def test_a_bad_request_gets_an_error_and_the_connection_lives(server, line, why)
         assert not bad["ok"]
         assert why in bad["error"]
         assert good["ok"]
+
+
+def test_a_mistake_of_ours_is_told_and_ends_nothing(server):
+    with connected(server) as client:
+        client.sendall(b'{"do": "mistake"}\n{"do": "mistake", "nan": true}\n{"do": "x"}\n')
+        first, second, third = drain(server, client, 3)
+        assert "KeyError" in first["error"]
+        assert "ValueError" in second["error"]
+        assert third["ok"]
+    told = server.take_faults()
+    assert len(told) == 2
+    assert all("mistake" in text for text in told)
+    assert server.take_faults() == ()
 
 
 @given(st.binary(max_size=400))
