@@ -15,6 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -44,6 +45,7 @@ JOINT_TOPIC: dict[Quantity, str] = {
 """Topic of each quantity of a joint when it has frames or rows of its own."""
 
 _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+_SCALAR = (SensorKind.IR, SensorKind.SONAR)
 _STAMPS_KEPT = 10_000
 _NS = 1_000_000_000
 
@@ -93,6 +95,7 @@ class DecodedTopics:
             for topics in _groups_of(decoder, joints)
         ]
         self._sensors = [_SensorTopic(writer, sensor) for sensor in robot.sensors]
+        self._sensor_targets = _Targets([sensor.name for sensor in robot.sensors])
 
     def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
         """Take the samples of one block of frames.
@@ -106,13 +109,24 @@ class DecodedTopics:
         messages: list[Message] = []
         for group in self._groups:
             messages += group.add(samples)
-        for sensor in self._sensors:
-            messages += sensor.add(samples)
+        pieces: dict[int, list[_Piece]] = {}
+        for decoded in samples:
+            for member, sensor in self._sensor_targets.members(decoded.signals):
+                own = decoded.member == member
+                column = "xyz".index(decoded.signals[0].axis or "x")
+                piece = (column, decoded.rows[own], decoded.t_ns[own], decoded.values[own])
+                pieces.setdefault(sensor, []).append(piece)
+        for sensor, own_pieces in pieces.items():
+            messages += self._sensors[sensor].messages(own_pieces)
         return messages
 
     def finish(self) -> list[Message]:
         """The messages that waited for more samples."""
         return [message for group in self._groups for message in group.finish()]
+
+
+_Piece: TypeAlias = tuple[int, IntArray, IntArray, FloatArray]
+"""Samples of one axis of a sensor: column, rows, times [Unix ns], values."""
 
 
 class _Targets:
@@ -121,6 +135,16 @@ class _Targets:
     def __init__(self, targets: Sequence[str]) -> None:
         self._index = {target: k for k, target in enumerate(targets)}
         self._known: dict[int, tuple[tuple[BusSignal, ...], IntArray]] = {}
+        self._members: dict[int, list[tuple[int, int]]] = {}
+
+    def members(self, signals: tuple[BusSignal, ...]) -> list[tuple[int, int]]:
+        """Member and target of each entry whose target is ours."""
+        found = self._members.get(id(signals))
+        if found is None:
+            index: list[int] = self.index(signals).tolist()
+            found = [(member, target) for member, target in enumerate(index) if target >= 0]
+            self._members[id(signals)] = found
+        return found
 
     def of(self, decoded: DecodedSignals) -> IntArray:
         """Index of each sample's target, -1 for others, shape (n,)."""
@@ -342,35 +366,27 @@ class _SensorTopic:
 
     def __init__(self, writer: SessionWriter, sensor: Sensor) -> None:
         self._writer, self._sensor = writer, sensor
-        self._targets = _Targets([sensor.name])
         self._write: Callable[[FloatArray, int, int], None] | None = None
 
-    def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
+    def messages(self, pieces: Sequence[_Piece]) -> list[Message]:
         """Values of one frame side by side, one message a frame."""
-        pieces: list[tuple[int, IntArray, IntArray, FloatArray]] = []
-        for decoded in samples:
-            index = self._targets.index(decoded.signals)
-            if (index < 0).all():
-                continue
-            own = index[decoded.member] >= 0
-            if own.any():
-                column = "xyz".index(decoded.signals[0].axis or "x")
-                pieces.append((column, decoded.rows[own], decoded.t_ns[own], decoded.values[own]))
-        if not pieces:
+        if not any(len(rows) for _, rows, _, _ in pieces):
             return []
         if self._write is None:
             self._write = _open_sensor(self._writer, self._sensor)
         write, topic = self._write, self._sensor.topic
-        t_ns, values = _side_by_side(pieces)
+        if len(pieces) == 1 and self._sensor.kind in _SCALAR:
+            _, _, t_ns, row = pieces[0]
+            values = row[:, None]
+        else:
+            t_ns, values = _side_by_side(pieces)
         return [
             Message(topic, t, partial(write, row, t))
             for t, row in zip(t_ns.tolist(), values, strict=True)
         ]
 
 
-def _side_by_side(
-    pieces: Sequence[tuple[int, IntArray, IntArray, FloatArray]],
-) -> tuple[IntArray, FloatArray]:
+def _side_by_side(pieces: Sequence[_Piece]) -> tuple[IntArray, FloatArray]:
     """Times [Unix ns], shape (n,), and values, NaN where missing, shape (n, 3), one row a frame."""
     first = pieces[0][1]
     shared = all(np.array_equal(rows, first) for _, rows, _, _ in pieces[1:])
