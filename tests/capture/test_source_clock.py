@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import socket
+import struct
+import subprocess
+import sys
+import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -255,7 +261,7 @@ def test_whatever_a_device_says_times_stay_in_order_and_before_their_arrival(
     st.integers(0, 2**62),
     st.integers(0, 99),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_any_quartz_and_any_load_converge(
     drift_ppm: float, mean_s: float, least_s: float, device_zero: int, seed: int
 ) -> None:
@@ -309,3 +315,54 @@ def test_metadata_is_text_and_leaves_out_what_is_unknown() -> None:
     assert facts["can0.samples"] == "2"
     assert "can0.drift_ppm" not in facts
     assert clock.pair() == (200, EPOCH_NS + 100)
+
+
+# -- two real clocks ---------------------------------------------------------------------------
+
+SENDER = """
+import socket, struct, sys, time
+out = socket.socket(fileno=int(sys.argv[1]))
+for k in range(3000):
+    time.sleep(0.001)
+    true_ns, raw_ns = time.monotonic_ns(), time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+    out.send(struct.pack("<QQ", true_ns, raw_ns + raw_ns // 12500))
+"""
+
+
+@pytest.mark.slow
+def test_another_process_with_another_clock_over_a_real_socket() -> None:
+    """The kernel's raw clock, 80 ppm faster, against its steered one; the sender knows both."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    clock = SourceClock()
+    true: list[int] = []
+    host: list[int] = []
+    mapped_ns: list[int] = []
+    command = [sys.executable, "-c", SENDER, str(theirs.fileno())]
+    # Our end is closed first, whatever happens: a sender that waits for room ends then.
+    with subprocess.Popen(command, pass_fds=(theirs.fileno(),)) as sender, ours:
+        theirs.close()
+        ended = False
+        while not ended:
+            time.sleep(0.005)
+            ours.settimeout(60)
+            batch = [ours.recv(16)]
+            ours.setblocking(False)
+            with suppress(BlockingIOError):
+                while batch[-1]:
+                    batch.append(ours.recv(16))
+            ended = not batch[-1]
+            pairs = [struct.unpack("<QQ", data) for data in batch if data]
+            now = np.full(len(pairs), time.monotonic_ns())
+            true += [pair[0] for pair in pairs]
+            host += now.tolist()
+            mapped_ns += clock.add(np.array([pair[1] for pair in pairs]), now).tolist()
+    assert sender.returncode == 0
+    assert len(true) == 3000
+    t_ns, host_ns = np.array(mapped_ns), np.array(host)
+    holds(t_ns, host_ns)
+    late_s = (t_ns - np.array(true))[1000:] / NS
+    waited_s = (host_ns - np.array(true))[1000:] / NS
+    assert late_s.min() > -0.001
+    assert np.median(late_s) < np.median(waited_s)
+    assert late_s.std() < waited_s.std()
+    assert clock.result().resets == 0
