@@ -207,16 +207,11 @@ class ControlServer:
 
     def _reply(self, line: bytes) -> bytes | _Later:
         self.requests += 1
-        if len(line) > BUFFER:
-            return _refusal(_TOO_LONG)
+        request = _request(line)
+        if isinstance(request, str):
+            return _refusal(request)
         try:
-            request = json.loads(line, parse_constant=_no_constant)
-        except (ValueError, RecursionError) as error:
-            return _refusal(f"not JSON: {error}")
-        if not isinstance(request, dict):
-            return _refusal('a request is a JSON object such as {"do": "status"}')
-        try:
-            reply = self._handler(cast("dict[str, Any]", request))
+            reply = self._handler(request)
             if isinstance(reply, _Later):
                 return reply
             data = _line({"ok": True, **reply})
@@ -280,6 +275,19 @@ def _lines(client: _Client) -> Iterator[bytes]:
 def _has_request(client: _Client) -> bool:
     # The last request of a client that has ended may lack its newline.
     return b"\n" in client.incoming or (client.ended and bool(client.incoming))
+
+
+def _request(line: bytes) -> dict[str, Any] | str:
+    """The request, or what is wrong with the line."""
+    if len(line) > BUFFER:
+        return _TOO_LONG
+    try:
+        request = json.loads(line, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        return f"not JSON: {error}"
+    if not isinstance(request, dict):
+        return 'a request is a JSON object such as {"do": "status"}'
+    return cast("dict[str, Any]", request)
 
 
 def _no_constant(name: str) -> None:
