@@ -29,6 +29,9 @@ from .source_clock import SourceClock
 HORIZON_S = 60
 """How far the stamps of a running recording may go back [s]: what is older is summed up."""
 
+PIECE = 1 << 17
+"""Bytes of messages that are looked at in one go, about: raw frames come in hundreds of kB."""
+
 ROUND_NS = 1_000_000_000
 """How often all channels are looked at [ns]."""
 
@@ -120,9 +123,9 @@ class LiveHealth:
         self._pending[channel_id].append((log_time_ns, sequence, payload))
 
     def step(self, now_ns: int) -> None:
-        """Look at the messages of one channel, if a second has gone by since all were looked at.
+        """Look at messages of one channel, if a second has gone by since all were looked at.
 
-        To be called every tick: a second's work is spread over as many ticks as there are
+        To be called every tick: a second's work is spread over about as many ticks as there are
         channels.
 
         Args:
@@ -150,7 +153,10 @@ class LiveHealth:
         self._end_round(now_ns)
 
     def _begin_round(self) -> None:
-        self._round = list(self._pending.items())
+        self._round = [
+            (key, part) for key, messages in self._pending.items() for part in _pieces(messages)
+        ]
+        self._round.reverse()  # they are taken from the end
         self._pending = defaultdict(list)
         self._in_round = True
 
@@ -263,3 +269,10 @@ class LiveHealth:
             load=self._scan.last_load(topic) if buses else None,
             clock=clock.result() if clock is not None and clock.pair() is not None else None,
         )
+
+
+def _pieces(messages: list[_Message]) -> list[list[_Message]]:
+    """Messages in their order, in pieces of about equal numbers."""
+    count = -(-sum(len(payload) for _, _, payload in messages) // PIECE) or 1
+    size = -(-len(messages) // count)
+    return [messages[start : start + size] for start in range(0, len(messages), size)]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mcap.records import Metadata
 
 from capture import SessionWriter, load_robot
+from capture.daemon import live_health
 from capture.daemon.live_health import LiveHealth
 from capture.daemon.tapped_sink import TappedSink
 from capture.log.diagnostics import OK, DiagnosticStatus
@@ -170,6 +171,13 @@ def test_a_clean_recording_is_good(tmp_path: Path) -> None:
     live = record(tmp_path / "s.mcap", NOTHING)
     assert (live.verdict, live.reasons) == ("good", ())
     assert live.sources[0].name == "can0"
+
+
+def test_pieces_keep_the_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_health, "PIECE", 2000)
+    wrong = replace(NOTHING, back=0.01, nan=0.002, lost=0.01, updates=1.0)
+    live = record(tmp_path / "s.mcap", wrong)
+    assert without_rounding(live) == without_rounding(check_session(tmp_path / "s.mcap"))
 
 
 def test_frames_lost_before_the_recorder_are_held_against_the_session(tmp_path: Path) -> None:
