@@ -18,6 +18,12 @@ from capture.errors import MissingExtraError, UndulogError
 
 VERBS: dict[str, tuple[str, str]] = {
     "record": ("capture.record_cli:record", "Record a robot, or its twin, into a session."),
+    "record status": ("capture.record_control:status", "Say how the running recordings go."),
+    "record mark": ("capture.record_control:mark", "Mark this moment of the running recording."),
+    "record note": ("capture.record_control:note", "Write a remark into the running recording."),
+    "record split": ("capture.record_control:split", "Have it begin a new part."),
+    "record stop": ("capture.record_control:stop", "End the running recording in good order."),
+    "record unit": ("capture.record_control:unit", "Print a systemd unit for recordings."),
     "import": ("capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
     "log info": ("capture.log_info:log_info", "Say what a log holds."),
     "log check": (
