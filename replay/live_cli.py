@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from capture.console import emit_json
 
@@ -47,8 +48,18 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
             report = relay_to_viewer(path, window, window.address)
     if json:
         emit_json(_facts(report, save))
-        return
-    _tell(report, save)
+    else:
+        _tell(report, save)
+    if connect is not None and report.complaint:
+        _leave(report.complaint)
+
+
+def _leave(complaint: str) -> NoReturn:
+    """End the process at once: Rerun would wait at its end for a viewer that takes nothing."""
+    sys.stdout.flush()
+    sys.stderr.write(f"error: {complaint}\n")
+    sys.stderr.flush()
+    os._exit(1)
 
 
 def _tell(report: RelayReport, save: Path | None) -> None:

@@ -1,7 +1,8 @@
 """The relay's end of the live feed: a socket that is read at once, and a bounded queue.
 
 A thread reads the socket, so that a slow picture doesn't fill it; when the queue is full the oldest
-messages go.
+messages go. It looks a hundred times a second rather than waits: to wake a process that waits is
+what makes a send dear, and the recorder would pay for it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import NamedTuple, Self
 from capture.daemon.live_wire import MAX_DATAGRAM, DatagramHead, Kind, read_head
 from capture.errors import DataError, UsageError
 
-_LOOK_S = 0.2
+_LOOK_S = 0.01
 
 
 class Datagram(NamedTuple):
@@ -99,7 +100,8 @@ class Inbox:
         while not self._ending.is_set():
             try:
                 data = self._socket.recv(MAX_DATAGRAM)
-            except TimeoutError:
+            except BlockingIOError:
+                self._ending.wait(_LOOK_S)
                 continue
             try:
                 head = read_head(data)
@@ -138,7 +140,7 @@ def _bind(path: Path) -> tuple[socket.socket, int]:
     if path.is_socket() and _answers(path):
         raise UsageError(f"{path}: another live view reads there")
     link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    link.settimeout(_LOOK_S)
+    link.setblocking(False)
     # Bound under another name, closed to others, then renamed: nobody finds it open before.
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     try:

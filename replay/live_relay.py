@@ -13,14 +13,14 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
 from capture.daemon.live_wire import Kind, LiveMessage, read_records
-from capture.errors import DataError, LogWriteError, UndulogError
+from capture.errors import DataError, LogWriteError
 from capture.interruption import StopRequest, interruptible
 from capture.part_file import part_file
 
@@ -37,8 +37,12 @@ SILENCE_S = 10.0
 """A feed that says nothing for so long has ended; a living one repeats its definitions [s]."""
 
 _LAGS_KEPT = 100_000
+_FLUSH_S = 1.0
 _GRACE_S = 3.0
 _LOOK_S = 0.05
+
+_HELD: list[LiveStream] = []
+"""Streams whose viewer takes nothing: to let go of one would wait for it."""
 
 Connect = Callable[[rr.RecordingStream], None]
 """Gives a recording stream its sink."""
@@ -55,6 +59,7 @@ class RelayReport:
         unread: Messages and datagrams that could not be read.
         lag_s: From the recorder's taking a message to Rerun's taking what was drawn of it [s]:
             median, 99th percentile and largest of the last messages; None where there was none.
+        complaint: Why the viewer did not take all of it; empty where it did.
     """
 
     sessions: tuple[str, ...]
@@ -62,6 +67,7 @@ class RelayReport:
     dropped: int
     unread: int
     lag_s: tuple[float, float, float] | None
+    complaint: str = ""
 
 
 class Relay:
@@ -84,6 +90,7 @@ class Relay:
         self._scene: LiveScene | None = None
         self._rec: LiveStream | None = None
         self._heard_at = time.monotonic()
+        self._complaint = ""
         self._shown = self._refused = 0
         self._unread_before = self._dropped_before = self._dropped = 0
         self._lags: deque[float] = deque(maxlen=_LAGS_KEPT)
@@ -102,6 +109,7 @@ class Relay:
             dropped=self._not_shown + self._dropped_before,
             unread=self._refused + self._inbox.refused + self._log.unread + self._unread_before,
             lag_s=lag_s,
+            complaint=self._complaint,
         )
 
     @property
@@ -132,12 +140,18 @@ class Relay:
             self._end()
 
     def close(self) -> None:
-        """Hand over what is left; waits for Rerun."""
+        """Hand over what is left; waits for Rerun, but not for long."""
         self._end()
-        if self._rec is not None:
-            self._rec.flush()
-            self._rec.disconnect()
-            self._rec = None
+        if self._rec is None:
+            return
+        try:
+            self._rec.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError as error:
+            self._complaint = f"the viewer did not take the last of it: {error}"
+            _HELD.append(self._rec)
+            return
+        self._rec.disconnect()
+        self._rec = None
 
     def _silent_s(self) -> float:
         return time.monotonic() - self._heard_at
@@ -229,7 +243,7 @@ def relay_to_viewer(path: Path, viewer: LiveViewer | None, address: str) -> Rela
 
     Raises:
         UsageError: If the socket can't be made.
-        UndulogError: If drawing fails.
+        UndulogError: If a sink can't be made.
     """
     with interruptible() as request, Inbox(path) as inbox:
         relay = Relay(inbox, lambda rec: rec.connect_grpc(address))
@@ -306,5 +320,5 @@ def _run(
     if painter.error is not None:
         raise painter.error
     if painter.is_alive():
-        raise UndulogError("the viewer takes no data; the live view ends without it")
+        return replace(relay.report, complaint="the viewer takes no data")
     return relay.report

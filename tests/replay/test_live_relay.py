@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -473,6 +475,53 @@ def test_frozen_and_killed_viewer_costs_the_feed_nothing(stage, server):
     relay.process.send_signal(signal.SIGTERM)
     relay.process.communicate(timeout=WAIT_S)
     assert not stage.path.exists()
+
+
+@pytest.mark.slow
+def test_relay_of_a_frozen_viewer_can_be_ended(stage, server):
+    address, process = server
+    recorder, relay = stage.recorder(), stage.relay(None, "--connect", address)
+    recorder.connect()
+    recorder.send(0.0, 1.0)
+    freeze(process.pid)
+    recorder.send(1.0)
+    relay.process.send_signal(signal.SIGTERM)
+    out, err = relay.process.communicate(timeout=WAIT_S)
+    assert relay.process.returncode == 1
+    assert "messages shown, 0 dropped" in out
+    assert "the viewer did not take the last of it" in err
+
+
+@pytest.mark.slow
+def test_web_serves_this_machine_only_and_leaves_nothing(stage):
+    relay = stage.relay(None, "--web")
+    page = relay.process.stdout.readline().strip()
+    assert page.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(page, timeout=WAIT_S) as answer:
+        assert answer.status == 200
+    recorder = stage.recorder()
+    recorder.connect()
+    recorder.send(0.0, 1.0)
+    (child,) = (
+        Path(f"/proc/{relay.process.pid}/task/{relay.process.pid}/children").read_text().split()
+    )
+    ports = {int(text) for text in re.findall(r"(?:127.0.0.1:|127.0.0.1%3A)(\d+)", page)}
+    assert len(ports) == 2
+    assert listening(ports) == {(f"{0x0100007F:08X}", port) for port in ports}
+    relay.process.send_signal(signal.SIGINT)
+    relay.process.communicate(timeout=WAIT_S)
+    assert relay.process.returncode == 0
+    assert not Path(f"/proc/{child}").exists()
+    assert not stage.path.exists()
+
+
+def listening(ports):
+    """Address and port of all listening sockets at some ports."""
+    lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
+    lines += Path("/proc/net/tcp6").read_text().splitlines()[1:]
+    entries = [line.split() for line in lines]
+    local = [entry[1].split(":") for entry in entries if entry[3] == "0A"]
+    return {(address, int(port, 16)) for address, port in local if int(port, 16) in ports}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,205 @@
+"""What a live view costs the recorder: offering a message and the tick's pump.
+
+The same messages, 25 joints at the log contract's rates, are offered in real time in ticks of
+5 ms: to nobody, to a relay that draws to a file, to the same relay frozen, and to a relay whose
+viewer, Rerun's own gRPC server, is frozen. Printed are the cost of a message (tap and pump
+together, mean), of an offer alone, and of a pump (median, 99th percentile, largest).
+
+Run: python bench/live_view.py [--seconds 20]
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Metadata, Schema
+
+from capture import load_robot
+from capture.daemon.live_feed import LiveFeed
+from capture.log.cdr import encode, layout_of
+from capture.log.schemas import message_type, schema_text
+from replay.viewer import LOOPBACK, free_ports, viewer_binary
+
+TICK_S = 0.005
+RATE_HZ = 100
+TOPICS = (
+    "/joint_commands",
+    "/joint_states",
+    "/joint_current",
+    "/joint_voltage",
+    "/joint_temperature",
+)
+ROBOT = load_robot("snake25")
+
+Message = tuple[int, int, int, int, bytes]
+
+
+def define(feed: LiveFeed) -> None:
+    """Tell a feed what the messages are."""
+    name = "sensor_msgs/msg/JointState"
+    facts = {"session_id": f"bench-{os.urandom(4).hex()}", "epoch_ns": "1735689600000000000"}
+    feed.define(Metadata(name="undulog", metadata=facts))
+    feed.define(Schema(id=1, name=name, encoding="ros2msg", data=schema_text(name).encode()))
+    for number, topic in enumerate(TOPICS, start=1):
+        metadata = {"unit": "rad"}
+        feed.define(Channel(number, topic, "cdr", metadata, 1))
+
+
+def sample(number: int) -> list[Message]:
+    """The messages of one round of the bus."""
+    return [(k + 1, t, t, number, p) for k, t, p in ((k, *stamped(k, number)) for k in range(5))]
+
+
+def stamped(_topic: int, number: int) -> tuple[int, bytes]:
+    """Time and bytes of one message."""
+    t_ns = 1_735_689_600_000_000_000 + number * 1_000_000_000 // RATE_HZ
+    view = np.frombuffer(TEMPLATE, dtype="<f8", count=25, offset=LAYOUT.leaves["position"].offset)
+    view[:] = np.sin(number * 0.03 - np.arange(25) / 3.0)
+    sec, nanosec = divmod(t_ns, 1_000_000_000)
+    stamp = LAYOUT.leaves["header.stamp.sec"].offset
+    TEMPLATE[stamp : stamp + 8] = sec.to_bytes(4, "little") + nanosec.to_bytes(4, "little")
+    return t_ns, bytes(TEMPLATE)
+
+
+_KIND = message_type("sensor_msgs/msg/JointState")
+TEMPLATE = bytearray(
+    encode(
+        _KIND,
+        {
+            "name": list(ROBOT.joint_names),
+            "position": [0.0] * 25,
+            "velocity": [0.0] * 25,
+            "effort": [0.0] * 25,
+        },
+    )
+)
+LAYOUT = layout_of(_KIND, bytes(TEMPLATE))
+
+
+_rounds = itertools.count()
+
+
+def measure(feed: LiveFeed, seconds: float, label: str) -> None:
+    """Offer and pump in real time, and print what it cost."""
+    offers: list[int] = []
+    pumps: list[int] = []
+    count = 0
+    clock = time.perf_counter_ns
+    start = time.perf_counter()
+    ticks = round(seconds / TICK_S)
+    before = feed.counts.sent, feed.counts.dropped
+    for tick in range(ticks):
+        messages = sample(next(_rounds)) if tick % 2 == 0 else []
+        begun = clock()
+        for message in messages:
+            feed.offer(*message)
+        offered = clock()
+        feed.pump()
+        pumps.append(clock() - offered)
+        if messages:
+            offers.append((offered - begun) // len(messages))
+            count += len(messages)
+        time.sleep(max(start + (tick + 1) * TICK_S - time.perf_counter(), 0.0))
+    pump = np.array(pumps) / 1e3
+    p50, p99 = np.percentile(pump, [50, 99])
+    mean = (sum(offers) * len(TOPICS) + sum(pumps)) / count / 1e3
+    sent, dropped = feed.counts.sent - before[0], feed.counts.dropped - before[1]
+    print(
+        f"{label:28s} {mean:6.2f} us a message; offer {np.median(offers) / 1e3:5.2f} us; pump "
+        f"{p50:5.1f} / {p99:6.1f} / {pump.max():6.1f} us; {ticks} of {ticks} ticks; "
+        f"sent {sent}, dropped {dropped}",
+        flush=True,
+    )
+
+
+def relay(path: Path, *arguments: Any) -> subprocess.Popen[bytes]:
+    """A relay in a process of its own, ready."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "undulog", "view", "--live", path, *map(str, arguments)]
+    )
+    wait_for(path.is_socket)
+    return process
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError("nothing came within a minute")
+        time.sleep(0.01)
+
+
+def connect(feed: LiveFeed) -> None:
+    """Wait until the feed has found its relay, and the relay has drawn a little."""
+    define(feed)
+
+    def found() -> bool:
+        feed.pump()
+        return feed.connected
+
+    wait_for(found)
+
+
+def main() -> None:
+    """Measure all cases."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each case")
+    seconds = parser.parse_args().seconds
+    with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
+        path = Path(folder) / "live.sock"
+        feed = LiveFeed(path)
+        define(feed)
+        measure(feed, seconds, "nobody watches")
+        feed.close()
+
+        feed = LiveFeed(path)
+        process = relay(path, "--save", Path(folder) / "a.rrd", "--json")
+        try:
+            connect(feed)
+            measure(feed, seconds, "relay draws to a file")
+            os.kill(process.pid, signal.SIGSTOP)
+            measure(feed, seconds, "relay frozen")
+            os.kill(process.pid, signal.SIGCONT)
+            feed.close()
+            process.wait()
+        finally:
+            process.kill()
+            process.wait()
+
+        (port,) = free_ports(1)
+        server = subprocess.Popen(
+            [viewer_binary(), "--serve-grpc", "--bind", LOOPBACK, "--port", str(port)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        feed = LiveFeed(path)
+        process = relay(path, "--connect", f"rerun+http://{LOOPBACK}:{port}/proxy")
+        try:
+            connect(feed)
+            measure(feed, seconds, "relay draws in a viewer")
+            os.kill(server.pid, signal.SIGSTOP)
+            measure(feed, seconds, "viewer frozen")
+            os.kill(server.pid, signal.SIGKILL)
+            measure(feed, seconds, "viewer killed")
+        finally:
+            feed.close()
+            process.terminate()
+            process.wait()
+            server.kill()
+            server.wait()
+
+
+if __name__ == "__main__":
+    main()
