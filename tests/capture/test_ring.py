@@ -20,7 +20,8 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from capture import Session
-from capture.errors import LogWriteError
+from capture.daemon.ring_storage import RingStorage
+from capture.errors import LogWriteError, UsageError
 from capture.log.mcap_sink import McapSink
 from capture.log.ring_mark import MARK_RECORD
 from capture.log.ring_sink import MAX_WAITING, MESSAGE_OVERHEAD, RingSink
@@ -32,12 +33,16 @@ SECOND = 1000 * MS
 PATIENCE_S = 60.0
 
 
-def written(ring):
-    """Wait until every mark is written."""
+def until(condition):
     deadline = time.monotonic() + PATIENCE_S
-    while ring.waiting:
+    while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.002)
+
+
+def written(ring):
+    """The marks, once every one is written."""
+    until(lambda: not ring.waiting)
     return ring.take_marks()
 
 
@@ -356,3 +361,34 @@ def test_definitions_of_every_kind_come_back(tmp_path):
         (attachment,) = reader.iter_attachments()
         assert (attachment.name, attachment.data) == ("robot.toml", b"data")
     assert metadata(path)["undulog"] == {"session_id": "s"}
+
+
+def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):
+    folder = tmp_path / "out"
+    with pytest.raises(LogWriteError, match="doesn't exist"):
+        RingStorage(folder / "run.mcap", 1.5)
+    folder.mkdir()
+    storage = RingStorage(folder / "run.mcap", 1.5)
+    ring = defined(storage.sink)
+    for k in range(4):
+        ring.write(1, EPOCH_NS + k * SECOND, EPOCH_NS, k, b"x")
+    path = folder / "run_mark0001.mcap"
+    assert storage.mark("slipped") == {"file": str(path), "messages": 2, "seconds": 1.0}
+    with pytest.raises(UsageError, match="a ring has no parts"):
+        storage.split()
+    until(lambda: not ring.waiting)
+    storage.tick()
+    assert storage.size == path.stat().st_size
+    ((level, text),) = storage.take_events()
+    assert level == "info"
+    assert "run_mark0001.mcap is written: 2 messages" in text
+    shutil.rmtree(folder)
+    storage.mark()
+    until(lambda: not ring.waiting)
+    storage.tick()
+    ((level, text),) = storage.take_events()
+    assert level == "error"
+    assert "run_mark0002.mcap" in text
+    assert storage.files() == (path,)
+    assert (storage.messages, storage.unsynced) == (4, 2)
+    ring.close(())
