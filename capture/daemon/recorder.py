@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from select import select
 
 from ..errors import LogWriteError
 from ..interruption import StopRequest
@@ -180,7 +181,7 @@ class Recorder:
             tick += 1
             due_ns += TICK_NS
             if after_ns < due_ns:
-                time.sleep((due_ns - after_ns) / _NS)
+                select([], [], [], (due_ns - after_ns) / _NS)
             elif after_ns > due_ns + _NS:  # stopped for a while: ticks are not made up for
                 self.overruns += (after_ns - due_ns) // TICK_NS
                 due_ns = after_ns
