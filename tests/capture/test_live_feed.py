@@ -15,7 +15,6 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from capture.daemon import live_feed
 from capture.daemon.live_feed import LiveFeed
-from capture.daemon.live_tap import LiveTap
 from capture.daemon.live_wire import (
     MAX_DATAGRAM,
     MAX_MESSAGE,
@@ -477,34 +476,3 @@ def test_reader_frozen_killed_and_started_again_never_holds_a_tick(make, reader,
     pump_until(feed, lambda: feed.queued == 0)
     assert feed.counts.connections == 2
     assert ticks == 6100
-
-
-class Kept:
-    """Takes everything and remembers it."""
-
-    def __init__(self):
-        self.defined, self.written, self.closed = [], [], None
-
-    def define(self, record):
-        self.defined.append(record)
-
-    def write(self, *message):
-        self.written.append(message)
-
-    def close(self, last):
-        self.closed = last
-
-
-def test_tap_keeps_all_and_offers_all(make, listen):
-    feed, link, sink = make(), listen(), Kept()
-    tap = LiveTap(sink, feed)
-    tap.define(STATES)
-    pump_until(feed, lambda: feed.connected)
-    received(link)
-    tap.write(1, EPOCH_NS, EPOCH_NS, 4, b"payload")
-    pump_until(feed, lambda: feed.queued == 0)
-    tap.close((FACTS,))
-    assert sink.defined == [STATES]
-    assert sink.written == [(1, EPOCH_NS, EPOCH_NS, 4, b"payload")]
-    assert sink.closed == (FACTS,)
-    assert [one.payload for one in messages(received(link)[1])] == [b"payload"]
