@@ -21,6 +21,12 @@ set or restarted: no bus shuffles its frames so far."""
 _START_JUMP_NS = 1_000_000_000.0
 """The same before the rate is known, when a backlog may still be running off."""
 
+SILENCE_NS = 120_000_000_000
+"""After a silence this long the offset is measured anew and only the rate is kept: a quartz wanders
+by more over it than the line is good for."""
+
+_WANDER = 2e-6  # of a rate over a silence
+
 _NS = 1_000_000_000
 _BINS_PER_OCTAVE = 8
 _BINS = 64 * _BINS_PER_OCTAVE
@@ -191,6 +197,8 @@ class SourceClock:
         if not self._own:
             self._own = True
             self._restart(int(device[0]), int(host[0]), Envelope())
+        elif host[0] - self._host > SILENCE_NS and self._envelope.settled:
+            self._after_silence(device, host)
         parts: list[IntArray] = []
         while len(host):
             if host[0] >= self._bucket_ends:
@@ -232,6 +240,16 @@ class SourceClock:
                 lowest = int(height[:stop].argmin())
         envelope.take(float(x[lowest]), float(y[lowest]))
         return stop
+
+    def _after_silence(self, device: IntArray, host: IntArray) -> None:
+        """Begin a new envelope where the old one leads to, if the clock was not set meanwhile."""
+        line = self._envelope.line
+        elapsed_ns = int(host[0]) - self._host
+        lag_ns = elapsed_ns - (int(device[0]) - self._device) * (1.0 + line.rate)
+        if abs(lag_ns) > JUMP_NS + 5.0 * max(line.uncertainty, _WANDER) * elapsed_ns:
+            return  # it was: what takes the samples will find that
+        sigma = max(3.0 * line.uncertainty, _WANDER)
+        self._restart(int(device[0]), int(host[0]), Envelope(line.rate, sigma))
 
     def _jump(self, device: int, host: int, what: str) -> None:
         self._resets += 1

@@ -234,6 +234,49 @@ def test_a_small_step_of_the_least_delay_is_followed_within_seconds(step_ms: int
     assert clock.result().resets == 0
 
 
+@pytest.mark.parametrize("silence_s", [30, 900, 40_000])
+def test_a_long_silence_is_no_reset_and_the_offset_is_found_at_once(silence_s: int) -> None:
+    """The rate moves by 1 ppm meanwhile, as a quartz's does from one room to the next."""
+    made = make(duration_s=80.0, polled=False)
+    late = made.after_s >= 40
+    silence_ns = silence_s * NS
+    true = made.true + late * silence_ns
+    x = true - EPOCH_NS
+    end = 40 * NS + silence_ns
+    device = np.rint(x * (1 + 60e-6) + np.maximum(x - 40 * NS, 0) * 1e-6).astype(np.int64)
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(true, device, made.host + late * silence_ns))
+    holds(t_ns, made.host + late * silence_ns)
+    late_s = ((t_ns - true) / NS)[x > end + 2 * NS]
+    assert np.abs(late_s - 0.0003).max() < 2e-4
+    assert clock.result().resets == 0
+    assert clock.take_events() == []
+
+
+def test_a_clock_that_stood_during_a_silence_is_followed() -> None:
+    made = make(duration_s=60.0)
+    late = made.after_s >= 30
+    host = made.host + late * 600 * NS
+    device = made.device + late * 500 * NS
+    clock = SourceClock()
+    holds(mapped(clock, Made(made.true, device, host)), host)
+    # Too little time has gone by on the device, which a late arrival could explain as well: what
+    # is told is that the delay grew, and the line follows.
+    assert clock.result().offset_ns == pytest.approx(int(host[-1] - device[-1]), abs=10_000_000)
+
+
+def test_a_device_that_counts_milliseconds_is_mapped_to_a_millisecond() -> None:
+    made = make(duration_s=60.0, drift_ppm=70.0, polled=False)
+    coarse = made.device // 1_000_000 * 1_000_000
+    clock = SourceClock()
+    t_ns = mapped(clock, Made(made.true, coarse, made.host))
+    holds(t_ns, made.host)
+    late_s = ((t_ns - made.true) / NS)[made.after_s > 30]
+    assert late_s.min() > 0.0003 - 0.00105
+    assert late_s.max() < 0.0003 + 0.00105
+    assert clock.result().drift_ppm == pytest.approx(70.0, abs=3.0)
+
+
 # -- properties --------------------------------------------------------------------------------
 
 stamps = st.integers(-(2**60), 2**60)
