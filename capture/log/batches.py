@@ -8,11 +8,13 @@ memory that is written for the first time costs a page fault each 4 KiB, as much
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..errors import LogError
@@ -21,6 +23,8 @@ from .message_heads import BODY_AT, FIXED_SIZE, HEAD, gather
 from .storage import LogFile
 
 _ARENA_SIZE = 8 << 20
+_START = struct.Struct("<BQ")  # of a record: opcode, length
+_LOG_TIME_AT = 15
 
 Window = tuple[int | None, int | None]
 
@@ -47,12 +51,12 @@ class Records:
     Attributes:
         offsets: Where they start, shape (n,).
         log_ns: Their log times [Unix ns], shape (n,).
-        lengths: Bytes of each message, shape (n,).
+        length: Bytes of each message, if all have as many; otherwise None.
     """
 
     offsets: IntArray
     log_ns: IntArray
-    lengths: IntArray
+    length: int | None
 
 
 def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
@@ -149,49 +153,89 @@ def _records(
     Raises:
         LogError: If an index is damaged or points to something that is no message.
     """
-    offsets, stops, limits = _offsets(log_file, placed, wanted)
-    if (offsets + BODY_AT > stops).any():
-        raise LogError(log_file.path, "a message index points outside its chunk")
-    heads = gather(data, offsets, HEAD) if len(offsets) else np.empty(0, HEAD)
-    lengths = heads["length"]
-    room = (stops - offsets - PREFIX_SIZE).astype(np.uint64)
-    if (heads["opcode"] != Opcode.MESSAGE).any() or (
-        (lengths < FIXED_SIZE) | (lengths > room)
-    ).any():
+    offsets, limits, stops = _offsets(log_file, placed, wanted)
+    if not len(offsets):
+        return [Records(offsets, offsets, None) for _ in wanted]
+    starts = gather(data, offsets, f"V{_START.size}")
+    log_ns = gather(data, offsets + _LOG_TIME_AT, "<i8")
+    found: list[Records] = []
+    for a, b, lasts in zip(limits[:-1], limits[1:], stops, strict=True):
+        length = None
+        if b > a:
+            length = _one_length(starts[a:b], offsets[a:b], lasts)
+            if length is None:
+                _check_each(log_file, data, offsets[a:b], lasts)
+        found.append(Records(offsets[a:b], log_ns[a:b], length))
+    return found
+
+
+def _one_length(
+    starts: NDArray[np.void], offsets: IntArray, stops: tuple[IntArray, IntArray]
+) -> int | None:
+    """The length of whole messages that start alike; None where something doesn't fit."""
+    first = starts[:1].tobytes()
+    if starts.tobytes() != first * len(starts):
+        return None
+    opcode, length = _START.unpack(first)
+    rows, ends = stops
+    # In file order the last record of a block reaches furthest.
+    room = (ends - offsets[rows]).min()
+    if opcode != Opcode.MESSAGE or not FIXED_SIZE <= length <= room - PREFIX_SIZE:
+        return None
+    return length - FIXED_SIZE
+
+
+def _check_each(
+    log_file: LogFile, data: Buffer, offsets: IntArray, stops: tuple[IntArray, IntArray]
+) -> None:
+    """Raise LogError where a record is not a whole message."""
+    rows, ends = stops
+    stop = np.repeat(ends, np.diff(rows, prepend=-1))
+    heads = gather(data, offsets, HEAD)
+    lengths, room = heads["length"], (stop - offsets - PREFIX_SIZE).astype(np.uint64)
+    whole = (heads["opcode"] == Opcode.MESSAGE) & (lengths >= FIXED_SIZE) & (lengths <= room)
+    if not whole.all():
         raise LogError(log_file.path, "a message index points to something that is not a message")
-    log_ns = heads["log"].astype(np.int64)
-    lengths = lengths.astype(np.int64) - FIXED_SIZE
-    return [
-        Records(offsets[a:b], log_ns[a:b], lengths[a:b])
-        for a, b in itertools.pairwise(limits)
-    ]
 
 
 def _offsets(
     log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
-) -> tuple[IntArray, IntArray, list[int]]:
-    """Where the records start, topic by topic and each in file order.
+) -> tuple[IntArray, list[int], list[tuple[IntArray, IntArray]]]:
+    """Where the records start, topic by topic and each in file order; all heads lie in the blocks.
 
     Returns:
-        The starts, where the payload of each ends, and the topics' limits in both.
+        The starts; the topics' limits in them; and for each topic, block by block, which of its
+        records is the last and where the payload ends.
     """
     ids = [channel_id for channel_ids in wanted for channel_id in channel_ids]
     by_block = [log_file.entries(one.block, ids) for one in placed]
-    by_channel = list(zip(*by_block, strict=True))
-    counts = np.array([[len(part) // 16 for part in parts] for parts in by_channel], dtype=np.int64)
-    raw = b"".join(part for parts in by_channel for part in parts)
-    offsets = np.frombuffer(raw, dtype="<i8")[1::2]
-    here = np.tile(np.array([(one.base, one.stop) for one in placed]), (len(ids), 1))
-    bases, stops = np.repeat(here, counts.reshape(-1), axis=0).T
-    if (offsets < 0).any() or (offsets > stops - bases).any():
+    counts = np.array([[len(part) // 16 for part in parts] for parts in by_block], dtype=np.int64)
+    by_topic: list[bytes] = []
+    totals = np.empty((len(wanted), len(placed)), dtype=np.int64)
+    at = 0
+    for row, channel_ids in enumerate(wanted):
+        size = len(channel_ids)
+        by_topic += [part for parts in by_block for part in parts[at : at + size]]
+        totals[row] = counts[:, at : at + size].sum(axis=1)
+        at += size
+    offsets = np.frombuffer(b"".join(by_topic), dtype="<i8")[1::2]
+    each = totals.reshape(-1)
+    room = np.array([max(one.stop - one.base - BODY_AT, -1) for one in placed], dtype=np.int64)
+    # As unsigned numbers, negative offsets are beyond all room too.
+    limit = np.repeat(np.tile(room + 1, len(wanted)).view(np.uint64), each)
+    if (offsets.view(np.uint64) >= limit).any():
         raise LogError(log_file.path, "a message index points outside its chunk")
-    offsets = offsets + bases
-    sums = np.concatenate([[0], np.cumsum(counts.sum(axis=1))])
-    limits: list[int] = sums[np.cumsum([0, *(len(each) for each in wanted)])].tolist()
+    bases = np.array([one.base for one in placed], dtype=np.int64)
+    offsets = offsets + np.repeat(np.tile(bases, len(wanted)), each)
+    limits: list[int] = [0, *np.cumsum(totals.sum(axis=1)).tolist()]
     steps_back = offsets[1:] < offsets[:-1]
     steps_back[[at - 1 for at in limits[1:-1] if 0 < at < len(offsets)]] = False
     if steps_back.any():  # an index that is not in file order, or a topic of several channels
         for a, b in itertools.pairwise(limits):
-            order = a + np.argsort(offsets[a:b], kind="stable")
-            offsets[a:b], stops[a:b] = offsets[order], stops[order]
-    return offsets, stops, limits
+            offsets[a:b] = np.sort(offsets[a:b], kind="stable")
+    stops: list[tuple[IntArray, IntArray]] = []
+    ends = np.array([one.stop for one in placed], dtype=np.int64)
+    for row in totals:
+        filled = row > 0
+        stops.append((np.cumsum(row)[filled] - 1, ends[filled]))
+    return offsets, limits, stops

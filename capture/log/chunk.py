@@ -114,6 +114,21 @@ def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
         return size + len(reader.read(1) or b"")
 
 
+def checks_itself(raw: memoryview) -> bool:
+    """Whether a zstd frame has a checksum of its content: decompression verifies it.
+
+    Args:
+        raw: The frame.
+
+    Returns:
+        Whether it has; False for what is no zstd frame.
+    """
+    try:
+        return zstandard.get_frame_parameters(raw).has_checksum
+    except zstandard.ZstdError:
+        return False
+
+
 def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
     """Walk records back to back.
 

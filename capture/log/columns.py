@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..arrays import IntArray
 from ..errors import DataError
 from .batches import Records, Window, blocks_in, record_batches
-from .cdr import Layout, layout_of
+from .cdr import Layout, Leaf, layout_of
 from .chunk import Block, Buffer
 from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType
@@ -57,7 +57,7 @@ class Group:
         self.layout = layout
         leaves = layout.leaves
         stamps = [pair for pair in _STAMPS if all(path in leaves for path in pair)]
-        self._stamp = tuple(leaves[path] for path in stamps[0]) if stamps else ()
+        self._stamp = (leaves[stamps[0][0]], leaves[stamps[0][1]]) if stamps else None
         self.is_stamped = bool(stamps)
         self.strings = {
             path: text for path, text in layout.strings.items() if paths is None or path in paths
@@ -67,7 +67,7 @@ class Group:
         self._columns = {
             path: ColumnStore(leaf.dtype, leaf.count, capacity)
             for path, leaf in leaves.items()
-            if leaf not in self._stamp and (paths is None or path in paths)
+            if leaf not in (self._stamp or ()) and (paths is None or path in paths)
         }
         self._tiles = [b"" for _ in layout.hull]
 
@@ -136,8 +136,7 @@ class Group:
         self._order.append(order)
         stamp_ns = None
         if self._stamp:
-            seconds, rest = (gather(data, at + leaf.offset, leaf.dtype) for leaf in self._stamp)
-            stamp_ns = seconds.astype(np.int64) * _NS + rest.astype(np.int64)
+            stamp_ns = _stamp_ns(data, at, *self._stamp)
         self._times.append(log_ns, stamp_ns)
         for path, store in self._columns.items():
             leaf = self.layout.leaves[path]
@@ -280,7 +279,7 @@ class _GroupReader:
         self.unread: list[Unread] = []
 
     def add(self, data: Buffer, records: Records, window_ns: Window) -> None:
-        at, log_ns, lengths = records.offsets + BODY_AT, records.log_ns, records.lengths
+        at, log_ns, length = records.offsets + BODY_AT, records.log_ns, records.length
         start, stop = window_ns
         if (start is not None and (log_ns < start).any()) or (
             stop is not None and (log_ns >= stop).any()
@@ -288,19 +287,19 @@ class _GroupReader:
             keep = np.ones(len(at), dtype=bool)
             keep &= True if start is None else log_ns >= start
             keep &= True if stop is None else log_ns < stop
-            at, log_ns, lengths = at[keep], log_ns[keep], lengths[keep]
+            at, log_ns = at[keep], log_ns[keep]
         if not len(at):
             return
         first = self._count
         self._count += len(at)
-        length = int(lengths[0])
-        if (lengths == length).all():
+        if length is not None:
             known = self._by_length.get(length)
             if known and known[0].holds(data, at):  # the usual case
                 known[0].take(data, at, log_ns, range(first, self._count))
-                return
-            self._sort_in(data, length, at, log_ns, np.arange(first, self._count))
+            else:
+                self._sort_in(data, length, at, log_ns, np.arange(first, self._count))
             return
+        lengths = gather(data, at - BODY_AT + _LENGTH_AT, "<i8") - FIXED_SIZE
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)
             self._sort_in(data, length, at[rows], log_ns[rows], first + rows)
@@ -346,6 +345,20 @@ class _GroupReader:
         if self.groups:
             return 2 * seen
         return max(seen, min(self._expected, self._reserve // max(length, 1)))
+
+
+def _stamp_ns(data: Buffer, at: IntArray, seconds: Leaf, rest: Leaf) -> IntArray:
+    """Stamps of messages [ns], shape (n,)."""
+    if (seconds.dtype, rest.dtype, rest.offset - seconds.offset) == ("<i4", "<u4", 4):
+        pairs = gather(data, at + seconds.offset, "<i8")  # one look for both
+        stamps = pairs.view("<i4")[::2].astype(np.int64)
+        stamps *= _NS
+        stamps += pairs.view("<u4")[1::2]
+        return stamps
+    parts = [
+        gather(data, at + leaf.offset, leaf.dtype).astype(np.int64) for leaf in (seconds, rest)
+    ]
+    return parts[0] * _NS + parts[1]
 
 
 def _matrix(data: Buffer, at: IntArray, length: int) -> Matrix:

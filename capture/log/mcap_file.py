@@ -43,6 +43,7 @@ from .chunk import (
     Block,
     Buffer,
     as_entries,
+    checks_itself,
     inflate,
     inflate_zstd_into,
     walk_records,
@@ -161,6 +162,9 @@ class McapFile:
     def inflate_into(self, block: Block, room: memoryview) -> None:
         """Decompress a block into memory that is there already, and check it.
 
+        A frame that has a checksum of its own is not held against the chunk's CRC as well: both
+        are 32 bits of the same bytes, and decompression has verified the one.
+
         Args:
             block: One for which :meth:`inflates` holds.
             room: As many bytes as it has.
@@ -172,11 +176,12 @@ class McapFile:
         try:
             with memoryview(self._buffer) as whole, whole[block.start : block.stop] as raw:
                 size = inflate_zstd_into(raw, room)
+                checked = not block.crc or checks_itself(raw)
         except zstandard.ZstdError as error:
             raise LogError(self.path, f"{where} can't be decompressed: {error}") from error
         if size != block.size:
             raise LogError(self.path, f"{where} has {size} bytes, not {block.size}")
-        if block.crc and zlib.crc32(room) != block.crc:
+        if not checked and zlib.crc32(room) != block.crc:
             raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
 
     def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:

@@ -1,8 +1,9 @@
-"""Writing MCAP: what the mcap library writes, byte for byte, at a fraction of its cost a message.
+"""Writing MCAP: what the mcap library writes, at a fraction of its cost a message.
 
 A message is packed once, straight into the chunk, and its index entry into an array that is the
 index record's own content. Everything that is written once a chunk or once a file is left to the
-library's records. Format: https://mcap.dev/spec.
+library's records. Each zstd frame has a checksum of its own beside the chunk's CRC: a reader gets
+it checked for a tenth of the time that the CRC takes. Format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -76,6 +77,7 @@ class McapWriter:
         """
         self._stream = stream
         self._chunk_size = chunk_size
+        self._zstd = zstandard.ZstdCompressor(write_checksum=True)
         self._chunk = bytearray()
         self._index: dict[int, array[int]] = {}
         self._schemas: dict[int, Schema] = {}
@@ -279,7 +281,7 @@ class McapWriter:
         indexes = {key: np.frombuffer(index, np.uint64)[::2] for key, index in self._index.items()}
         begin = int(min(times.min() for times in indexes.values()))
         end = int(max(times.max() for times in indexes.values()))
-        data = zstandard.compress(self._chunk)
+        data = self._zstd.compress(self._chunk)
         body = _CHUNK.size - 9 + len(data)
         at = self._stream.tell()
         size, crc = len(self._chunk), zlib.crc32(self._chunk)

@@ -1,10 +1,16 @@
-"""Our MCAP writer against the mcap library's: the same calls give the same bytes."""
+"""Our MCAP writer against the mcap library's: the same calls give the same bytes.
+
+But for one thing: our zstd frames have a checksum, so the library is given a compressor that does
+the same.
+"""
 
 import io
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -27,6 +33,15 @@ CALLS = st.lists(
     ),
     max_size=40,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def library_with_checksums():
+    """The library compresses with checksums while these tests run."""
+    compressor = zstandard.ZstdCompressor(write_checksum=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mcap.writer.zstandard", SimpleNamespace(compress=compressor.compress))
+        yield
 
 
 def written(kind, calls, chunk_size):
