@@ -125,6 +125,7 @@ class LiveFeed:
         self._queued_bytes = 0
         self._words: deque[_Packed] = deque()
         self._waiting: _Packed | None = None
+        self._full = False
         self._now_ns = time.monotonic_ns()
         self._renew_at_ns = 0
         self._send_at_ns = 0
@@ -207,8 +208,8 @@ class LiveFeed:
         if self._socket is None or not self._ripe(now_ns):
             return
         until_ns = now_ns + _BUDGET_NS
+        self._send_at_ns = now_ns + _FILL_NS
         while self._send_one():
-            self._send_at_ns = now_ns + _FILL_NS
             if time.monotonic_ns() >= until_ns:
                 return
 
@@ -281,10 +282,10 @@ class LiveFeed:
             self.counts.dropped += 1
 
     def _ripe(self, now_ns: int) -> bool:
-        """Whether there is something to send: a datagram is left to fill for 20 ms."""
-        if self._words or self._waiting is not None:
-            return True
-        return bool(self._queue) and (self._queued_bytes >= _FILL or now_ns >= self._send_at_ns)
+        """Whether to send: a datagram is left to fill, and a full socket to itself, for 20 ms."""
+        if now_ns < self._send_at_ns:
+            return not self._full and (bool(self._words) or self._queued_bytes >= _FILL)
+        return bool(self._queue or self._words or self._waiting is not None)
 
     def _next(self) -> _Packed | None:
         """The next datagram: what waits, then definitions, then the oldest messages."""
@@ -320,7 +321,7 @@ class LiveFeed:
             self._socket.send(packed.data)
         except OSError as error:
             if error.errno in {errno.EAGAIN, errno.ENOBUFS, errno.ENOMEM}:
-                self._waiting = packed
+                self._waiting, self._full = packed, True
                 return False
             if error.errno == errno.EMSGSIZE:
                 self._waiting = None
@@ -330,7 +331,7 @@ class LiveFeed:
             self._waiting = None
             self._lose(self._now_ns)
             return False
-        self._waiting = None
+        self._waiting, self._full = None, False
         self.counts.sent += packed.messages
         return True
 
@@ -361,7 +362,7 @@ class LiveFeed:
             self._socket.close()
             self._socket = None
         self.counts.dropped += self.queued
-        self._waiting = None
+        self._waiting, self._full = None, False
         self._queue.clear()
         self._queued_bytes = 0
         self._words.clear()
