@@ -269,9 +269,10 @@ class SessionScan:
                     )
                     had = found.get((scan.topic, name))
                     found[scan.topic, name] = joint if had is None else had.with_more(joint)
+        closed = _closed(scans)
         for _, scan in scans:
             for series in scan.series.values():
-                series.ranges.forget(self._closed(scans))
+                series.ranges.forget(closed)
         return tuple(found.values())
 
     def _frozen(
@@ -280,27 +281,20 @@ class SessionScan:
         """Frozen seconds and their first one, for each joint with a command, by its place."""
         measured = series.ranges.result(len(series.names))
         runs: dict[int, list[tuple[int, int]]] = {}
+        closed = _closed(scans)
         for other, scan in scans:
             for command in scan.series.values() if scan.topic == COMMANDS else ():
                 pair = (key, series.names, other, command.names)
                 if pair not in self._freezes:
                     self._freezes[pair] = FreezeTally(series.names, command.names)
                 freeze = self._freezes[pair]
+                if not freeze.columns:
+                    continue
                 ranges = command.ranges.result(len(command.names))
-                lasted, since = freeze.result(measured, ranges, self._closed(scans))
+                lasted, since = freeze.result(measured, ranges, closed)
                 for k, *run in zip(freeze.columns, lasted.tolist(), since.tolist(), strict=True):
                     runs.setdefault(k, []).append((run[0], run[1]))
         return runs
-
-    def _closed(self, scans: list[tuple[int, ChannelScan]]) -> int | None:
-        """Seconds before this one will not change in any series of angles."""
-        every = [
-            series.ranges.closed
-            for _, scan in scans
-            for series in scan.series.values()
-            if scan.topic in (COMMANDS, STATES)
-        ]
-        return min((second for second in every if second is not None), default=None)
 
     def last_load(self, topic: str) -> tuple[float, float] | None:
         """Load of a bus in its last whole second.
@@ -335,3 +329,14 @@ def _series(topic: str, type_name: str, tally: Series) -> SeriesHealth:
         numbers=tally.numbers,
         nan=tally.nan,
     )
+
+
+def _closed(scans: list[tuple[int, ChannelScan]]) -> int | None:
+    """Seconds before this one will not change in any series of angles."""
+    every = [
+        series.ranges.closed
+        for _, scan in scans
+        for series in scan.series.values()
+        if scan.topic in (COMMANDS, STATES)
+    ]
+    return min((second for second in every if second is not None), default=None)
