@@ -14,6 +14,7 @@ UNIT_NAME = "undulog-record@.service"
 HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
 """Folders that the unit hides from the recorder."""
 
+_REFUSED = "\"'\\*?["  # systemd takes no program's name with these
 _SHIPPED_PROGRAM = "/usr/local/bin/undulog"
 
 
@@ -29,12 +30,16 @@ def unit_text(program: Path) -> str:
     Raises:
         UsageError: If the path can't stand in a unit.
     """
-    if not program.is_absolute() or any(letter in str(program) for letter in "\n\r\0"):
-        raise UsageError(f"{program}: an absolute path of the undulog command is needed")
+    text = str(program)
+    odd = [letter for letter in text if letter in _REFUSED or not letter.isprintable()]
+    if not program.is_absolute() or odd:
+        raise UsageError(
+            f"{program}: a unit needs an absolute path of the command, without "
+            "quotes, backslashes, *, ? and ["
+        )
     place = resources.files("capture.daemon") / "shipped" / UNIT_NAME
-    escaped = str(program).replace("\\", "\\\\").replace('"', '\\"')
-    escaped = escaped.replace("%", "%%").replace("$", "$$")
-    quoted = f'"{escaped}"' if any(letter in str(program) for letter in " \t\"'\\;") else escaped
+    quoted = text.replace("%", "%%")  # which begins a specifier
+    quoted = f'"{quoted}"' if " " in quoted or ";" in quoted else quoted
     return place.read_text(encoding="utf-8").replace(_SHIPPED_PROGRAM, quoted)
 
 

@@ -1,0 +1,251 @@
+"""The systemd unit: valid, hardened, and what it promises is what the recorder does."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from capture.daemon.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
+from capture.errors import UsageError
+
+PATIENCE_S = 60.0
+EXPOSURE = 2.0  # of 10, as `systemd-analyze security` counts; 2.5 would still be "OK"
+
+
+@pytest.fixture
+def systemd_analyze(display_tests_required):
+    """Path of systemd-analyze; skips where there is none, fails where one is required."""
+    path = shutil.which("systemd-analyze")
+    if path is None and display_tests_required:
+        pytest.fail("no systemd-analyze on the path")
+    if path is None:
+        pytest.skip("no systemd-analyze on the path")
+    return path
+
+
+@pytest.fixture
+def unit(tmp_path):
+    """The unit as installed here, for the settings snake.toml."""
+    path = tmp_path / UNIT_NAME.replace("@", "@snake")
+    path.write_text(unit_text(installed_program()))
+    return path
+
+
+def settings_of(text):
+    """Key to all its values, without comments."""
+    found = {}
+    for line in text.splitlines():
+        key, equals, value = line.partition("=")
+        if equals and not line.startswith("#"):
+            found.setdefault(key, []).append(value)
+    return found
+
+
+def test_systemd_finds_nothing_wrong(systemd_analyze, unit):
+    done = subprocess.run(
+        [systemd_analyze, "verify", "--man=no", str(unit)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stderr.splitlines() if unit.name in line]
+    assert said == []
+
+
+def test_systemd_finds_it_well_hardened(systemd_analyze, unit):
+    command = [systemd_analyze, "security", "--offline=true", "--no-pager"]
+    command += [f"--threshold={EXPOSURE * 10:.0f}", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "unrecognized option" in done.stderr:
+        pytest.skip("this systemd-analyze can't judge a file")
+    assert done.returncode == 0, done.stdout
+    exposure = float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1])
+    assert exposure <= EXPOSURE
+
+
+def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
+    """The threshold judges this very unit, not only its name."""
+    weak = unit.read_text().replace("DynamicUser=yes", "User=root")
+    weak = re.sub(r"(?m)^(CapabilityBoundingSet|SystemCallFilter|ProtectSystem)=.*$", "", weak)
+    unit.write_text(weak)
+    command = [systemd_analyze, "security", "--offline=true", "--no-pager"]
+    command += [f"--threshold={EXPOSURE * 10:.0f}", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+
+
+def test_what_the_recorder_relies_on_is_there(unit):
+    found = settings_of(unit.read_text())
+    assert found["Type"] == ["notify"]
+    assert found["KillSignal"] == ["SIGTERM"]
+    assert found["Restart"] == ["on-failure"]
+    assert found["RestartPreventExitStatus"] == ["2"]
+    assert found["RuntimeDirectory"] == found["StateDirectory"] == ["undulog/%i"]
+    families = found["RestrictAddressFamilies"][0].split()
+    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(families)
+    assert {"char-ttyACM rw", "char-ttyUSB rw"} <= set(found["DeviceAllow"])
+
+
+def test_the_program_s_path_stands_in_the_unit():
+    assert "ExecStart=/opt/undulog/bin/undulog record " in unit_text(
+        Path("/opt/undulog/bin/undulog")
+    )
+    assert 'ExecStart="/opt/a 50%%/$HOME/undulog" record ' in unit_text(
+        Path("/opt/a 50%/$HOME/undulog")
+    )
+    for path in ("bin/undulog", "/opt/two\nlines/undulog", '/opt/a"b/undulog', "/opt/a*/undulog"):
+        with pytest.raises(UsageError, match="an absolute path"):
+            unit_text(Path(path))
+
+
+@pytest.mark.parametrize("folder", ["/opt/with space", "/opt/50%", "/opt/a;b", "/opt/$x", "/opt/ü"])
+def test_odd_paths_mean_to_systemd_what_they_say(systemd_analyze, tmp_path, folder):
+    """systemd looks for the program, and names the path that it understood."""
+    unit = tmp_path / UNIT_NAME.replace("@", "@snake")
+    unit.write_text(unit_text(Path(folder) / "undulog"))
+    done = subprocess.run(
+        [systemd_analyze, "verify", "--man=no", str(unit)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert f"Command {folder}/undulog is not executable" in done.stderr
+
+
+def test_a_program_that_the_unit_hides_is_told(tmp_path):
+    assert hidden_folder(Path("/home/ann/venv/bin/undulog")) == "/home"
+    assert hidden_folder(Path("/opt/undulog/bin/undulog")) is None
+    (tmp_path / "undulog").write_text("")
+    assert hidden_folder(tmp_path / "undulog") == "/tmp" or "tmp" not in str(tmp_path)
+
+
+# -- the recorder as such a service ---------------------------------------------------------------
+
+
+def heard(manager, wanted):
+    """Lines that come to the manager until the wanted one."""
+    lines = []
+    manager.settimeout(PATIENCE_S)
+    while wanted not in lines:
+        lines += manager.recv(65536).decode().splitlines()
+    return lines
+
+
+def start_command(unit, name):
+    """What the unit would run, with its specifiers filled in."""
+    command = settings_of(unit.read_text())["ExecStart"][0]
+    return command.replace("%i", name).split()
+
+
+def without_capabilities():
+    """A command that drops what root may do, where that is possible."""
+    drop = ["setpriv", "--no-new-privs", "--bounding-set=-all"]
+    if os.getuid() or shutil.which("setpriv") is None:
+        return []
+    return [] if subprocess.run([*drop, "true"], check=False).returncode else drop
+
+
+@pytest.fixture
+def service(unit, tmp_path):
+    """Starts what the unit says, as the service manager would, without any capability.
+
+    Yields a function that takes the settings and gives the process and the manager's socket.
+    """
+    started = []
+    state, runtime = tmp_path / "state", tmp_path / "runtime"
+    state.mkdir()
+    runtime.mkdir()
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(tmp_path / "notify"))
+
+    def start(settings):
+        (tmp_path / "snake.toml").write_text(settings)
+        command = start_command(unit, "snake")
+        at = command.index("/etc/undulog/snake.toml")
+        command[at] = str(tmp_path / "snake.toml")
+        command = [*without_capabilities(), *command]
+        environ = {
+            "PATH": os.environ["PATH"],
+            "NOTIFY_SOCKET": str(tmp_path / "notify"),
+            "WATCHDOG_USEC": "200000",
+            "RUNTIME_DIRECTORY": str(runtime),
+            "STATE_DIRECTORY": str(state),
+        }
+        started.append(
+            subprocess.Popen(
+                command, cwd=state, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+        )
+        return started[-1], manager
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+    manager.close()
+
+
+def control(runtime, *words):
+    """Run a verb of the control socket as the operator would."""
+    environ = {**os.environ, "RUNTIME_DIRECTORY": str(runtime)}
+    return subprocess.run(
+        [sys.executable, "-m", "undulog", "record", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environ,
+    )
+
+
+def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(service, tmp_path):
+    settings = f'[record]\nsources = ["unix:{tmp_path}/frames.sock"]\noutput = "run.mcap"\n'
+    process, manager = service(settings)
+    heard(manager, "READY=1")
+    for _ in range(3):
+        heard(manager, "WATCHDOG=1")
+    assert (tmp_path / "runtime" / "run.sock").is_socket()
+    asked = control(tmp_path / "runtime", "status", "--json")
+    assert asked.returncode == 0, asked.stderr
+    assert '"state": "recording"' in asked.stdout
+    process.send_signal(signal.SIGTERM)
+    heard(manager, "STOPPING=1")
+    output, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, errors
+    assert output == b"", "--quiet"
+    raw = (tmp_path / "state" / "run.mcap").read_bytes()
+    assert raw.endswith(b"\x89MCAP0\r\n")
+    assert not (tmp_path / "runtime" / "run.sock").exists()
+
+
+def test_a_loop_that_hangs_feeds_its_watchdog_no_more(service, tmp_path):
+    settings = f'[record]\nsources = ["unix:{tmp_path}/frames.sock"]\noutput = "run.mcap"\n'
+    process, manager = service(settings)
+    heard(manager, "READY=1")
+    heard(manager, "WATCHDOG=1")
+    process.send_signal(signal.SIGSTOP)
+    manager.settimeout(2.0)
+    silent = False
+    deadline = time.monotonic() + PATIENCE_S
+    while not silent and time.monotonic() < deadline:
+        try:
+            manager.recv(65536)  # what was sent before
+        except TimeoutError:
+            silent = True
+    assert silent
+    process.send_signal(signal.SIGCONT)
+    heard(manager, "WATCHDOG=1")
+
+
+def test_wrong_settings_end_with_2_so_that_they_are_not_tried_again(service):
+    process, _ = service("[record]\nsauces = []\n")
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2
+    assert b"record.sauces: found an unknown key" in errors
