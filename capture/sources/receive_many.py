@@ -1,8 +1,8 @@
 """Many packets in one system call: Linux ``recvmmsg``, with the kernel's time of each packet.
 
 Python's ``recv_into`` costs more than a microsecond a packet, and with the time of arrival twice
-that. One call for 128 packets, and numpy for what surrounds them, is several times cheaper, and a
-packet's time is that of its arrival, not of our looking.
+that. One call for all that have come is several times cheaper, and a packet's time is that of its
+arrival, not of our looking.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import errno
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -29,6 +29,7 @@ SO_RCVBUFFORCE = 33
 """Socket option: receive buffer beyond the system's limit, for the superuser."""
 
 _CONTROL = 128
+_SLACK_NS = 20_000_000
 
 
 class _Mmsghdr(ctypes.Structure):
@@ -49,29 +50,30 @@ class _Mmsghdr(ctypes.Structure):
 
 _MMSGHDR = cast("np.dtype[np.void]", np.dtype(_Mmsghdr))
 _IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
-_HEAD = [("len", np.uintp), ("level", "<i4"), ("type", "<i4")]
+_HEAD = [("len", np.uintp), ("kind", "<u8")]  # level and type, compared as one
 _STAMP = np.dtype([*_HEAD, ("s", np.intp), ("ns", np.intp)])
 _DROPS = np.dtype([*_HEAD, ("count", "<u4")])
+_TIME_KIND = SO_TIMESTAMPNS << 32 | socket.SOL_SOCKET
+_DROPS_KIND = SO_RXQ_OVFL << 32 | socket.SOL_SOCKET
 _RECVMMSG = ctypes.CDLL(None, use_errno=True).recvmmsg
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Packets of one call. Its arrays are good until the next call.
+    """Packets of one call. Lists, as there are mostly few: they cost less than numpy's columns.
 
     Attributes:
-        packets: Their bytes, shape (n, longest).
-        sizes: How many bytes each has, shape (n,).
-        flags: ``MSG_TRUNC`` where a packet was longer, ``MSG_DONTROUTE`` and others, shape (n,).
-        stamps_ns: Arrival [Unix ns, on the computer's wall clock]; 0 where the kernel gave none,
-            shape (n,).
+        packets: Their bytes, shape (n, longest); good until the next call.
+        sizes: How many bytes each has.
+        flags: Of each: ``MSG_TRUNC`` if it was longer, ``MSG_DONTROUTE`` and others.
+        stamps_ns: Arrival [Unix ns, on the computer's wall clock]; 0 where the kernel gave none.
         drops: The kernel's count of dropped packets, modulo 2**32; None if it told none.
     """
 
     packets: NDArray[np.uint8]
-    sizes: NDArray[np.int64]
-    flags: NDArray[np.int32]
-    stamps_ns: NDArray[np.int64]
+    sizes: list[int]
+    flags: list[int]
+    stamps_ns: list[int]
     drops: int | None
 
 
@@ -96,7 +98,13 @@ class ReceiveMany:
         self._heads["iov"] = self._iov.ctypes.data + row * _IOVEC.itemsize
         self._heads["iovlen"] = 1
         self._heads["control"] = self._control.ctypes.data + row * _CONTROL
-        self._address = self._heads.ctypes.data
+        self._heads["controllen"] = _CONTROL
+        self._call = (
+            ctypes.c_void_p(self._heads.ctypes.data),
+            ctypes.c_uint(packets),
+            ctypes.c_int(socket.MSG_DONTWAIT),
+            None,
+        )
         self._stamps = self._control[:, : _STAMP.itemsize].view(_STAMP)[:, 0]
         drops = self._control[:, _STAMP.itemsize : _STAMP.itemsize + _DROPS.itemsize]
         self._drops = drops.view(_DROPS)[:, 0]
@@ -113,38 +121,35 @@ class ReceiveMany:
         Raises:
             OSError: As ``recvmmsg`` has it.
         """
-        self._heads["controllen"] = _CONTROL
-        count = int(
-            _RECVMMSG(
-                ctypes.c_int(fileno),
-                ctypes.c_void_p(self._address),
-                ctypes.c_uint(self.capacity),
-                ctypes.c_int(socket.MSG_DONTWAIT),
-                None,
-            )
-        )
+        count = int(_RECVMMSG(ctypes.c_int(fileno), *self._call))
         if count < 0:
             code = ctypes.get_errno()
             if code not in (errno.EAGAIN, errno.EINTR):
                 raise OSError(code, os.strerror(code))
             count = 0
+        if not count:
+            return Batch(self._packets[:0], [], [], [], None)
         heads = self._heads[:count]
-        used = heads["controllen"]
-        stamps = self._stamps[:count]
-        stamped = _is(stamps, SO_TIMESTAMPNS) & (used >= _STAMP.itemsize)
-        drops = self._drops[:count]
-        told = _is(drops, SO_RXQ_OVFL) & (used >= _STAMP.itemsize + _DROPS.itemsize)
+        used: list[int] = heads["controllen"].tolist()
+        heads["controllen"] = _CONTROL  # for the next call
+        stamps_ns = [
+            s * 1_000_000_000 + ns if kind == _TIME_KIND and room >= _STAMP.itemsize else 0
+            for (_, kind, s, ns), room in zip(self._stamps[:count].tolist(), used, strict=True)
+        ]
+        drops = None
+        if max(used) > _STAMP.itemsize:
+            rows = zip(self._drops[:count].tolist(), used, strict=True)
+            told = [
+                n for (_, kind, n), room in rows if kind == _DROPS_KIND and room > _STAMP.itemsize
+            ]
+            drops = told[-1] if told else None
         return Batch(
             packets=self._packets[:count],
-            sizes=heads["size"].astype(np.int64),
-            flags=heads["flags"].astype(np.int32),
-            stamps_ns=np.where(stamped, stamps["s"] * 1_000_000_000 + stamps["ns"], 0),
-            drops=int(drops["count"][told][-1]) if told.any() else None,
+            sizes=heads["size"].tolist(),
+            flags=heads["flags"].tolist(),
+            stamps_ns=stamps_ns,
+            drops=drops,
         )
-
-
-def _is(control: NDArray[np.void], kind: int) -> NDArray[np.bool_]:
-    return (control["type"] == kind) & (control["level"] == socket.SOL_SOCKET)
 
 
 class ArrivalClock:
@@ -164,26 +169,31 @@ class ArrivalClock:
         before, wall, after = now_ns(), time.time_ns(), now_ns()
         self._offset_ns = (before + after) // 2 - wall
 
-    def times(self, stamps_ns: NDArray[np.int64], floor_ns: int) -> NDArray[np.uint64]:
+    def times(self, stamps_ns: Sequence[int], floor_ns: int) -> list[int]:
         """Arrival on the session's clock.
 
         Args:
             stamps_ns: Arrival on the wall clock [Unix ns], 0 where unknown, in the order of one
-                socket's queue, shape (n,).
+                socket's queue.
             floor_ns: Before this time none came, on the session's clock [Unix ns]: the socket was
                 empty then, or gave an earlier packet. It bounds the harm of a wall clock that is
                 set.
 
         Returns:
-            Arrival on the session's clock [Unix ns], in order, not after now, shape (n,).
+            Arrival on the session's clock [Unix ns], in order, not after now.
         """
         before, wall, after = self._now_ns(), time.time_ns(), self._now_ns()
-        self._offset_ns = min(max(self._offset_ns, before - wall), after - wall)
-        times = np.where(stamps_ns > 0, stamps_ns + self._offset_ns, after)
-        # A packet that came before stamps were asked for is stamped when it is fetched, but the
-        # queue keeps the order: it came no later than those behind it.
-        times = np.minimum.accumulate(times[::-1])[::-1]
-        return times.clip(floor_ns, after).astype(np.uint64)
+        offset = self._offset_ns = min(max(self._offset_ns, before - wall), after - wall)
+        times: list[int] = []
+        latest = after
+        for stamp in reversed(stamps_ns):
+            # A packet that came before stamps were asked for is stamped when it is fetched, but
+            # the queue keeps the order: it came no later than those behind it.
+            if stamp and stamp + offset < latest:
+                latest = max(stamp + offset, floor_ns)
+            times.append(latest)
+        times.reverse()
+        return times
 
 
 def enlarge_buffer(sock: socket.socket, force: int, option: int, size: int) -> None:
