@@ -184,7 +184,7 @@ def edited_log(
         LogWriteError: If it can't be written; nothing is left behind then.
         UndulogError: If a stop was requested.
     """
-    read = [path for source in sources for path in (source.path, *source.paths)]
+    read = [path for source in sources for path in (source.path, *source.file.parts.paths)]
     refuse_output(output, read, force=force)
     profiles = {source.file.profile for source in sources}
     with part_file(output) as part:

@@ -19,10 +19,12 @@ class PartFiles:
     Attributes:
         files: By number of the part.
         missing: What is missing or left out, one sentence each.
+        paths: All files that were looked at, those that held nothing too.
     """
 
     files: dict[int, McapFile] = field(default_factory=dict[int, McapFile])
     missing: list[str] = field(default_factory=list[str])
+    paths: list[Path] = field(default_factory=list[Path])
 
     def close(self) -> None:
         """Release all files."""
@@ -85,7 +87,7 @@ def check_chain(parts: PartFiles) -> list[str]:
     """
     wrong: list[str] = []
     for number, file in parts.files.items():
-        stated = file.metadata.get(PART_RECORD, {}).get("previous_sha256")
+        stated = _part_record(file).get("previous_sha256")
         former = parts.files.get(number - 1)
         if stated is None or former is None:
             continue
@@ -100,64 +102,91 @@ def check_chain(parts: PartFiles) -> list[str]:
 
 
 def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
-    split = part_path(first, 2).exists()
+    paths = {1: first}
+    if part_path(first, 2).exists() or not first.exists():
+        paths |= _later(first)
+    opened: dict[int, McapFile] = {}
     try:
-        found.files[1] = McapFile(first, bare=bare or split)
-        split |= PART_RECORD in found.files[1].metadata
-    except LogError as error:
-        others = later_parts(first) if first.parent.is_dir() else []
-        if not bare and not others:
-            raise
-        if others or first.exists():
-            found.missing.append(f"part 1 can't be read: {error}" if others else str(error))
-        split = bool(others)
-    if not split:
-        return
-    for path in later_parts(first):
-        _add(found, path, split_part_path(path)[1])
-    found.missing += _gaps(found, first, bare=bare)
+        _open_all(opened, paths, found.missing, bare=bare)
+        if len(paths) == 1 and 1 in opened and "next" in _part_record(opened[1]):
+            paths |= _later(first)
+            rest = {number: path for number, path in paths.items() if number > 1}
+            _open_all(opened, rest, found.missing, bare=True)
+    finally:
+        found.files |= sorted(opened.items())
+        found.paths += paths.values()
+    for number, file in sorted(opened.items()):
+        begun = bare and file.cut and not file.blocks  # died before anything of worth was in it
+        reason = "" if begun else _stranger(opened, number)
+        if reason:
+            found.missing.append(f"{file.path.name} {reason}: left out")
+        if reason or (begun and number > 1):
+            del opened[number], found.files[number]
+            file.close()
+    found.missing += _gaps(found, first, {*paths} if 1 in opened else {*paths} - {1}, bare=bare)
 
 
-def _add(found: PartFiles, path: Path, number: int) -> None:
+def _open_all(
+    opened: dict[int, McapFile], paths: dict[int, Path], missing: list[str], *, bare: bool
+) -> None:
+    """Open files, the last first.
+
+    Of a recording that runs, what is written meanwhile leaves no gap before a part then.
+    """
+    alone = not bare and len(paths) == 1
+    for number, path in reversed(paths.items()):
+        try:
+            opened[number] = McapFile(path, bare=not alone)
+        except LogError as error:
+            if alone:
+                raise
+            if number > 1 or path.exists():
+                missing.insert(0, f"part {number} can't be read: {error}")
+
+
+def _later(first: Path) -> dict[int, Path]:
+    """The files that have the name of a later part, by number."""
+    if not first.parent.is_dir():
+        return {}
     try:
-        file = McapFile(path, bare=True)
-    except LogError as error:
-        found.missing.append(f"part {number} can't be read: {error}")
-        return
-    reason = ""
-    if PART_RECORD not in file.metadata or file.metadata[PART_RECORD].get("part") != str(number):
-        reason = f"does not say that it is part {number}"
-    elif any(_session_id(file) != _session_id(other) for other in found.files.values()):
-        reason = "is of another session"
-    elif _redefines(file, found):
-        reason = "describes its channels differently"
-    if reason:
-        file.close()
-        found.missing.append(f"{path.name} {reason}: left out")
-        return
-    found.files[number] = file
+        return {split_part_path(path)[1]: path for path in later_parts(first)}
+    except OSError as error:
+        raise LogError(first, f"its folder can't be listed: {error.strerror}") from error
 
 
-def _gaps(found: PartFiles, first: Path, *, bare: bool) -> list[str]:
+def _stranger(opened: dict[int, McapFile], number: int) -> str:
+    """Why a file does not belong to those before it; empty if it does."""
+    file = opened[number]
+    if number > 1 and _part_record(file).get("part") != str(number):
+        return f"does not say that it is part {number}"
+    before = [opened[other] for other in opened if other < number]
+    if any(_session_id(file) != _session_id(other) for other in before):
+        return "is of another session"
+    if _redefines(file, before):
+        return "describes its channels differently"
+    return ""
+
+
+def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list[str]:
     """The parts that must have been and are not there."""
     if not found.files:
         return []
     last = max(found.files)
-    gone = [number for number in range(1, last) if number not in found.files]
-    end = found.files[last].metadata.get(PART_RECORD, {})
-    if "next" in end:
-        gone.append(last + 1)
+    end = _part_record(found.files[last])
+    gone = [number for number in range(1, last) if number not in there]
     told = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
-    if "next" in end:
-        told[-1] += "; whether more followed it can't be told"
-    elif "parts" not in end and last > 1 and not bare:
+    if bare:  # the write-ahead log knows how much was recorded after the last file
+        return told
+    if "next" in end and last + 1 not in there:
+        name = part_path(first, last + 1).name
+        told.append(f"part {last + 1} ({name}) is missing; whether more followed it can't be told")
+    elif "next" not in end and "parts" not in end and last > 1:
         told.append(f"part {last} does not say that it is the last: more may have followed")
-    already = {int(text.split()[1]) for text in found.missing if text.startswith("part ")}
-    return [text for text in told if not text.startswith(tuple(f"part {k} (" for k in already))]
+    return told
 
 
-def _redefines(file: McapFile, found: PartFiles) -> bool:
-    known = {key: channel for other in found.files.values() for key, channel in _kinds(other)}
+def _redefines(file: McapFile, others: list[McapFile]) -> bool:
+    known = {key: kind for other in others for key, kind in _kinds(other)}
     return any(known.get(key, kind) != kind for key, kind in _kinds(file))
 
 
@@ -168,6 +197,10 @@ def _kinds(file: McapFile) -> list[tuple[int, tuple[str, str, bytes]]]:
         kind = (channel.topic, schema.name, schema.data) if schema else (channel.topic, "", b"")
         kinds.append((key, kind))
     return kinds
+
+
+def _part_record(file: McapFile) -> dict[str, str]:
+    return file.metadata.get(PART_RECORD, {})
 
 
 def _session_id(file: McapFile) -> str:

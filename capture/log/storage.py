@@ -112,9 +112,9 @@ class LogFile:
         try:
             for file in self.files:
                 self._join(file)
-            self.warnings += self.parts.missing
             if wal is not None:
                 self._join_wal(wal)
+            self.warnings += self.parts.missing
             self._require_channels()
         except BaseException:
             self.close()
@@ -253,14 +253,20 @@ class LogFile:
         self._define(wal)
         self._leave_cut_chunk(wal)
         in_files = sum(self.counts.values())
-        rest = beyond(wal.messages, self._last_keys(len(wal.messages)))
+        # The log may begin before the files' end, and they may have grown beyond its own since.
+        overlap = max(wal.accepted, in_files) - wal.before
+        rest = beyond(wal.messages, self._last_keys(overlap) if wal.messages else set())
         if rest:
             tail = WalTail(rest)
             self._add(tail, tail.blocks, tail.counts)
         accepted = wal.accepted if wal.messages else None
         self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted)
-        self.warnings.append(str(self.recovered))
-        self.warnings += wal.warnings
+        told = list(wal.warnings)
+        if self.recovered.missing == 0:  # then what was only begun held nothing
+            gone = [text for text in self.parts.missing if "can't be read" in text]
+            self.parts.missing = [text for text in self.parts.missing if text not in gone]
+            told = [text for text in told if "no readable header" not in text]
+        self.warnings += [str(self.recovered), *told]
 
     def _define(self, wal: WalContents) -> None:
         """Take from a write-ahead log what the files don't explain themselves."""
@@ -289,7 +295,7 @@ class LogFile:
             return
         found = {key: len(at) for key, at in (block.offsets or {}).items()}
         whole = sum(self.counts.values()) - sum(found.values())
-        if wal.messages[0].position - 1 <= whole:
+        if wal.before <= whole:
             self.blocks.pop()
             for channel_id, count in found.items():
                 self.counts[channel_id] -= count

@@ -203,25 +203,37 @@ class Recovery(Iterator[WalMessage]):
             self.warnings.append(f"messages of channels that are not defined: {listed}")
 
     def _records(self, segments: list[_Found]) -> Iterator[tuple[RecordHead, bytes]]:
+        former: _SegmentReader | None = None
+        reader: _SegmentReader | None = None
         last = 0
-        for segment in segments:
-            try:
-                with segment.path.open("rb") as file:
-                    reader = _SegmentReader(segment, file, last)
-                    yield from reader.records()
-            except FileNotFoundError:  # a log in use: released since it was listed
-                continue
-            except OSError as error:
-                self.warnings.append(
-                    f"{segment.path.name} can't be read to its end: {error.strerror}"
-                )
-                continue
-            last = reader.last
-            if reader.damaged:
-                self.warnings.append(
-                    f"{segment.path.name}: {reader.damaged} bytes are no whole records, "
-                    f"the first at byte {reader.first_damage}"
-                )
+        try:
+            for segment in segments:
+                try:
+                    reader = _SegmentReader(segment, segment.path.open("rb"), last)
+                    for head, payload in reader.records():
+                        if former is not None and head.position > last + 1:
+                            # Of a log in use: it went on in the former while that was read.
+                            yield from former.later()
+                        last = head.position
+                        former = _closed(former)
+                        yield head, payload
+                except FileNotFoundError:  # a log in use: released since it was listed
+                    continue
+                except OSError as error:
+                    told = f"{segment.path.name} can't be read to its end: {error.strerror}"
+                    self.warnings.append(told)
+                    reader = _closed(reader)
+                    continue
+                _closed(former)
+                former = reader
+                if reader.damaged:
+                    self.warnings.append(
+                        f"{segment.path.name}: {reader.damaged} bytes are no whole records, "
+                        f"the first at byte {reader.first_damage}"
+                    )
+        finally:
+            _closed(former)
+            _closed(reader)
 
 
 class _SegmentReader:
@@ -236,16 +248,21 @@ class _SegmentReader:
         self.damaged = 0
         self.first_damage = 0
         self._file = file
+        self._at = HEADER_SIZE
         self._end = segment.end
         self._salt = segment.header.salt
         self._kinds = STREAM_KINDS[segment.header.stream]
 
     def records(self) -> Iterator[tuple[RecordHead, bytes]]:
-        at = HEADER_SIZE
-        while at < self._end:
+        while (at := self._at) < self._end:
             head = self._whole(at)
             if head is None:
                 following, stop = self._search(at)
+                # Of a log in use, this one was being written when it was looked at: a later one
+                # is there, so now it is whole.
+                head = self._again(at) if following is not None else None
+                if head is not None:
+                    following, stop = (at, head), at
                 if stop > at:
                     self.first_damage = self.first_damage or at
                     self.damaged += stop - at
@@ -255,8 +272,22 @@ class _SegmentReader:
             self.last = head.position
             self._file.seek(at + RECORD_SIZE)
             payload = self._file.read(head.length)
+            self._at = (at + RECORD_SIZE + head.length + 7) & -8
             yield head, payload
-            at = (at + RECORD_SIZE + head.length + 7) & -8
+
+    def later(self) -> Iterator[tuple[RecordHead, bytes]]:
+        """Records that were put since the end was reached; damage isn't counted again."""
+        damage = self.damaged, self.first_damage
+        self._file.seek(0, os.SEEK_END)  # what was read ahead is old
+        yield from self.records()
+        self.damaged, self.first_damage = damage
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _again(self, at: int) -> RecordHead | None:
+        self._file.seek(0, os.SEEK_END)  # what was read ahead is old
+        return self._whole(at)
 
     def _whole(self, at: int) -> RecordHead | None:
         """The head of the record at a place, if one is there and its CRC fits.
@@ -314,6 +345,11 @@ class _SegmentReader:
             marked |= words[2:] & np.uint64(0xFFFF) == kind | MARK << 8
         marked &= words[1:-1] > np.uint64(self.last)
         return [int(index) * 8 for index in np.flatnonzero(marked)]
+
+
+def _closed(reader: _SegmentReader | None) -> None:
+    if reader is not None:
+        reader.close()
 
 
 def recover(folder: Path | str) -> Recovery:

@@ -48,6 +48,11 @@ class WalContents:
         """How many messages the recorder accepted, as far as the log tells; 0 if it doesn't."""
         return self.messages[-1].position if self.messages else 0
 
+    @property
+    def before(self) -> int:
+        """How many messages were accepted before the first that the log still has."""
+        return self.messages[0].position - 1 if self.messages else 0
+
 
 def read_wal(first: Path) -> WalContents | None:
     """Read the write-ahead log of a session, without changing it.

@@ -3,10 +3,13 @@
 It is no test module: a child process runs it, and each message can be told again from its number.
 """
 
+import json
 import os
 import random
+import signal
 import struct
 import sys
+import time
 
 from mcap.records import Channel, Metadata, Schema
 
@@ -55,23 +58,26 @@ def write(sink, number):
     sink.write(channel, log_ns, publish_ns, sequence, payload)
 
 
-def main():
-    """Write without end; tell each number after it was accepted."""
-    path, split_size, split_every = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    sink = open_sink(
-        path,
-        segment_size=1 << 16,
-        split_size=split_size or None,
-        sync_interval_s=0.05,
-        flush_interval_s=0.2,
-        ballast=1 << 16,
-    )
-    for number in range(1 << 40):
+def run(path, count=1 << 40, splits=(), split_every=0, **options):
+    """Write, tell each number after it was accepted, and die of a kill.
+
+    Args:
+        path: The session.
+        count: Messages; when the disk has what it can have of them, the process kills itself.
+        splits: Numbers of messages after which a part begins.
+        split_every: Messages of a part.
+        options: Of the sink.
+    """
+    sink = open_sink(path, **options)
+    for number in range(count):
         write(sink, number)
         os.write(1, (number + 1).to_bytes(8, "little"))
-        if split_every and number % split_every == split_every - 1:
+        if number + 1 in splits or (split_every and (number + 1) % split_every == 0):
             sink.split()
+    while sink.backlog:
+        time.sleep(0.001)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 if __name__ == "__main__":
-    main()
+    run(sys.argv[1], **json.loads(sys.argv[2]))
