@@ -18,7 +18,7 @@ from pathlib import Path
 from time import perf_counter_ns
 from typing import Any, Final, cast
 
-from ..errors import UndulogError
+from ..errors import ControlError, UndulogError
 from .control_socket import listen, release
 
 MAX_CLIENTS = 16
@@ -70,13 +70,12 @@ class _Client:
 class ControlServer:
     """Serves the control socket from the recorder's loop."""
 
-    def __init__(self, path: Path, handler: Handler) -> None:
+    def __init__(self, path: Path, handler: Handler | None = None) -> None:
         """Listen.
 
         Args:
             path: Where; its folder must be there.
-            handler: Does what is asked. What it raises is the reply's ``error``; what is no
-                :class:`UndulogError` is a mistake of ours and told by :meth:`take_faults` too.
+            handler: Does what is asked; None where :meth:`serve` says so later.
 
         Raises:
             ControlError: If another recorder listens there, something else is in the way, or the
@@ -86,7 +85,7 @@ class ControlServer:
         self.requests = 0
         """Requests answered so far."""
         self._faults: list[str] = []
-        self._handler = handler
+        self._handler = handler or _not_yet
         self._listener, self._identity = listen(path, backlog=MAX_CLIENTS)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
@@ -98,6 +97,18 @@ class ControlServer:
     def clients(self) -> int:
         """Number of connections."""
         return len(self._clients)
+
+    def serve(self, handler: Handler) -> None:
+        """Have requests carried out from now on.
+
+        The socket can be claimed before anything is created, and served when all is there: a
+        recorder that is refused its socket leaves no file behind.
+
+        Args:
+            handler: Does what is asked. What it raises is the reply's ``error``; what is no
+                :class:`UndulogError` is a mistake of ours and told by :meth:`take_faults` too.
+        """
+        self._handler = handler
 
     def take_faults(self) -> tuple[str, ...]:
         """Mistakes of ours that requests brought to light since the last call.
@@ -260,6 +271,11 @@ class ControlServer:
         with suppress(KeyError):  # it may be unwatched: full, or ended
             self._selector.unregister(client.socket)
         client.socket.close()
+
+
+def _not_yet(request: Mapping[str, Any]) -> Reply:
+    del request
+    raise ControlError("the recording has not begun yet")
 
 
 def _lines(client: _Client) -> Iterator[bytes]:

@@ -120,6 +120,18 @@ def test_each_request_gets_its_reply_in_order_on_one_connection(server):
     assert server.requests == 500
 
 
+def test_a_socket_can_be_claimed_before_it_is_served(tmp_path):
+    server = ControlServer(tmp_path / "c.sock")
+    with pytest.raises(ControlError, match="another recorder listens there"):
+        ControlServer(server.path)
+    with polled(server), ControlClient(server.path) as client:
+        with pytest.raises(ControlError, match="not begun yet"):
+            client.ask({"do": "x"})
+        server.serve(echo)
+        assert client.ask({"do": "x"}) == {"got": {"do": "x"}}
+    server.close()
+
+
 def test_a_request_may_come_in_pieces(server):
     with connected(server) as client:
         for byte in b'{"do": "x"}\n':
