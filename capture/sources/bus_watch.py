@@ -52,7 +52,12 @@ class BusWatch:
             frames: What came, in order.
             tally: Where to count and tell.
         """
-        is_error = (frames["id_flags"] & ERROR_FLAG) != 0
+        ids = frames["id_flags"]
+        if not np.bitwise_or.reduce(ids) & ERROR_FLAG:
+            if self._off and len(ids):
+                self._back(tally)
+            return
+        is_error = (ids & ERROR_FLAG) != 0
         places = np.flatnonzero(is_error).tolist()
         tally.counts.error_frames += len(places)
         before = -1

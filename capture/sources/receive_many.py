@@ -188,8 +188,9 @@ class ArrivalClock:
         latest = after
         for stamp in reversed(stamps_ns):
             # A packet that came before stamps were asked for is stamped when it is fetched, but
-            # the queue keeps the order: it came no later than those behind it.
-            if stamp and stamp + offset < latest:
+            # the queue keeps the order: it came no later than those behind it. One that would lie
+            # long before the floor can't be true: the wall clock was set in between.
+            if stamp and floor_ns - _SLACK_NS < stamp + offset < latest:
                 latest = max(stamp + offset, floor_ns)
             times.append(latest)
         times.reverse()

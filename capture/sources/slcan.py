@@ -1,7 +1,7 @@
 """Serial adapters that speak slcan (Lawicel), read in bulk from the terminal device.
 
 python-can reads such an adapter byte by byte, 130 us a frame; a bus at 8,000 frames a second has
-one every 125. Here a read takes all there is and numpy takes it apart.
+one every 125. Here a read takes all there is and one expression takes it apart.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ BITRATES = {
 """Bit rate [bit/s] to the command that sets it (S7 is 800,000 with some adapters)."""
 
 _CHUNK = 65536
+_SHORT = 2048  # a terminal gives up to 4095 bytes a read; after fewer there are no more
 _MOST_BYTES = 1 << 20
 _ANSWER_S = 0.2
 _QUIET_S = 0.05
@@ -98,6 +99,7 @@ class SlcanLink:
         self.detail = ("listen-only" if settings.listen_only else "acknowledges frames") + rate
         self._fileno: int | None = fileno
         self._first = first
+        self._buffer = memoryview(bytearray(_CHUNK))
         self._text = SlcanText(stamps=settings.timestamps)
         self._tally = tally
         self._error: OSError | None = None
@@ -121,9 +123,13 @@ class SlcanLink:
         size = 0
         try:
             while size < _MOST_BYTES:
-                chunk = _read(self._fileno)
-                chunks.append(chunk)
-                size += len(chunk)
+                count = os.readv(self._fileno, [self._buffer])
+                if not count:
+                    raise _hung_up()
+                chunks.append(self._buffer[:count].tobytes())
+                size += count
+                if count < _SHORT:
+                    break
         except BlockingIOError:
             pass
         except OSError as error:
@@ -248,18 +254,18 @@ def _write(fileno: int, data: bytes) -> None:
         data = data[os.write(fileno, data) :]
 
 
-def _read(fileno: int) -> bytes:
-    chunk = os.read(fileno, _CHUNK)
-    if not chunk:
-        raise OSError(errno.EIO, "the device hung up")
-    return chunk
+def _hung_up() -> OSError:
+    return OSError(errno.EIO, "the device hung up")
 
 
 def _receive(fileno: int, timeout_s: float) -> bytes:
     """What comes next; empty if nothing does in time."""
     if not select.select([fileno], [], [], timeout_s)[0]:
         return b""
-    return _read(fileno)
+    chunk = os.read(fileno, _CHUNK)
+    if not chunk:
+        raise _hung_up()
+    return chunk
 
 
 def _settle(fileno: int) -> None:

@@ -1,40 +1,34 @@
-"""The serial line protocol of slcan adapters (Lawicel), read in bulk.
+"""The serial line protocol of slcan adapters (Lawicel).
 
 A frame is a line ended by a carriage return: ``t`` (11-bit identifier, three digits) or ``T``
 (29-bit, eight), a length digit, two digits for each data byte, and, if the adapter stamps its
 frames, four digits of milliseconds that start again after a minute. ``r`` and ``R`` are remote
 requests. A bell character is the adapter's way to say that something went wrong.
+
+One expression finds all frames of a chunk; a chunk with anything else in it is read line by line.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import re
 
-from ..log.frames import EXTENDED_FLAG, REMOTE_FLAG, FrameArray, empty_frames
+from ..log.frames import EXTENDED_FLAG, REMOTE_FLAG, FrameArray
 from .events import Tally
-from .hex_text import NIBBLES, Text, cut, data_bytes, identifiers
+from .records import pack_record, records
 
 STAMP_PERIOD_MS = 60_000
 """An adapter's time stamps start again after so many milliseconds."""
 
-_RETURN = 0x0D
-_BELL = 0x07
+_FRAME = r"([tr][0-9A-Fa-f]{3}|[TRx][0-9A-Fa-f]{8})([0-8])([0-9A-Fa-f]*)"  # x: CANDapter's T
+_FRAMES = re.compile(rf"(?<![^\r]){_FRAME}\r")
+_ONE = re.compile(_FRAME)
+_END = re.compile(r"[\r\a]")
+_FD = re.compile(r"(?:[db][0-9A-Fa-f]{3}|[DB][0-9A-Fa-f]{8})[0-9A-Fa-f]+")
+_ANSWERS = "zZVvNF"  # acknowledged, version, serial number, status
 _LONGEST = 200  # a CAN FD frame with 64 bytes has 142
+_HIGHEST_STANDARD = 0x7FF
+_HIGHEST_EXTENDED = 0x1FFF_FFFF
 _NS_PER_MS = 1_000_000
-
-
-def _kinds(letters: bytes) -> NDArray[np.bool_]:
-    table = np.zeros(256, dtype=np.bool_)
-    table[list(letters)] = True
-    return table
-
-
-_FRAME = _kinds(b"tTrRx")  # x: an extended frame in CANDapter's dialect
-_EXTENDED = _kinds(b"TRx")
-_REMOTE = _kinds(b"rR")
-_FD = _kinds(b"dDbB")
-_ANSWER = _kinds(b"zZVvNF")  # acknowledged, version, serial number, status
 
 
 class SlcanText:
@@ -47,7 +41,7 @@ class SlcanText:
             stamps: Whether the adapter was asked to stamp its frames, so that their device time
                 is taken from it.
         """
-        self._stamps = _StampClock() if stamps else None
+        self._stamps = StampClock() if stamps else None
         self._rest = b""
 
     def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> FrameArray:
@@ -61,109 +55,92 @@ class SlcanText:
         Returns:
             The frames whose lines have ended.
         """
-        text = self._rest + chunk
-        end = max(text.rfind(b"\r"), text.rfind(b"\a")) + 1
-        self._rest = text[end:]
+        whole = self._rest + chunk
+        end = max(whole.rfind(b"\r"), whole.rfind(b"\a")) + 1
+        self._rest = whole[end:]
         if len(self._rest) > _LONGEST:
             self._rest = b"?"  # noise: its end, when it comes, is one malformed line
-        if not end:
-            return empty_frames(0)
-        array = np.frombuffer(text, dtype=np.uint8, count=end)
-        is_bell = array == _BELL
-        ends = np.flatnonzero((array == _RETURN) | is_bell)
-        starts = np.empty_like(ends)
-        starts[0] = 0
-        starts[1:] = ends[:-1] + 1
-        tally.malformed("the adapter reports an error (bell)", int(np.count_nonzero(is_bell)))
-        return self._lines(array, starts, ends - starts, t_ns, tally)
+        text = whole[:end].decode("latin-1")  # any byte is some character
+        found: list[tuple[str, str, str]] = _FRAMES.findall(text)
+        if len(found) != text.count("\r") or "\a" in text:
+            found = _line_by_line(text, tally)
+        packed = [record for fields in found if (record := self._record(*fields, t_ns))]
+        tally.malformed("malformed line", len(found) - len(packed))
+        return records(packed)
 
-    def _lines(
-        self,
-        text: Text,
-        starts: NDArray[np.intp],
-        sizes: NDArray[np.intp],
-        t_ns: int,
-        tally: Tally,
-    ) -> FrameArray:
-        kinds = text[starts]
-        is_frame = _FRAME[kinds]
-        if not is_frame.all():
-            others = kinds[~is_frame & (sizes > 0)]
-            fd = int(np.count_nonzero(_FD[others]))
-            if fd:
-                tally.events.say("warn", "CAN FD frame left out", fd)
-            tally.malformed("malformed line", len(others) - fd - int(_ANSWER[others].sum()))
-            starts, sizes, kinds = starts[is_frame], sizes[is_frame], kinds[is_frame]
-        extended = _EXTENDED[kinds]
-        remote = _REMOTE[kinds]
-        widths = np.where(extended, 8, 3)
-        lengths = NIBBLES[text.take(starts + 1 + widths, mode="clip")].astype(np.intp)
-        plain = 2 + widths + np.where(remote, 0, 2 * lengths)
-        stamped = sizes == plain + 4
-        ids, good = identifiers(text, starts + 1, widths)
-        good &= (lengths <= 8) & (stamped | (sizes == plain))
-        good &= ids <= np.where(extended, 0x1FFF_FFFF, 0x7FF)
-        carried = np.where(remote | ~good, 0, lengths)
-        data, digits = data_bytes(text, starts + 2 + widths, carried)
-        good &= digits
-        times, timed = self._times(text, starts + plain, stamped, good, t_ns)
-        good &= timed
-        tally.malformed("malformed line", int(np.count_nonzero(~good)))
-        frames = empty_frames(len(starts))
-        frames["t_device_ns"] = times
-        frames["t_host_ns"] = t_ns
-        frames["id_flags"] = (
-            ids | extended * np.uint32(EXTENDED_FLAG) | remote * np.uint32(REMOTE_FLAG)
-        )
-        frames["dlc"] = lengths
-        frames["data"] = data
-        return frames if good.all() else frames[good]
-
-    def _times(
-        self,
-        text: Text,
-        starts: NDArray[np.intp],
-        stamped: NDArray[np.bool_],
-        good: NDArray[np.bool_],
-        t_ns: int,
-    ) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
-        """Device times [ns], and which of them can be read; shape (n,) both."""
-        times = np.full(len(starts), t_ns, dtype=np.uint64)
-        if self._stamps is None:
-            return times, np.ones(len(starts), dtype=np.bool_)
-        raw = NIBBLES[cut(text, starts, 4)].astype(np.int64)
-        digits = (raw < 16).all(axis=1)
-        raw_ms = raw @ np.array([4096, 256, 16, 1])
-        timed = stamped & digits & (raw_ms < STAMP_PERIOD_MS)
-        use = timed & good
-        if use.any():
-            times[use] = self._stamps.unwrap(raw_ms[use], t_ns)
-        elif not self._stamps.started:
-            return times, np.ones(len(starts), dtype=np.bool_)  # it was asked, and gives none
-        return times, timed
+    def _record(self, head: str, digit: str, rest: str, t_ns: int) -> bytes | None:
+        """A frame's record; None if its line is malformed."""
+        kind = head[0]
+        flags = int(head[1:], 16)
+        length = int(digit)
+        digits = 2 * length
+        if kind in "TRx":
+            if flags > _HIGHEST_EXTENDED:
+                return None
+            flags |= EXTENDED_FLAG
+        elif flags > _HIGHEST_STANDARD:
+            return None
+        if kind in "rR":
+            flags |= REMOTE_FLAG
+            digits = 0
+        extra = len(rest) - digits
+        if extra not in (0, 4):
+            return None
+        device_ns: int | None = t_ns
+        if self._stamps is not None:
+            device_ns = self._stamps.time_ns(rest[digits:], t_ns)
+            if device_ns is None:
+                return None
+        return pack_record(device_ns, t_ns, flags, length, 0, bytes.fromhex(rest[:digits]))
 
 
-class _StampClock:
+class StampClock:
     """Counts the minutes that an adapter's stamps leave out."""
 
     def __init__(self) -> None:
-        self.started = False
-        self._last_ms = 0
+        """Start before the first stamp."""
+        self._last_ms: int | None = None
         self._last_host_ns = 0
 
-    def unwrap(self, raw_ms: NDArray[np.int64], t_ns: int) -> NDArray[np.uint64]:
-        """Device times [ns] of frames read at one time, shape (n,)."""
-        half = STAMP_PERIOD_MS // 2
-        first = int(raw_ms[0])
-        if self.started:
-            # A pause may have taken minutes: the host's clock tells how many.
-            expected = self._last_ms + (t_ns - self._last_host_ns) // _NS_PER_MS
-            first += STAMP_PERIOD_MS * ((expected - first + half) // STAMP_PERIOD_MS)
-            first = max(first, first % STAMP_PERIOD_MS)
-        steps = np.diff(raw_ms)
-        steps = (steps + half) % STAMP_PERIOD_MS - half
-        total = first + np.concatenate([[0], np.cumsum(steps)])
-        self.started = True
-        self._last_ms = int(total[-1])
-        self._last_host_ns = t_ns
-        return (np.maximum(total, 0) * _NS_PER_MS).astype(np.uint64)
+    def time_ns(self, stamp: str, host_ns: int) -> int | None:
+        """The device's time of a frame.
+
+        Args:
+            stamp: Four digits of milliseconds; empty if the adapter gave none.
+            host_ns: When the frame was read [Unix ns]: it tells how many minutes a pause took.
+
+        Returns:
+            Time on the adapter's clock [ns]; the host's if it never gave a stamp; None if it did,
+            but not now, or if the stamp is beyond a minute.
+        """
+        if not stamp:
+            return host_ns if self._last_ms is None else None
+        time_ms = int(stamp, 16)
+        if time_ms >= STAMP_PERIOD_MS:
+            return None
+        if self._last_ms is not None:
+            half = STAMP_PERIOD_MS // 2
+            expected = self._last_ms + (host_ns - self._last_host_ns) // _NS_PER_MS
+            minutes = (expected - time_ms + half) // STAMP_PERIOD_MS
+            time_ms += STAMP_PERIOD_MS * max(0, minutes)
+        self._last_ms, self._last_host_ns = time_ms, host_ns
+        return time_ms * _NS_PER_MS
+
+
+def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
+    """The fields of the frames in a chunk that has other things in it too."""
+    tally.malformed("the adapter reports an error (bell)", text.count("\a"))
+    found: list[tuple[str, str, str]] = []
+    fd = malformed = 0
+    for line in _END.split(text):
+        frame = _ONE.fullmatch(line)
+        if frame is not None:
+            found.append((frame[1], frame[2], frame[3]))
+        elif _FD.fullmatch(line):
+            fd += 1
+        elif line and line[0] not in _ANSWERS:
+            malformed += 1
+    tally.malformed("malformed line", malformed)
+    if fd:
+        tally.events.say("warn", "CAN FD frame left out", fd)
+    return found

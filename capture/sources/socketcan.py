@@ -42,24 +42,24 @@ _PACKETS = 256
 _MOST_BATCHES = 64
 
 
-def frames_of(batch: Batch, t_host_ns: np.ndarray[tuple[int], np.dtype[np.uint64]]) -> FrameArray:
+def frames_of(batch: Batch, times_ns: Sequence[int]) -> FrameArray:
     """Turn the kernel's frames into ours.
 
     Args:
         batch: Packets of a raw CAN socket; those that aren't classic frames are left out.
-        t_host_ns: Their arrival [Unix ns], shape (n,).
+        times_ns: Their arrival [Unix ns].
 
     Returns:
         The classic frames; device and host time are both the arrival.
     """
-    classic = batch.sizes == CAN_MTU
-    raw = np.ascontiguousarray(batch.packets[classic, :CAN_MTU]).view(_CAN_FRAME)[:, 0]
-    frames = empty_frames(len(raw))
-    frames["t_device_ns"] = frames["t_host_ns"] = t_host_ns[classic]
+    rows = [row for row, size in enumerate(batch.sizes) if size == CAN_MTU]
+    raw = batch.packets[rows, :CAN_MTU].view(_CAN_FRAME)[:, 0]
+    frames = empty_frames(len(rows))
+    frames["t_device_ns"] = frames["t_host_ns"] = [times_ns[row] for row in rows]
     frames["id_flags"] = raw["id"]
     frames["dlc"] = raw["len"]
-    local = (batch.flags[classic] & socket.MSG_DONTROUTE) != 0
-    frames["dir"] = np.where(local, DIR_TX, DIR_RX)
+    local = socket.MSG_DONTROUTE
+    frames["dir"] = [DIR_TX if batch.flags[row] & local else DIR_RX for row in rows]
     frames["data"] = raw["data"]
     return frames
 
@@ -108,7 +108,7 @@ class SocketcanLink:
                 break
             if len(batch.sizes):
                 times = self._clock.times(batch.stamps_ns, self._floor_ns)
-                self._floor_ns = int(times[-1])
+                self._floor_ns = times[-1]
                 found.append(frames_of(batch, times))
                 self._count(batch)
             else:
@@ -124,10 +124,10 @@ class SocketcanLink:
         self._socket.close()
 
     def _count(self, batch: Batch) -> None:
-        fd = int(np.count_nonzero(batch.sizes == CANFD_MTU))
+        fd = batch.sizes.count(CANFD_MTU)
         if fd:
             self._tally.events.say("warn", "CAN FD frame left out", fd)
-        odd = len(batch.sizes) - fd - int(np.count_nonzero(batch.sizes == CAN_MTU))
+        odd = len(batch.sizes) - fd - batch.sizes.count(CAN_MTU)
         self._tally.malformed("packet that is no CAN frame", odd)
         if batch.drops is not None and batch.drops != self._drops:
             lost = (batch.drops - self._drops) % 2**32

@@ -41,6 +41,7 @@ class SocketcandLink:
         """
         self._socket = sock
         self._first = first
+        self._buffer = memoryview(bytearray(_CHUNK))
         self._text = SocketcandText()
         self._tally = tally
         self._error: OSError | None = None
@@ -65,11 +66,13 @@ class SocketcandLink:
         size = 0
         try:
             while size < _MOST_BYTES:
-                chunk = self._socket.recv(_CHUNK)
-                if not chunk:
+                count = self._socket.recv_into(self._buffer)
+                if not count:
                     raise ConnectionResetError(errno.ECONNRESET, "the server closed the connection")
-                chunks.append(chunk)
-                size += len(chunk)
+                chunks.append(self._buffer[:count].tobytes())
+                size += count
+                if count < len(self._buffer):
+                    break
         except BlockingIOError:
             pass
         except OSError as error:

@@ -10,19 +10,10 @@ decimals, and whatever is broken.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
-import numpy as np
-
-from ..log.frames import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    ID_MASK,
-    REMOTE_FLAG,
-    FrameArray,
-    empty_frames,
-)
+from ..log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
 from .events import Tally
+from .records import pack_record, records
 
 _FRAMES = re.compile(
     r"< frame ([0-9A-Fa-f]{1,8}) (\d{1,10})\.(\d{6}) ((?:[0-9A-Fa-f]{2} ?){0,8}) ?>", re.ASCII
@@ -38,16 +29,6 @@ _TOLD = re.compile(r"< *(error\b[^>]*?) *>")
 _LONGEST = 400  # a CAN FD frame with 64 bytes and blanks has about 220
 _HIGHEST_STANDARD = 0x7FF
 _HIGHEST_EXTENDED = 0x1FFF_FFFF
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """A frame that was read on its own."""
-
-    t_ns: int
-    id_flags: int
-    length: int
-    data: bytes
 
 
 class SocketcandText:
@@ -75,52 +56,38 @@ class SocketcandText:
             self._rest = b"<"  # noise: its end, when it comes, is one malformed message
         text = whole[:end].decode("latin-1")  # any byte is some character
         found: list[tuple[str, str, str, str]] = _FRAMES.findall(text)
-        frames = None
+        packed = None
         if len(found) == text.count("<") == text.count(">"):
-            frames = _together(found)
-        if frames is None:
-            frames = _one_by_one(text, tally)
-        frames["t_host_ns"] = t_ns
-        return frames
+            packed = _together(found, t_ns)
+        if packed is None:
+            packed = _one_by_one(text, t_ns, tally)
+        return records(packed)
 
 
-def _together(found: list[tuple[str, str, str, str]]) -> FrameArray | None:
-    """Frames from their fields; None if an identifier is too high for its number of digits."""
-    frames = empty_frames(len(found))
-    if not found:
-        return frames
-    identifiers, seconds, micros, fields = zip(*found, strict=True)
-    frames["t_device_ns"] = [
-        int(whole + part) * 1000 for whole, part in zip(seconds, micros, strict=True)
-    ]
-    ids = np.array([int(digits, 16) for digits in identifiers], dtype=np.uint32)
-    extended = np.array([len(digits) for digits in identifiers]) > 3
-    if (ids > np.where(extended, _HIGHEST_EXTENDED, _HIGHEST_STANDARD)).any():
-        return None
-    frames["id_flags"] = ids | extended * np.uint32(EXTENDED_FLAG)
-    data = [field.replace(" ", "") for field in fields]
-    frames["dlc"] = [len(digits) // 2 for digits in data]
-    padded = bytes.fromhex("".join([digits.ljust(16, "0") for digits in data]))
-    frames["data"] = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 8)
-    return frames
+def _together(found: list[tuple[str, str, str, str]], t_ns: int) -> list[bytes] | None:
+    """Records from their fields; None if an identifier is too high for its number of digits."""
+    packed: list[bytes] = []
+    for digits, seconds, micros, field in found:
+        flags = int(digits, 16)
+        if len(digits) > 3:
+            if flags > _HIGHEST_EXTENDED:
+                return None
+            flags |= EXTENDED_FLAG
+        elif flags > _HIGHEST_STANDARD:
+            return None
+        data = bytes.fromhex(field)
+        packed.append(pack_record(int(seconds + micros) * 1000, t_ns, flags, len(data), 0, data))
+    return packed
 
 
-def _one_by_one(text: str, tally: Tally) -> FrameArray:
+def _one_by_one(text: str, t_ns: int, tally: Tally) -> list[bytes]:
     messages = _MESSAGE.findall(text)
     broken = text.count("<") + text.count(">") - 2 * len(messages)
     tally.malformed("malformed message", broken)
-    read = [frame for message in messages if (frame := _frame(message, tally)) is not None]
-    frames = empty_frames(len(read))
-    if read:
-        frames["t_device_ns"] = [frame.t_ns for frame in read]
-        frames["id_flags"] = [frame.id_flags for frame in read]
-        frames["dlc"] = [frame.length for frame in read]
-        padded = b"".join(frame.data.ljust(8, b"\0") for frame in read)
-        frames["data"] = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 8)
-    return frames
+    return [record for message in messages if (record := _record(message, t_ns, tally))]
 
 
-def _frame(message: str, tally: Tally) -> _Frame | None:
+def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     """Read one message; None if it is no frame."""
     found = _ANY.fullmatch(message)
     if found is None:
@@ -134,7 +101,7 @@ def _frame(message: str, tally: Tally) -> _Frame | None:
     t_ns = int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))
     identifier = int(digits, 16)
     if kind == "error":  # the server keeps the details to itself
-        return _Frame(t_ns, identifier & ID_MASK | ERROR_FLAG, 0, b"")
+        return pack_record(t_ns, t_host_ns, identifier & ID_MASK | ERROR_FLAG, 0, 0, b"")
     extended = len(digits) > 3
     flags = extended * EXTENDED_FLAG
     rest = rest.replace(" ", "")
@@ -151,4 +118,4 @@ def _frame(message: str, tally: Tally) -> _Frame | None:
     if data is None or not 0 <= length <= 8 or identifier > highest:
         tally.malformed("malformed message", 1)
         return None
-    return _Frame(t_ns, identifier | flags, length, data)
+    return pack_record(t_ns, t_host_ns, identifier | flags, length, 0, data)

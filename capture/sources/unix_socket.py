@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import SourceError, UsageError
 from ..log.frames import FrameArray, frames_from_bytes
@@ -33,6 +32,13 @@ from .receive_many import SO_TIMESTAMPNS, ArrivalClock, Batch, ReceiveMany
 _PACKETS = 128
 _MOST_BATCHES = 64  # in one poll, of one sender: others want to be heard too
 _BACKLOG = 64
+_SHAPES = {
+    head + count * RECORD_SIZE: (count, head)
+    for head in (0, HEAD.size)
+    for count in range(MOST_RECORDS + 1)
+    if head or count
+}
+"""Size of a packet to its number of records and the size of its head."""
 _GONE = select.EPOLLHUP | select.EPOLLRDHUP | select.EPOLLERR
 
 
@@ -220,14 +226,14 @@ class UnixSource:
             except ConnectionError:
                 self._forget(sender)
                 return
-            if not batch.sizes.all():  # beyond a sender's last packet, reads are empty
+            if 0 in batch.sizes:  # beyond a sender's last packet, reads are empty
                 gone = gone or _hung_up(sender.sock)
-            if gone and not batch.sizes.any():
+            if gone and not any(batch.sizes):
                 self._forget(sender)
                 return
             if len(batch.sizes):
                 times = self._arrivals.times(batch.stamps_ns, sender.floor_ns)
-                sender.floor_ns = int(times[-1])
+                sender.floor_ns = times[-1]
                 frames = self._unpack(sender, batch, times, gone)
                 if len(frames):
                     found.append(frames)
@@ -236,28 +242,28 @@ class UnixSource:
             if len(batch.sizes) < self._receive.capacity and not gone:
                 return
 
-    def _unpack(
-        self, sender: _Sender, batch: Batch, times: NDArray[np.uint64], gone: bool
-    ) -> FrameArray:
-        heads = batch.sizes % RECORD_SIZE
-        counts = batch.sizes // RECORD_SIZE
-        good = (heads == 0) & (counts > 0) | (heads == HEAD.size)
-        good &= (counts <= MOST_RECORDS) & (batch.flags & socket.MSG_TRUNC == 0)
-        if not good.all():
-            bad = ~good & (batch.sizes > 0) if gone else ~good
-            self._tally.malformed("malformed packet", int(np.count_nonzero(bad)))
+    def _unpack(self, sender: _Sender, batch: Batch, times: list[int], gone: bool) -> FrameArray:
         flat = batch.packets.reshape(-1).data
         width = batch.packets.shape[1]
         pieces: list[memoryview] = []
-        rows = zip(batch.sizes.tolist(), heads.tolist(), good.tolist(), strict=True)
-        for row, (size, head, fits) in enumerate(rows):
-            if not fits:
+        arrivals: list[int] = []
+        counts: list[int] = []
+        malformed = 0
+        for row, (size, time_ns) in enumerate(zip(batch.sizes, times, strict=True)):
+            shape = _SHAPES.get(size)  # one that is too long is cut to a size that isn't there
+            if shape is None:
+                malformed += bool(size) or not gone
                 continue
+            count, head = shape
+            start = row * width
             if head:
-                self._prove(sender, flat[row * width : row * width + head], size // RECORD_SIZE)
-            pieces.append(flat[row * width + head : row * width + size])
+                self._prove(sender, flat[start : start + head], count)
+            pieces.append(flat[start + head : start + size])
+            arrivals.append(time_ns)
+            counts.append(count)
+        self._tally.malformed("malformed packet", malformed)
         frames = frames_from_bytes(memoryview(bytearray().join(pieces)))
-        frames["t_host_ns"] = np.repeat(times[good], counts[good])
+        frames["t_host_ns"] = np.repeat(np.array(arrivals, dtype=np.uint64), counts)
         return frames
 
     def _prove(self, sender: _Sender, head: memoryview, count: int) -> None:

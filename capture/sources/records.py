@@ -1,0 +1,24 @@
+"""Frames packed one by one: for a few dozen at a time, cheaper than numpy's columns."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+
+from ..log.frames import FrameArray, frames_from_bytes
+
+pack_record = struct.Struct("<QQIBB2x8s").pack
+"""Packs ``t_device_ns, t_host_ns, id_flags, dlc, dir, data`` as
+:data:`capture.log.frames.FRAME_DTYPE` has them; data is filled with zeros."""
+
+
+def records(packed: Iterable[bytes]) -> FrameArray:
+    """Put packed records together.
+
+    Args:
+        packed: What :data:`pack_record` gave.
+
+    Returns:
+        Shape (n,), writeable.
+    """
+    return frames_from_bytes(memoryview(bytearray().join(packed)))
