@@ -58,7 +58,8 @@ class DiskThread:
         self._queue: SimpleQueue[_Bytes | _Finish | None] = SimpleQueue()
         self._failure: LogWriteError | None = None
         self._shortage: LogWriteError | None = None
-        self._queued = 0
+        self._queued = 0  # counted by the recorder's thread,
+        self._ends = 0  # and by this one
         self._written = 0
         self._hash = ""
         self._unsynced = 0
@@ -79,7 +80,12 @@ class DiskThread:
     @property
     def backlog(self) -> int:
         """Bytes given and not yet written."""
-        return self._queued - self._written
+        return self.bytes_given - self._written
+
+    @property
+    def bytes_given(self) -> int:
+        """Bytes of all parts so far, written or not."""
+        return self._queued + self._ends
 
     def write(self, part: PartStream, covered: int) -> None:
         """Hand over what a part has queued.
@@ -155,7 +161,7 @@ class DiskThread:
                 write_description(item.writer, record)
             item.writer.finish()
             pieces = part.take()
-            self._queued += sum(map(len, pieces))
+            self._ends += sum(map(len, pieces))
             self._put(part, pieces)
             self._covered = max(self._covered, item.covered)
             self._sync(part)

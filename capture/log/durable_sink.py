@@ -90,7 +90,6 @@ class DurableSink:
         self._messages: int = 0
         self._refused: LogWriteError | None = None
         self._part_began: int = 0
-        self._finished_bytes = 0
         self._split_trouble: UndulogError | None = None
         self._open = True
         if not force:
@@ -135,7 +134,7 @@ class DurableSink:
     @property
     def bytes_written(self) -> int:
         """Bytes of MCAP so far, over all parts; the open chunk is not in it."""
-        return self._finished_bytes + self._part.size
+        return self._disk.bytes_given
 
     @property
     def backlog(self) -> int:
@@ -254,7 +253,6 @@ class DurableSink:
             raise
         end = Metadata(PART_RECORD, {"part": str(former.number), "next": following.path.name})
         self._disk.finish(former, writer, (end,), self._wal.position)
-        self._finished_bytes += former.size
         self._part, self._part_began = following, self._messages
         self._writer = self._new_writer()
         for record in (*self._known, begin):
