@@ -9,7 +9,6 @@ a tick: it takes what has come, within a budget, and waits for nobody.
 
 from __future__ import annotations
 
-import json
 import selectors
 import socket
 from collections.abc import Callable, Iterator, Mapping
@@ -19,22 +18,17 @@ from time import perf_counter_ns
 from typing import Any, Final, cast
 
 from ..errors import ControlError, UndulogError
+from .control_lines import BUFFER, TOO_LONG, Reply, read_request, refusal, reply_line
 from .control_socket import listen, release
 
 MAX_CLIENTS = 16
 """More than these and the one that was silent for longest is let go."""
-
-BUFFER = 64 * 1024
-"""Longest request, and the most replies that wait for a client that doesn't read [B]."""
 
 BUDGET_NS = 1_000_000
 """After so long in one poll the remaining requests wait for the next one [ns]."""
 
 _READ = 16 * 1024
 _MOST_FAULTS = 8
-_TOO_LONG = f"a request is longer than {BUFFER} bytes"
-
-Reply = Mapping[str, Any]
 
 
 class _Later:
@@ -156,7 +150,7 @@ class ControlServer:
         release(self.path, self._listener, self._identity)
         for client in list(self._clients.values()):
             if client.waits and farewell is not None:
-                client.outgoing += _line({"ok": True, **farewell})
+                client.outgoing += reply_line({"ok": True, **farewell})
             self._send(client)
             self._drop(client)
         self._selector.close()
@@ -175,7 +169,7 @@ class ControlServer:
                 return
             if len(self._clients) >= MAX_CLIENTS:
                 silent = min(self._clients.values(), key=lambda client: client.heard)
-                silent.outgoing += _refusal(f"{MAX_CLIENTS} others are connected")
+                silent.outgoing += refusal(f"{MAX_CLIENTS} others are connected")
                 self._send(silent)
                 self._drop(silent)
             connection.setblocking(False)
@@ -212,27 +206,27 @@ class ControlServer:
                 client.more = not client.waits and _has_request(client)
                 return
         if len(client.incoming) > BUFFER:
-            client.outgoing += _refusal(_TOO_LONG)
+            client.outgoing += refusal(TOO_LONG)
             client.incoming.clear()
             client.closing = True
 
     def _reply(self, line: bytes) -> bytes | _Later:
         self.requests += 1
-        request = _request(line)
+        request = read_request(line)
         if isinstance(request, str):
-            return _refusal(request)
+            return refusal(request)
         try:
             reply = self._handler(request)
             if isinstance(reply, _Later):
                 return reply
-            data = _line({"ok": True, **reply})
+            data = reply_line({"ok": True, **reply})
         except UndulogError as error:
-            return _refusal(str(error))
+            return refusal(str(error))
         except Exception as error:  # noqa: BLE001 - the recording goes on, whatever was asked
             if len(self._faults) < _MOST_FAULTS:
                 self._faults.append(f"a request failed with {error!r}: {line[:80]!r}")
-            return _refusal(f"a mistake of the recorder's own: {error!r}")
-        return data if len(data) <= BUFFER else _refusal(f"the reply has {len(data)} bytes")
+            return refusal(f"a mistake of the recorder's own: {error!r}")
+        return data if len(data) <= BUFFER else refusal(f"the reply has {len(data)} bytes")
 
     def _send(self, client: _Client) -> None:
         """Send what the socket takes; listen to the client only while its replies get through."""
@@ -291,28 +285,3 @@ def _lines(client: _Client) -> Iterator[bytes]:
 def _has_request(client: _Client) -> bool:
     # The last request of a client that has ended may lack its newline.
     return b"\n" in client.incoming or (client.ended and bool(client.incoming))
-
-
-def _request(line: bytes) -> dict[str, Any] | str:
-    """The request, or what is wrong with the line."""
-    if len(line) > BUFFER:
-        return _TOO_LONG
-    try:
-        request = json.loads(line, parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        return f"not JSON: {error}"
-    if not isinstance(request, dict):
-        return 'a request is a JSON object such as {"do": "status"}'
-    return cast("dict[str, Any]", request)
-
-
-def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON number")
-
-
-def _line(reply: Reply) -> bytes:
-    return json.dumps(reply, allow_nan=False).encode() + b"\n"
-
-
-def _refusal(error: str) -> bytes:
-    return _line({"ok": False, "error": error})

@@ -21,8 +21,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from capture.daemon import control
-from capture.daemon.control import BUFFER, LATER, MAX_CLIENTS, ControlServer
+from capture.daemon.control import LATER, MAX_CLIENTS, ControlServer
 from capture.daemon.control_client import ControlClient
+from capture.daemon.control_lines import BUFFER
 from capture.daemon.control_requests import OPERATOR, OperatorLog, request_handler
 from capture.daemon.control_socket import default_socket, find_sockets, socket_folder
 from capture.errors import ControlError, DataError
