@@ -122,12 +122,17 @@ def record(
 def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
     from .daemon.notify import Notifier
     from .daemon.record import Recording
+    from .daemon.terminal import Terminal
 
+    terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:
-        recording = Recording(settings, stop, notifier=Notifier(os.environ))
+        recording = Recording(settings, stop, show=terminal.show, notifier=Notifier(os.environ))
         if settings.live:
             _start_relay(recording.live_socket, relay)
-        return recording.run()
+        try:
+            return recording.run()
+        finally:
+            terminal.close()
 
 
 def _start_relay(socket: Path, relay: ExitStack) -> None:

@@ -86,6 +86,8 @@ class Recording:
         self._snapshot: RecorderSnapshot | None = None
         socket = settings.socket or default_socket(settings.output, os.environ)
         with ExitStack() as opened:  # what is open is closed again if the next thing fails
+            self._control = ControlServer(socket)  # first: two recorders never share one
+            opened.callback(self._control.close)
             self._feed = LiveFeed(socket.with_suffix(".live"))
             opened.callback(self._feed.close)
             self._storage = open_storage(settings)
@@ -114,7 +116,7 @@ class Recording:
             )
             self._recorder.on_event(self._note_event)
             log = OperatorLog(self._writer, self._recorder.say, self._clock.now_ns)
-            self._control = ControlServer(socket, request_handler(self, log))
+            self._control.serve(request_handler(self, log))
             opened.pop_all()
 
     @property
@@ -165,8 +167,7 @@ class Recording:
         Raises:
             LogWriteError: If that file can't be created.
         """
-        del text
-        return self._storage.mark()
+        return self._storage.mark(text)
 
     def split(self) -> Mapping[str, Any]:
         """Begin a new part.
@@ -195,6 +196,10 @@ class Recording:
         """Take a new snapshot."""
         self._health.update(self._clock.now_ns())
         self._storage.tick()
+        for level, text in self._storage.take_events():
+            self._recorder.say(level, "recorder", text)
+        for text in self._control.take_faults():
+            self._recorder.say("error", "recorder", text)
         self._snapshot = self._new_snapshot("recording")
         return self._snapshot
 

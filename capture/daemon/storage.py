@@ -10,6 +10,7 @@ from ..errors import LogWriteError
 from ..log.durable_sink import DurableSink
 from ..log.part_names import part_path
 from ..log.sink import MessageSink
+from .ring_storage import RingStorage
 from .settings import RecordSettings
 
 _NS = 1_000_000_000
@@ -61,8 +62,19 @@ class Storage(Protocol):
         """
         ...
 
-    def mark(self) -> Mapping[str, Any]:
+    def take_events(self) -> tuple[tuple[str, str], ...]:
+        """What there is to say since the last call.
+
+        Returns:
+            Level (``info``, ``warn``, ``error``) and one sentence each.
+        """
+        ...
+
+    def mark(self, text: str = "") -> Mapping[str, Any]:
         """Mark this moment.
+
+        Args:
+            text: Why.
 
         Returns:
             What there is to say of it.
@@ -109,6 +121,7 @@ class DiskStorage:
             split_size=settings.split_size,
             split_ns=None if split_s is None else round(split_s * _NS),
         )
+        self._told = ""
 
     @property
     def path(self) -> Path:
@@ -148,8 +161,25 @@ class DiskStorage:
         """
         self.sink.tick()
 
-    def mark(self) -> Mapping[str, Any]:
-        """Nothing to do: everything is written, the mark with it."""
+    def take_events(self) -> tuple[tuple[str, str], ...]:
+        """Parts that could not be begun, once each.
+
+        Returns:
+            Level and one sentence each.
+        """
+        trouble = self.sink.split_trouble
+        if trouble is None or str(trouble) == self._told:
+            return ()
+        self._told = str(trouble)
+        return (("error", f"the next part could not be begun, this one goes on: {trouble}"),)
+
+    def mark(self, text: str = "") -> Mapping[str, Any]:
+        """Nothing to do: everything is written, the mark with it.
+
+        Args:
+            text: Why.
+        """
+        del text
         return {}
 
     def split(self) -> Mapping[str, Any]:
@@ -183,4 +213,6 @@ def open_storage(settings: RecordSettings) -> Storage:
         OutputExistsError: If the output is there and ``force`` is not given.
         LogWriteError: If it can't be created.
     """
+    if settings.ring_s is not None:
+        return RingStorage(settings.output, settings.ring_s)
     return DiskStorage(settings)
