@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 import shutil
 import subprocess
 from fractions import Fraction
@@ -23,6 +24,7 @@ from capture.daemon.setting_values import PARSERS
 from capture.daemon.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, resolve
 from capture.errors import DataError, SettingsError, UsageError
 
+MANUAL = Path(__file__).parents[2] / "docs" / "recording.md"
 NEEDED = {"sources": ("can:virtual:a",), "output": "run.mcap"}
 
 
@@ -123,7 +125,6 @@ GOOD = {  # three different values a setting: for the file, the environment, the
     "sources": (["a:1"], "b:1 'c:2 3'", ("d:1",)),
     "robot": ("snake25", "snake13", "arcsnake-joint"),
     "bus": ("can0", "rear", "front"),
-    "bus": ("can0", "can1", "can2"),
     "output": ("a.mcap", "b.mcap", Path("c.mcap")),
     "force": (True, "no", True),
     "duration": ("1h30min", "90", 2.5),
@@ -193,6 +194,17 @@ def test_every_setting_is_tested_and_the_docstring_s_example_holds_all(tmp_path)
         assert settings.metadata == {"place": "tank 2"}
         left = {"split_size", "split_time"} if ring else {"ring"}
         assert {name for name in PARSERS if settings.origin[name] == "default"} == left
+
+
+@pytest.mark.skipif(not MANUAL.is_file(), reason="the manual is not here")
+def test_the_manual_s_example_works_and_its_table_has_every_setting(tmp_path):
+    text = MANUAL.read_text().split("## Control", 1)[0]
+    example = text.split("```toml\n", 1)[1].split("```", 1)[0]
+    (tmp_path / "snake.toml").write_text(example)
+    settings = resolve({"operator": "ann"}, {}, tmp_path / "snake.toml")
+    assert settings.split_time_s == 600.0
+    rows = "".join(line.split("|")[1] for line in text.splitlines() if line.startswith("| `"))
+    assert set(re.findall(r"`(\w+)`", rows)) == set(PARSERS)
 
 
 def test_defaults():
