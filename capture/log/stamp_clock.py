@@ -18,6 +18,9 @@ _NS = 1_000_000_000
 _FAR_NS = 3600 * _NS
 """Stamps further than this from the log time are on another clock."""
 
+_NEVER_NS = 2**62
+"""No log time lies beyond this [Unix ns], the year 2116: such a one is damage."""
+
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
@@ -69,7 +72,7 @@ class StampClock:
             for path in _STAMP
         )
         stamp_ns = sec * _NS + nanosec
-        if not stamp_ns:
+        if not stamp_ns or not 0 <= log_ns < _NEVER_NS:
             return None
         if abs(log_ns - stamp_ns) <= _FAR_NS:
             return 0

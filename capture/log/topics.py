@@ -152,13 +152,14 @@ class Topics:
             MissingChannelError: If the log has no such topic.
             DataError: If the topic's schema can't be used.
         """
-        from mcap_ros2.decoder import DecoderFactory, McapROS2DecodeError
+        from mcap_ros2.decoder import DecoderFactory
 
         schema = self._schema(topic)
+        self.message_type(topic)  # ours says more of a damaged schema, and says it once
         where = f"{self._file.path}: {topic}"
         try:
             decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
-        except (McapROS2DecodeError, ValueError) as error:
+        except Exception as error:  # the library's parser has no error tree of its own
             raise DataError(f"{where}: its schema can't be used: {error}") from error
 
         def checked(message: bytes) -> Any:
