@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from capture.daemon.live_wire import MAX_DATAGRAM, DatagramHead, Kind, read_head
+from capture.daemon.live_wire import HEAD_SIZE, MAX_DATAGRAM, DatagramHead, Kind, read_head
 from capture.errors import DataError, UsageError
 
 _LOOK_S = 0.01
@@ -130,7 +130,7 @@ class Inbox:
 
 def _said(datagram: Datagram) -> bytes:
     """What tells definitions from their repetition: all but the counter in the head."""
-    return bytes([datagram.head.kind]) + datagram.data[-(len(datagram.data) - 24) :]
+    return bytes([datagram.head.kind]) + datagram.data[HEAD_SIZE:]
 
 
 def _bind(path: Path) -> tuple[socket.socket, int]:

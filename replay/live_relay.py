@@ -94,6 +94,7 @@ class Relay:
         self._shown = self._refused = 0
         self._unread_before = self._dropped_before = self._dropped = 0
         self._lags: deque[float] = deque(maxlen=_LAGS_KEPT)
+        self._states: list[LiveMessage] = []
 
     @property
     def report(self) -> RelayReport:
@@ -165,6 +166,7 @@ class Relay:
         self._dropped_before += self._dropped
         self._dropped = 0
         self._feed_id, self._log, self._scene, self.ended = feed_id, LiveLog(), None, False
+        self._states.clear()
         return True
 
     def _take(self, datagram: Datagram, pending: list[LiveMessage]) -> None:
@@ -174,10 +176,12 @@ class Relay:
             self.ended = False  # it was only silent
         try:
             for record in read_records(datagram.data):
-                if isinstance(record, LiveMessage):
-                    pending.append(record)
-                else:
+                if not isinstance(record, LiveMessage):
                     self._log.define(record)
+                elif datagram.head.kind is Kind.DEFINITIONS:
+                    self._states.append(record)
+                else:
+                    pending.append(record)
         except DataError:
             self._refused += 1
 
@@ -188,6 +192,9 @@ class Relay:
         if self._scene is None:
             first_ns = min(message.log_time_ns for message in messages)
             self._scene = self._open(first_ns)
+        if self._states:  # said before, and told again to whoever comes
+            self._scene.draw(self._log.decode(self._states), self._not_shown)
+            self._states.clear()
         self._scene.draw(batch, self._not_shown)
         self._shown += batch.messages
         now_ns = time.monotonic_ns()

@@ -66,6 +66,7 @@ class LiveScene:
         self._origin_ns: int | None = None
         self._limit_w: float | None = None
         self._mode: str | None = None
+        self._mode_ns = 0
         self._modes = 0
         self._has_events = self._has_power = False
         self._trail_end: tuple[int, FloatArray] | None = None
@@ -188,9 +189,10 @@ class LiveScene:
     def _draw_words(self, batch: Batch) -> None:
         turns: list[tuple[int, str]] = []
         for t_ns, mode in batch.modes:
-            if mode != self._mode:
-                turns.append((t_ns, mode))
-                self._mode = mode
+            if t_ns > self._mode_ns:  # what holds is told again and again
+                if mode != self._mode:
+                    turns.append((t_ns, mode))
+                self._mode, self._mode_ns = mode, t_ns
         self._modes += len(turns)
         gait.log_states(self._rec, self._clock, turns)
         gait.log_lines(self._rec, self._clock, batch.events)

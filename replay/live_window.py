@@ -56,15 +56,10 @@ class Window:
             own = self._tracks.setdefault(key, {})
             for track in tracks:
                 old = own.get(track.name)
-                t_ns, values = track.t_ns, track.values
-                if old is not None:
-                    t_ns = np.concatenate([old.t_ns, t_ns])
-                    values = np.concatenate([old.values, values])
-                own[track.name] = Track(track.name, *_recent(t_ns, values))
+                kept = None if old is None else (old.t_ns, old.values)
+                own[track.name] = Track(track.name, *_grown(kept, track.t_ns, track.values))
         for topic, (t_ns, values) in batch.ranges.items():
-            old_t, old_values = self.ranges.get(topic, (t_ns[:0], values[:0]))
-            joined = np.concatenate([old_t, t_ns]), np.concatenate([old_values, values])
-            self.ranges[topic] = _recent(*joined)
+            self.ranges[topic] = _grown(self.ranges.get(topic), t_ns, values)
         if batch.head is not None:
             self.head = _joined(self.head, batch.head)
         ends = [one.t_ns[-1] for tracks in batch.columns.values() for one in tracks]
@@ -133,20 +128,20 @@ class Fresh:
         return tuple(found)
 
 
-def _recent(t_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
-    t_ns, values = ordered(t_ns, values)
-    first = int(np.searchsorted(t_ns, int(t_ns[-1]) - KEPT_NS)) if t_ns.size else 0
-    return t_ns[first:], values[first:]
+def _grown(
+    old: tuple[IntArray, FloatArray] | None, t_ns: IntArray, values: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """New samples after those of the last seconds before them."""
+    if old is None or not t_ns.size:
+        return (t_ns, values) if old is None else old
+    first = int(np.searchsorted(old[0], int(t_ns[0]) - KEPT_NS))
+    return ordered(np.concatenate([old[0][first:], t_ns]), np.concatenate([old[1][first:], values]))
 
 
 def _joined(old: HeadPath | None, new: HeadPath) -> HeadPath:
-    if old is None:
-        return new
-    pose = np.concatenate(
-        [
-            np.concatenate([old.position, old.quaternion], axis=1),
-            np.concatenate([new.position, new.quaternion], axis=1),
-        ]
-    )
-    t_ns, pose = _recent(np.concatenate([old.t_ns, new.t_ns]), pose)
+    kept = None
+    if old is not None:
+        kept = old.t_ns, np.concatenate([old.position, old.quaternion], axis=1)
+    pose = np.concatenate([new.position, new.quaternion], axis=1)
+    t_ns, pose = _grown(kept, new.t_ns, pose)
     return HeadPath(t_ns, pose[:, :3], pose[:, 3:], tracked=True)

@@ -56,6 +56,9 @@ _STREAMS = {
 }
 """Types whose messages are samples of something that goes on: fewer show the same."""
 
+_STATES = {"std_msgs/msg/String"}
+"""Types whose last message holds until the next: told to a relay that comes later."""
+
 _RAW = "/can/"
 
 _Queued = tuple[int, int, int, int, int, bytes]
@@ -121,6 +124,7 @@ class LiveFeed:
         self._schemas: dict[int, str] = {}
         self._periods: dict[int, int] = {}
         self._due: dict[int, int] = {}  # empty while nobody watches
+        self._states: dict[int, _Queued | None] = {}
         self._queue: deque[_Queued] = deque()
         self._queued_bytes = 0
         self._words: deque[_Packed] = deque()
@@ -158,6 +162,8 @@ class LiveFeed:
         if isinstance(record, Channel) and self._shown(record):
             streams = self._schemas.get(record.schema_id) in _STREAMS
             self._periods[record.id] = self._period_ns if streams else 0
+            if self._schemas.get(record.schema_id) in _STATES:
+                self._states.setdefault(record.id, None)
             if self._socket is not None:
                 self._due[record.id] = 0
         if self._socket is not None:
@@ -181,6 +187,15 @@ class LiveFeed:
             payload: Its bytes.
         """
         due = self._due.get(channel_id)
+        if channel_id in self._states:
+            self._states[channel_id] = (
+                channel_id,
+                sequence,
+                log_time_ns,
+                publish_time_ns,
+                self._now_ns,
+                payload,
+            )
         if due is None:
             return
         if log_time_ns < due:
@@ -251,11 +266,12 @@ class LiveFeed:
         return self._raw_frames or not channel.topic.startswith(_RAW)
 
     def _all_words(self) -> deque[_Packed]:
-        """All definitions, as few datagrams as they fit."""
+        """All definitions, then the states that hold: as few datagrams as they fit."""
         found: deque[_Packed] = deque()
         part: list[bytes] = []
         size = 0
-        for packed in self._known.values():
+        states = [pack_message(state) for state in self._states.values() if state is not None]
+        for packed in [*self._known.values(), *(one for one in states if len(one) < _DATAGRAM)]:
             if part and size + len(packed) > _DATAGRAM:
                 found.append(self._datagram_of_words(part))
                 part, size = [], 0

@@ -8,6 +8,9 @@ A datagram is a head and then whole records, so that each can be read without an
 
 All numbers are little-endian. ``kind`` of a record is the opcode of the MCAP record that it would
 be (https://mcap.dev/spec); the payload of a definition is that record's body, compressed with zlib.
+A datagram of definitions ends with the last messages of topics that speak only on change: they
+still hold, and one who comes later would not know.
+
 ``offered`` is the monotonic clock of the machine when the message was taken, so that a reader on
 the same machine knows how late it is.
 """

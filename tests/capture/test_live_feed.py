@@ -232,6 +232,22 @@ def test_definitions_are_repeated(make, listen, monkeypatch):
     assert feed.counts.connections == 1
 
 
+def test_a_state_that_holds_is_told_to_a_relay_that_comes_later(make, listen):
+    feed = make()
+    schema = Schema(id=7, name="std_msgs/msg/String", encoding="ros2msg", data=b"string data")
+    mode = Channel(id=7, topic="/gait/mode", message_encoding="cdr", metadata={}, schema_id=7)
+    feed.define(schema)
+    feed.define(mode)
+    for number in range(3):
+        offer(feed, number, channel=7, payload=f"mode {number}".encode())
+    link = listen()
+    pump_until(feed, lambda: feed.connected)
+    _, records = received(link)
+    assert records[:-1] == [*DEFINITIONS, schema, mode]
+    assert records[-1].payload == b"mode 2"
+    assert feed.counts.sent == 0  # as a message: it was told, like the definitions
+
+
 def test_raw_frames_are_not_sent_unless_asked_for(make, listen):
     for raw, expected in ((False, []), (True, [3])):
         link, feed = listen(), make(raw_frames=raw)

@@ -261,16 +261,34 @@ def test_static_things_are_said_once(live):
 
 def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):
     recorder = stage.recorder()
-    recorder.send(0.0, 1.0, wait=False)
+    recorder.send(0.0, 1.5, wait=False)
     relay = stage.relay()
     recorder.connect()
-    recorder.send(1.0)
+    recorder.send(1.5)
     recorder.feed.close()
     report = relay.finish()
     assert report["dropped"] == 0
-    found = rows(read_back(relay.output), "/joints/measured", "Scalars:scalars")
-    assert list(found) == (truth.t_ns - EPOCH_NS)[100:].tolist()
-    np.testing.assert_allclose(list(found.values()), truth.position[100:], atol=1e-12)
+    drawn = read_back(relay.output)
+    found = rows(drawn, "/joints/measured", "Scalars:scalars")
+    assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
+    np.testing.assert_allclose(list(found.values()), truth.position[150:], atol=1e-12)
+    # The mode was said before, and still holds.
+    assert rows(drawn, "/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
+
+
+def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back):
+    recorder, relay = stage.recorder(), stage.relay()
+    recorder.connect()
+    freeze(relay.process.pid)
+    recorder.send(wait=False)  # all three seconds wait
+    os.kill(relay.process.pid, signal.SIGCONT)
+    until(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
+    recorder.feed.close()
+    assert relay.finish()["dropped"] == 0
+    drawn = read_back(relay.output)
+    for entity in ("/joints/measured", "/joints/error", "/power/mechanical"):
+        found = rows(drawn, entity, "Scalars:scalars")
+        assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
 
 
 def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch):
