@@ -190,11 +190,11 @@ class Recording:
     def _each_tick(self) -> None:
         self._control.poll()
         self._feed.pump()
+        self._health.step(self._clock.now_ns())
         self._notifier.alive()
 
     def _look(self) -> RecorderSnapshot:
         """Take a new snapshot."""
-        self._health.update(self._clock.now_ns())
         self._storage.tick()
         for level, text in self._storage.take_events():
             self._recorder.say(level, "recorder", text)
