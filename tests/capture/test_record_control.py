@@ -149,7 +149,7 @@ def test_a_recorder_that_is_killed_while_we_wait_is_told(recorder, capsys):
     assert "run.sock: " in err
 
 
-def test_a_second_recording_of_that_name_is_refused_and_the_first_goes_on(recorder, place):
+def test_a_second_recording_of_that_name_is_refused_and_leaves_nothing(recorder, place):
     recorder("run")
     (place / "b").mkdir()
     command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/b.frames"]
@@ -162,6 +162,7 @@ def test_a_second_recording_of_that_name_is_refused_and_the_first_goes_on(record
     )
     assert done.returncode == 1
     assert "another recorder listens there; end it, or name another with --socket" in done.stderr
+    assert list((place / "b").iterdir()) == []
     with ControlClient(place / "r" / "undulog" / "run.sock") as client:
         assert client.ask({"do": "status"})["output"] == f"{place}/run.mcap"
 
@@ -190,6 +191,26 @@ def test_a_controller_in_another_process_tells_its_gait_for_a_while(recorder, pl
         found = [state for *_, state in reader.iter_decoded_messages(["/gait"])]
     assert len(found) == 200
     assert found[50].position[1] == pytest.approx(1.5707963267948966, rel=1e-15)
+
+
+def test_a_ring_is_written_when_marked(recorder, place, capsys):
+    process = recorder("run", "--ring", "20s")
+    code, out, _ = said(capsys, "mark", "--json", "slipped")
+    assert code == 0
+    first = place / "run_mark0001.mcap"
+    assert json.loads(out)["file"] == str(first)
+    code, _, err = said(capsys, "split")
+    assert code == 1
+    assert "a ring has no parts" in err
+    said(capsys, "note", "later")
+    assert said(capsys, "mark")[0] == 0
+    assert said(capsys, "stop", "--wait")[0] == 0
+    process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert not (place / "run.mcap").exists()
+    assert ("operator", 20, "mark: slipped") in events(first)
+    assert ("operator", 20, "later") not in events(first)
+    assert ("operator", 20, "later") in events(place / "run_mark0002.mcap")
 
 
 def test_a_note_needs_a_text(place, capsys):
