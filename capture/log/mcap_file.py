@@ -232,9 +232,7 @@ class McapFile:
             LogError: If the index or the payload is damaged.
         """
         if block.offsets is None and block.index_at:
-            if channel_id not in block.index_at:
-                return np.empty(0, dtype=np.int64)
-            return self._message_index(block, block.index_at[channel_id], channel_id)
+            return self._message_index(block, channel_id)
         if block.offsets is None:  # a chunk that was written without a message index
             block.offsets = self._walk_block(block)
         return block.offsets.get(channel_id, np.empty(0, dtype=np.int64))
@@ -460,18 +458,14 @@ class McapFile:
                 self._take(opcode, start, stop, data)
         return {channel_id: np.array(at, dtype=np.int64) for channel_id, at in found.items()}
 
-    def _message_index(self, block: Block, at: int, channel_id: int) -> IntArray:
-        start, stop = self._record_at(at)
-        if self._buffer[at] != Opcode.MESSAGE_INDEX or stop - start < 6:
-            raise LogError(self.path, f"no message index at byte {at}")
-        found_id, size = struct.unpack_from("<HI", self._buffer, start)
-        if found_id != channel_id or size != stop - start - 6 or size % 16:
-            raise LogError(self.path, f"the message index at byte {at} is damaged")
-        entries = np.frombuffer(self._buffer[start + 6 : stop], dtype="<u8").reshape(-1, 2)
-        offsets = entries[:, 1].astype(np.int64)
-        if offsets.size and not (offsets.min() >= 0 and offsets.max() + PREFIX_SIZE <= block.size):
-            raise LogError(self.path, f"the message index at byte {at} points outside its chunk")
-        return offsets
+    def _message_index(self, block: Block, channel_id: int) -> IntArray:
+        (entries,) = self.entries(block, [channel_id])
+        offsets = np.frombuffer(entries, dtype="<i8")[1::2]
+        if offsets.size and not 0 <= offsets.min() <= offsets.max() <= block.size - PREFIX_SIZE:
+            raise LogError(
+                self.path, f"a message index of channel {channel_id} points outside its chunk"
+            )
+        return offsets.copy()
 
     # -- payloads --------------------------------------------------------------------------
 
