@@ -74,7 +74,7 @@ def _words(value: object) -> list[str]:
 
 def _sources(value: object) -> tuple[str, ...]:
     words = _words(value)
-    if not words or not all(word.strip() for word in words) or len(set(words)) != len(words):
+    if not words or not all(":" in word for word in words) or len(set(words)) != len(words):
         raise DataError("one or more different source addresses, e.g. can:socketcan:can0")
     return tuple(words)
 

@@ -267,6 +267,7 @@ def test_all_faults_of_all_layers_are_told_at_once(tmp_path):
         *((name, 7j) for name in PARSERS),
         ("sources", ["a:1", "a:1"]),
         ("sources", [1]),
+        ("sources", ("statsu",)),
         ("sources", "'open"),
         ("output", "run.log"),
         ("force", 1),
