@@ -259,6 +259,10 @@ class LinkedSource:
             if not (self._was_up and error.errno in _ABSENT):  # its loss was told
                 self._complain(f"waits for {self._place}: {_reason(error)}")
             return
+        except Exception as error:  # noqa: BLE001 (a fault of one source ends no recording)
+            self._backoff.failed(now_ns)
+            self._complain(f"can't open {self._place}: {error!r}")
+            return
         self._backoff.opened(now_ns)
         self._complaint = ""
         detail = f" ({self._link.detail})" if self._link.detail else ""
@@ -276,12 +280,15 @@ class LinkedSource:
         try:
             return tuple(array for array in self._link.read(now_ns) if len(array))
         except OSError as error:
-            self._link.close()
-            self._link = None
-            self._lost_ns = now_ns
-            self._backoff.failed(now_ns)
-            self._complain(f"lost {self._place}: {_reason(error)}")
-            return ()
+            reason = _reason(error)
+        except Exception as error:  # noqa: BLE001 (a fault of one source ends no recording)
+            reason = repr(error)
+        self._link.close()
+        self._link = None
+        self._lost_ns = now_ns
+        self._backoff.failed(now_ns)
+        self._complain(f"lost {self._place}: {reason}")
+        return ()
 
     def _complain(self, text: str) -> None:
         """Tell why there is no connection, once for each new reason."""

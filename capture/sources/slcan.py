@@ -6,6 +6,7 @@ one every 125. Here a read takes all there is and one expression takes it apart.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import os
@@ -292,4 +293,5 @@ def _release(fileno: int) -> None:
     except OSError:
         pass  # gone already: nothing to close
     finally:
-        os.close(fileno)
+        with contextlib.suppress(OSError):
+            os.close(fileno)

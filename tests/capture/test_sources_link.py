@@ -1,0 +1,128 @@
+"""A source over a connection: what openers and links may do to it, with real sockets below."""
+
+import socket
+import threading
+import time
+
+import pytest
+
+from capture.errors import SourceError
+from capture.log.frames import FRAME_DTYPE
+from capture.robot import ClockDomain
+from capture.sources.address import parse_address
+from capture.sources.link import LinkedSource
+from capture.sources.socketcan import SocketcanLink
+
+FRAME = bytes.fromhex("23010000020000001122000000000000")
+
+
+@pytest.fixture
+def sockets():
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs,
+    ):
+        ours.bind(("127.0.0.1", 0))
+        theirs.connect(ours.getsockname())
+        yield ours, theirs
+
+
+def source_of(open_link) -> LinkedSource:
+    return LinkedSource(
+        parse_address("can:test:can0"),
+        open_link,
+        place="can0",
+        clock=ClockDomain.HOST,
+        facts={},
+    )
+
+
+def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen) -> None:
+    ours, theirs = sockets
+    faults = [RuntimeError("a bug"), RuntimeError("a bug"), OSError(5, "Input/output error")]
+
+    def open_link(tally):
+        if faults:
+            raise faults.pop(0)
+        return SocketcanLink(ours, tally)
+
+    heard = listen(source_of(open_link))
+    heard.until_event("connected to can0")
+    assert heard.texts == [
+        "can't open can0: RuntimeError('a bug')",
+        "waits for can0: Input/output error",
+        "connected to can0 (never transmits)",
+    ]
+    theirs.send(FRAME)
+    (frame,) = heard.until_frames(1)
+    assert (frame["id_flags"], frame["dlc"], bytes(frame["data"][:2])) == (0x123, 2, b"\x11\x22")
+    assert frame.dtype == FRAME_DTYPE
+
+
+def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
+    ours, theirs = sockets
+
+    class Faulty(SocketcanLink):
+        def read(self, now_ns):
+            if found := super().read(now_ns):
+                raise ZeroDivisionError("a bug") from None
+            return found
+
+        def close(self) -> None:
+            pass  # the test's socket lives on
+
+    links = [Faulty, SocketcanLink]
+    heard = listen(source_of(lambda tally: links.pop(0)(ours, tally)))
+    heard.until_event("connected")
+    theirs.send(FRAME)
+    heard.until_event("lost can0: ZeroDivisionError('a bug')")
+    heard.until_event("is back")
+    theirs.send(FRAME)
+    heard.until_frames(1)
+    assert heard.source.counts.reconnects == 1
+
+
+def test_what_is_found_impossible_late_ends_the_source_only(listen) -> None:
+    go = threading.Event()
+
+    def open_link(tally):
+        go.wait(60)
+        raise SourceError("can:test:can0", "there is no such driver")
+
+    heard = listen(source_of(open_link))
+    assert not heard.source.finished
+    go.set()
+    event = heard.until_event("there is no such driver")
+    assert event.level == "error"
+    assert heard.source.finished
+
+
+def test_what_is_found_impossible_at_once_is_raised(context) -> None:
+    def open_link(tally):
+        raise SourceError("can:test:can0", "there is no such driver")
+
+    source = source_of(open_link)
+    with pytest.raises(SourceError, match="no such driver"):
+        source.start(context)
+    source.stop()
+
+
+def test_a_connection_that_opens_after_the_end_is_closed(sockets, context) -> None:
+    ours, _ = sockets
+    go = threading.Event()
+
+    def open_link(tally):
+        go.wait(60)
+        return SocketcanLink(ours, tally)
+
+    source = source_of(open_link)
+    source.start(context)
+    assert source.poll().frames == ()
+    source.stop()
+    go.set()
+    deadline = time.monotonic() + 60
+    while ours.fileno() != -1:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert not source.connected
+    assert source.poll().frames == ()
