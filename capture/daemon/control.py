@@ -9,6 +9,7 @@ a tick: it takes what has come, within a budget, and waits for nobody.
 
 from __future__ import annotations
 
+import os
 import selectors
 import socket
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +27,9 @@ MAX_CLIENTS = 16
 
 BUDGET_NS = 1_000_000
 """After so long in one poll the remaining requests wait for the next one [ns]."""
+
+TEND_POLLS = 200
+"""Every so many polls the server looks whether its socket is still there."""
 
 _READ = 16 * 1024
 _MOST_FAULTS = 8
@@ -116,6 +120,8 @@ class ControlServer:
     def poll(self) -> None:
         """Take and answer what has come; returns at once."""
         self._polls += 1
+        if self._polls % TEND_POLLS == 0:
+            self._tend()
         ready = self._selector.select(0)
         busy = [client for client in self._clients.values() if client.more and client.has_room]
         if not ready and not busy:
@@ -156,6 +162,24 @@ class ControlServer:
         self._selector.close()
 
     # -- one client ------------------------------------------------------------------------
+
+    def _tend(self) -> None:
+        """Make the socket again where it has gone.
+
+        A user's runtime folder goes with the last log-out, and the recorder stays: who comes back
+        must find it.
+        """
+        if os.path.lexists(self.path):
+            return
+        try:
+            self.path.parent.mkdir(mode=0o700, exist_ok=True)
+            listener, identity = listen(self.path, backlog=MAX_CLIENTS, patience_s=0.0)
+        except (ControlError, OSError):  # its folder isn't back yet; we look again
+            return
+        self._selector.unregister(self._listener)
+        self._listener.close()
+        self._listener, self._identity = listener, identity
+        self._selector.register(listener, selectors.EVENT_READ)
 
     def _accept(self) -> None:
         while True:

@@ -18,7 +18,9 @@ from ..errors import ControlError
 _SUFFIX = ".sock"
 _LONGEST_PATH = 107  # bytes of sun_path, less the closing zero
 _SYSTEM_FOLDER = Path("/run/undulog")
-_LOCK_PATIENCE_S = 2.0
+
+LOCK_PATIENCE_S = 2.0
+"""Longest wait for another recorder that makes its socket in the same folder [s]."""
 
 Identity = tuple[int, int]
 """Device and inode of a socket file."""
@@ -80,7 +82,9 @@ def find_sockets(environ: Mapping[str, str]) -> list[Path]:
     return sorted(path for path in found if _somebody_listens(path))
 
 
-def listen(path: Path, *, backlog: int) -> tuple[socket.socket, Identity]:
+def listen(
+    path: Path, *, backlog: int, patience_s: float = LOCK_PATIENCE_S
+) -> tuple[socket.socket, Identity]:
     """Make a socket that only this user can reach, from its first moment.
 
     A stale one, left by a recorder that was killed, is replaced; a lock on the folder keeps two
@@ -89,6 +93,7 @@ def listen(path: Path, *, backlog: int) -> tuple[socket.socket, Identity]:
     Args:
         path: Where.
         backlog: How many callers may wait.
+        patience_s: Longest wait for another recorder that is at it just now [s].
 
     Returns:
         The non-blocking socket, and what its file is, for :func:`release`.
@@ -102,7 +107,7 @@ def listen(path: Path, *, backlog: int) -> tuple[socket.socket, Identity]:
         )
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        with _locked(path.parent):
+        with _locked(path.parent, patience_s):
             _remove_stale(path)
             before = os.umask(0o177)
             try:
@@ -167,11 +172,11 @@ def _sockets_below(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def _locked(folder: Path) -> Generator[None]:
+def _locked(folder: Path, patience_s: float) -> Generator[None]:
     """Hold the folder's lock; it goes with the process, whatever becomes of that."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        deadline = time.monotonic() + _LOCK_PATIENCE_S
+        deadline = time.monotonic() + patience_s
         while True:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import signal
 import socket
 import stat
@@ -21,7 +22,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from capture.daemon import control
-from capture.daemon.control import LATER, MAX_CLIENTS, ControlServer
+from capture.daemon.control import LATER, MAX_CLIENTS, TEND_POLLS, ControlServer
 from capture.daemon.control_client import ControlClient
 from capture.daemon.control_lines import BUFFER
 from capture.daemon.control_requests import OPERATOR, OperatorLog, request_handler
@@ -447,6 +448,30 @@ def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
     with polled(second), ControlClient(path) as client:
         client.ask({"do": "x"})
     second.close()
+
+
+def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_in(tmp_path):
+    session = tmp_path / "user"
+    session.mkdir()
+    path = default_socket(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(session)})
+    server = ControlServer(path, echo)
+    with connected(server) as client:
+        client.sendall(b'{"do": "x"}\n')
+        drain(server, client, 1)
+        shutil.rmtree(session)
+        for _ in range(3 * TEND_POLLS):
+            server.poll()
+        session.mkdir()
+        polls(server, path.is_socket)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        with connected(server) as back:
+            back.sendall(b'{"do": "y"}\n')
+            assert drain(server, back, 1)[0]["got"] == {"do": "y"}
+        client.sendall(b'{"do": "z"}\n')
+        assert drain(server, client, 1)[0]["got"] == {"do": "z"}
+    server.close()
+    assert not path.exists()
 
 
 def test_the_usual_place_and_finding_what_runs(tmp_path):
