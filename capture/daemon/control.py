@@ -12,13 +12,14 @@ from __future__ import annotations
 import os
 import selectors
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter_ns
 from typing import Any, Final, cast
 
 from ..errors import ControlError, UndulogError
+from .control_connection import Connection
 from .control_lines import BUFFER, TOO_LONG, Reply, read_request, refusal, reply_line
 from .control_socket import listen, release
 
@@ -46,25 +47,6 @@ Handler = Callable[[Mapping[str, Any]], "Reply | _Later"]
 """Does what a request asks; raises an UndulogError to refuse."""
 
 
-class _Client:
-    """One connection: bytes that came and bytes that wait to go."""
-
-    def __init__(self, connection: socket.socket, number: int) -> None:
-        self.socket = connection
-        self.heard = number  # the poll in which it last said something
-        self.incoming = bytearray()
-        self.outgoing = bytearray()
-        self.ended = False  # it will send no more
-        self.closing = False  # we take no more from it
-        self.waits = False  # for the end of the recording
-        self.more = False  # a whole request is left from the last poll
-
-    @property
-    def has_room(self) -> bool:
-        """Whether a reply still fits."""
-        return len(self.outgoing) < BUFFER
-
-
 class ControlServer:
     """Serves the control socket from the recorder's loop."""
 
@@ -87,7 +69,7 @@ class ControlServer:
         self._listener, self._identity = listen(path, backlog=MAX_CLIENTS)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._clients: dict[socket.socket, _Client] = {}
+        self._clients: dict[socket.socket, Connection] = {}
         self._polls = 0
         self._open = True
 
@@ -197,10 +179,10 @@ class ControlServer:
                 self._send(silent)
                 self._drop(silent)
             connection.setblocking(False)
-            self._clients[connection] = _Client(connection, self._polls)
+            self._clients[connection] = Connection(connection, self._polls)
             self._selector.register(connection, selectors.EVENT_READ)
 
-    def _receive(self, client: _Client) -> None:
+    def _receive(self, client: Connection) -> None:
         try:
             data = client.socket.recv(_READ)
         except BlockingIOError:
@@ -214,12 +196,12 @@ class ControlServer:
         client.heard = self._polls
         client.incoming += data
 
-    def _answer(self, client: _Client, end_ns: int) -> None:
+    def _answer(self, client: Connection, end_ns: int) -> None:
         """Answer the whole requests that have come, as far as budget and buffer go."""
         client.more = False
         if client.waits:
             return
-        for line in _lines(client):
+        for line in client.lines():
             if line.strip():
                 reply = self._reply(line)
                 if isinstance(reply, bytes):
@@ -227,7 +209,7 @@ class ControlServer:
                 else:
                     client.waits = True
             if client.waits or not client.has_room or perf_counter_ns() > end_ns:
-                client.more = not client.waits and _has_request(client)
+                client.more = not client.waits and client.has_request
                 return
         if len(client.incoming) > BUFFER:
             client.outgoing += refusal(TOO_LONG)
@@ -252,7 +234,7 @@ class ControlServer:
             return refusal(f"a mistake of the recorder's own: {error!r}")
         return data if len(data) <= BUFFER else refusal(f"the reply has {len(data)} bytes")
 
-    def _send(self, client: _Client) -> None:
+    def _send(self, client: Connection) -> None:
         """Send what the socket takes; listen to the client only while its replies get through."""
         try:
             while client.outgoing:
@@ -272,7 +254,7 @@ class ControlServer:
         wanted |= selectors.EVENT_WRITE if client.outgoing else 0
         self._watch(client, wanted)
 
-    def _watch(self, client: _Client, events: int) -> None:
+    def _watch(self, client: Connection, events: int) -> None:
         watched = self._selector.get_map().get(client.socket)
         if watched is not None and watched.events == events:
             return
@@ -283,7 +265,7 @@ class ControlServer:
         elif events:
             self._selector.register(client.socket, events)
 
-    def _drop(self, client: _Client) -> None:
+    def _drop(self, client: Connection) -> None:
         if self._clients.pop(client.socket, None) is None:
             return
         with suppress(KeyError):  # it may be unwatched: full, or ended
@@ -294,18 +276,3 @@ class ControlServer:
 def _not_yet(request: Mapping[str, Any]) -> Reply:
     del request
     raise ControlError("the recording has not begun yet")
-
-
-def _lines(client: _Client) -> Iterator[bytes]:
-    """The requests that have come whole, each taken off the buffer as it is handed out."""
-    while _has_request(client):
-        at = client.incoming.find(b"\n")
-        end = len(client.incoming) if at < 0 else at + 1
-        line = bytes(client.incoming[:end])
-        del client.incoming[:end]
-        yield line
-
-
-def _has_request(client: _Client) -> bool:
-    # The last request of a client that has ended may lack its newline.
-    return b"\n" in client.incoming or (client.ended and bool(client.incoming))
