@@ -1,8 +1,9 @@
 """The relay: reads a recorder's live feed and draws it in Rerun, in a process of its own.
 
 A viewer that is frozen makes Rerun wait for ever once some hundred megabytes lie before it. That
-happens here, in a thread that does nothing else, and never in the recorder: the inbox drops what
-is not drawn, then the socket fills, then the recorder drops what the socket doesn't take.
+happens here, in a thread that does nothing else, and never in the recorder: the inbox goes on
+reading and drops what is not drawn. Where the whole relay stands still the socket fills, and the
+recorder drops what it doesn't take.
 """
 
 from __future__ import annotations
