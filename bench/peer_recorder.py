@@ -53,6 +53,22 @@ class Ros2Listener(can.Listener):
         self._stream.close()
 
 
+class Shared(can.Listener):
+    """A listener of several notifiers, each of which would stop it."""
+
+    def __init__(self, listener: can.Listener) -> None:
+        """Wrap it."""
+        self._write = listener.on_message_received
+        self.end = listener.stop
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Pass a frame on."""
+        self._write(msg)
+
+    def stop(self) -> None:
+        """Wait for the last one."""
+
+
 class Counter(can.Listener):
     """Counts what the notifier hands out."""
 
@@ -81,8 +97,9 @@ def main() -> None:
         listener = Ros2Listener(out.with_suffix(".mcap"))
     else:
         listener = can.Logger(str(out.with_suffix(suffix)))
+    shared = Shared(listener)
     notifiers = [
-        can.Notifier(bus, [listener, counter], timeout=0.2)
+        can.Notifier(bus, [shared, counter], timeout=0.2)
         for bus, counter in zip(buses, counters, strict=True)
     ]
     print("ready", flush=True)
@@ -90,7 +107,7 @@ def main() -> None:
     time.sleep(0.5)
     for notifier in notifiers:
         notifier.stop(timeout=5)
-    listener.stop()
+    shared.end()
     for bus in buses:
         bus.shutdown()
     result = {"frames": sum(counter.frames for counter in counters), "cpu_s": time.process_time()}

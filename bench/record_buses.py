@@ -242,7 +242,7 @@ def main() -> None:
         lambda folder: over_unix(folder, seconds),
         lambda folder: over_socketcand(folder, seconds),
         lambda folder: frozen_viewer(folder, seconds),
-        lambda folder: over_unix(folder, 5.0 + SETTLE_S, 250_000.0, "undulog, burst 500k frames/s"),
+        lambda folder: over_unix(folder, 2.0 + SETTLE_S, 250_000.0, "undulog, burst 500k frames/s"),
         lambda folder: peer("blf", folder, seconds),
         lambda folder: peer("candump", folder, seconds),
         lambda folder: peer("mcap-ros2", folder, seconds),

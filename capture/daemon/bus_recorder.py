@@ -21,8 +21,8 @@ from .source_clock import SourceClock
 FRAME_TOPIC_PREFIX = "/can/"
 """Raw frames of source ``can0`` are on ``/can/can0``."""
 
-_FRAMES_PER_MESSAGE = 8192
-_FRAMES_PER_SLICE = 4096
+_FRAMES_PER_MESSAGE = 4096
+_FRAMES_PER_SLICE = 512
 
 
 class BusRecorder:
@@ -105,18 +105,25 @@ class BusRecorder:
             LogWriteError: If the messages can't be written.
         """
         while self._waiting and now_ns() < until_ns:
-            slices = [self._waiting.popleft()]
-            count = len(slices[0])
-            while self._waiting and count + len(self._waiting[0]) <= _FRAMES_PER_SLICE:
-                slices.append(self._waiting.popleft())
-                count += len(slices[-1])
-            self.backlog -= count
-            frames = np.concatenate(slices)
+            frames = self._slice()
             frames["t_host_ns"] = self._clock.add(frames["t_device_ns"], frames["t_host_ns"])
             if self._decoder is not None and self._topics is not None:
                 samples, tally = self._decoder.decode(frames)
                 self.tally.add(tally)
                 self._write(self._topics.add(samples), now_ns)
+
+    def _slice(self) -> FrameArray:
+        """The next frames to decode: few enough for one tick."""
+        slices, room = list[FrameArray](), _FRAMES_PER_SLICE
+        while self._waiting and room:
+            batch = self._waiting.popleft()
+            if len(batch) > room:
+                self._waiting.appendleft(batch[room:])
+                batch = batch[:room]
+            slices.append(batch)
+            room -= len(batch)
+        self.backlog -= _FRAMES_PER_SLICE - room
+        return np.concatenate(slices)
 
     def decode_no_more(self) -> None:
         """Only keep the frames from here on; those that waited are safe already."""

@@ -28,6 +28,10 @@ TICK_NS = 10_000_000
 DECODE_TICKS = 5
 """Frames are decoded every so many ticks, a backlog in every one."""
 
+_PRESSED = 1000
+_PRESSED_TICK_NS = 3_000_000
+"""After so many frames in a tick the next one comes sooner: the kernel's buffers are small."""
+
 _DECODE_BUDGET_NS = 4_000_000
 _BACKLOG = 16_384
 _SECOND_TICKS = 1_000_000_000 // TICK_NS
@@ -96,6 +100,7 @@ class Recorder:
             self._second[(k + 1) * _SECOND_TICKS // (len(tasks) + 1)] = task
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
+        self._came = 0  # frames in the last poll
         self._odd_clocks: set[str] = set()
         self._unknown: dict[str, set[str]] = {source.name: set() for source in self._sources}
         self._on_event: Callable[[int, str, str, str], None] | None = None
@@ -179,7 +184,7 @@ class Recorder:
             after_ns = time.monotonic_ns()
             self.ticks.add(after_ns - now_ns)
             tick += 1
-            due_ns += TICK_NS
+            due_ns += TICK_NS if self._came < _PRESSED else _PRESSED_TICK_NS
             if after_ns < due_ns:
                 select([], [], [], (due_ns - after_ns) / _NS)
             elif after_ns > due_ns + _NS:  # stopped for a while: ticks are not made up for
@@ -201,8 +206,10 @@ class Recorder:
             each()
 
     def _poll(self) -> None:
+        self._came = 0
         for source in self._sources:
             polled = source.poll()
+            self._came += sum(map(len, polled.frames))
             for event in polled.events:
                 self.say(event.level, source.name, event.text, event.t_ns)
             for frames in polled.frames:
