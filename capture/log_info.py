@@ -39,7 +39,8 @@ def describe(session: Session) -> dict[str, Any]:
             "start_ns": session.start_ns,
             "start_utc": _utc(session.start_ns),
             "duration_s": seconds,
-            "size_bytes": session.path.stat().st_size,
+            "size_bytes": sum(path.stat().st_size for path in session.files),
+            "files": [path.name for path in session.files],
             "profile": session.profile,
             "library": session.library,
             "verdict": session.verdict,
@@ -57,7 +58,7 @@ def log_info(file: Path, /, *, json: bool = False) -> None:
     Example: `undulog log info run.mcap`
 
     Args:
-        file: An MCAP file, of any make.
+        file: An MCAP file, of any make; of a split session any part, or the folder.
         json: Print one JSON object.
     """
     with Session.open(file) as session:
@@ -72,9 +73,10 @@ def _print_facts(facts: dict[str, Any]) -> None:
     session = facts["session"]
     robot = f"{session['robot']}, {session['joints']} joints" if session["robot"] else "no robot"
     messages = sum(topic["messages"] for topic in facts["topics"])
+    parts = f" in {len(session['files'])} parts" if len(session["files"]) > 1 else ""
     print(
         f"{session['id']}: {robot}, {session['duration_s']:.2f} s from {session['start_utc']}, "
-        f"{messages} messages, {session['size_bytes'] / 1e6:.1f} MB"
+        f"{messages} messages, {session['size_bytes'] / 1e6:.1f} MB{parts}"
     )
     for warning in facts["warnings"]:
         print(f"warning: {warning}")

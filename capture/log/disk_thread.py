@@ -198,5 +198,8 @@ class DiskThread:
         return True
 
     def _fail(self, path: Path, error: OSError) -> None:
+        if isinstance(error, LogWriteError):
+            self._failure = error
+            return
         reason = os.strerror(error.errno) if error.errno else str(error)
         self._failure = LogWriteError(path, f"can't be written: {reason}")

@@ -21,7 +21,7 @@ from .disk_thread import DiskThread
 from .mcap_sink import PROFILE, library_name, write_description, write_error
 from .mcap_writer import McapWriter
 from .part_names import PART_RECORD, later_parts, part_path
-from .part_stream import PartStream
+from .part_stream import FileDeletedError, PartStream
 from .sink import Description
 from .wal import WriteAheadLog, wal_folder
 
@@ -295,6 +295,10 @@ class DurableSink:
             self._wal.close()
         except LogWriteError as error:
             trouble = trouble or error
+        if isinstance(trouble, FileDeletedError):
+            raise FileDeletedError(
+                trouble.path, f"{_reason(trouble)}; only what {self._wal.folder} still has is left"
+            ) from trouble
         if trouble is not None:
             raise LogWriteError(
                 trouble.path,
@@ -351,7 +355,7 @@ class DurableSink:
         self._refuse_closed()
         trouble = self._disk.trouble or self._refused
         if trouble is not None:
-            raise LogWriteError(trouble.path, _reason(trouble))
+            raise type(trouble)(trouble.path, _reason(trouble))
 
 
 def _reason(error: LogWriteError) -> str:

@@ -7,9 +7,13 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from ..errors import OutputExistsError
+from ..errors import LogWriteError, OutputExistsError
 from .mcap_sink import write_error
 from .wal_segment import sync_folder
+
+
+class FileDeletedError(LogWriteError):
+    """Somebody deleted the file that is being written."""
 
 
 class PartStream:
@@ -99,14 +103,19 @@ class PartStream:
         """Bring what was written to the disk.
 
         Raises:
+            FileDeletedError: If the file has no name any more: all that is in it will be gone.
             OSError: If the disk fails.
         """
-        if self._named:
-            os.fdatasync(self._file)
-            return
-        os.fsync(self._file)
-        sync_folder(self.path.parent)
-        self._named = True
+        try:
+            if self._named:
+                os.fdatasync(self._file)
+            else:
+                os.fsync(self._file)
+                sync_folder(self.path.parent)
+                self._named = True
+        finally:
+            if os.fstat(self._file).st_nlink == 0:
+                raise FileDeletedError(self.path, "was deleted while it was being written")
 
     def close(self) -> str:
         """Close the file.

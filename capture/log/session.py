@@ -37,7 +37,7 @@ class Session:
         """Open a session.
 
         Args:
-            path: The MCAP file.
+            path: The MCAP file; of a split session any part, or the folder that holds it.
 
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
@@ -55,7 +55,7 @@ class Session:
         """Open a session; the same as calling the class.
 
         Args:
-            path: The MCAP file.
+            path: The MCAP file; of a split session any part, or the folder that holds it.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -89,6 +89,11 @@ class Session:
         return self._topics.channels
 
     # -- facts -----------------------------------------------------------------------------
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that are read, in order: one, or the parts of a split session."""
+        return tuple(file.path for file in self._file.files)
 
     @property
     def warnings(self) -> list[str]:

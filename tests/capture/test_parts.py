@@ -3,6 +3,7 @@
 import hashlib
 import runpy
 import shutil
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -190,7 +191,27 @@ def test_a_next_part_that_is_there_already_costs_no_message(tmp_path):
     assert read(path) == (recorder.truth(500), [])
 
 
-def test_a_folder_that_is_gone_ends_the_recording_without_a_word_lost(tmp_path):
+def test_a_file_that_somebody_deletes_is_told_before_the_end(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap", flush_interval_s=0.01)
+    recorder.write(sink, 0)
+    (tmp_path / "run.mcap").unlink()
+
+    def go_on():
+        number = 1
+        while True:
+            recorder.write(sink, number)
+            number += 1
+            time.sleep(0.001)
+
+    with pytest.raises(LogWriteError, match=r"run\.mcap: was deleted while it was being written"):
+        go_on()
+    with pytest.raises(
+        LogWriteError, match=r"was deleted .*; only what .*run\.mcap\.wal still has"
+    ):
+        sink.close(())
+
+
+def test_a_folder_that_is_gone_is_told(tmp_path):
     place = tmp_path / "gone"
     place.mkdir()
     sink = recorder.open_sink(place / "run.mcap")
@@ -198,7 +219,7 @@ def test_a_folder_that_is_gone_ends_the_recording_without_a_word_lost(tmp_path):
     shutil.rmtree(place)
     with pytest.raises(LogWriteError, match="No such file"):
         sink.split()
-    with pytest.raises(LogWriteError):
+    with pytest.raises(LogWriteError, match="deleted"):
         sink.close(())
 
 
