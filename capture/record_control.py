@@ -171,11 +171,28 @@ def _summary(recording: Mapping[str, Any]) -> str:
         f"{recording.get('output')}: {recording.get('state', 'recording')}, {_facts(recording)}"
     ]
     lines += [f"  reason: {reason}" for reason in recording.get("reasons", [])]
-    for source in recording.get("sources", []):
-        state = "connected" if source.get("connected") else "not connected"
-        lines.append(f"  {source.get('name')}: {state}, {source.get('frames') or 0} frames")
+    lines += [f"  {_source(source)}" for source in recording.get("sources", [])]
     lines.append(f"  socket: {recording['socket']}")
     return "\n".join(lines)
+
+
+def _source(source: Mapping[str, Any]) -> str:
+    """A source's state in one line."""
+    ended = "has ended" if source.get("finished") else "not connected"
+    parts = ["connected" if source.get("connected") and not source.get("finished") else ended]
+    if (frames := source.get("frames")) is not None:
+        parts.append(f"{frames} frames")
+    if (rate_hz := source.get("rate_hz")) is not None:
+        parts.append(f"{rate_hz:.0f} frames/s")
+    for key, what in (
+        ("dropped", "lost before us"),
+        ("malformed", "malformed"),
+        ("error_frames", "error frames"),
+        ("reconnects", "reconnects"),
+    ):
+        if source.get(key):
+            parts.append(f"{source[key]} {what}")
+    return f"{source.get('name')}: {', '.join(parts)}"
 
 
 def _facts(reply: Mapping[str, Any]) -> str:
