@@ -100,7 +100,7 @@ class SourceContext:
         now_ns: The session's clock: Unix time at the start plus monotonic time since [ns].
         writer: The session, for a source that has channels of its own (the twin); frames are
             written by the recorder.
-        facts: Extra facts, e.g. ``fast`` for a twin that runs as fast as it can.
+        facts: Wishes for a twin: ``fast`` (``true``: as fast as it can), ``duration_s``.
     """
 
     now_ns: Callable[[], int]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -18,7 +19,7 @@ class _Repeats:
 
 
 class EventLog:
-    """Collects the events of one source; one thread uses it.
+    """Collects the events of one source, from any of its threads.
 
     The first of its kind is told at once. Those that follow within a second are counted, and told
     together when it is over.
@@ -31,6 +32,7 @@ class EventLog:
             now_ns: The session's clock [Unix ns].
         """
         self._now_ns = now_ns
+        self._lock = threading.Lock()
         self._repeats: dict[str, _Repeats] = {}
         self._events: list[SourceEvent] = []
 
@@ -43,12 +45,13 @@ class EventLog:
             count: How often it happened.
         """
         now = self._now_ns()
-        repeats = self._repeats.get(text)
-        if repeats is None:
-            self._repeats[text] = _Repeats(now, level)
-            self._tell(now, level, text, count)
-        else:
-            repeats.held += count
+        with self._lock:
+            repeats = self._repeats.get(text)
+            if repeats is None:
+                self._repeats[text] = _Repeats(now, level)
+                self._tell(now, level, text, count)
+            else:
+                repeats.held += count
 
     def take(self) -> tuple[SourceEvent, ...]:
         """Hand out the events that are due.
@@ -56,8 +59,10 @@ class EventLog:
         Returns:
             In the order they happened; each is handed out once.
         """
-        if self._repeats:
-            now = self._now_ns()
+        if not self._repeats:
+            return ()
+        now = self._now_ns()
+        with self._lock:
             for text, repeats in list(self._repeats.items()):
                 if now - repeats.told_ns < _PAUSE_NS:
                     continue
@@ -66,7 +71,7 @@ class EventLog:
                     repeats.told_ns, repeats.held = now, 0
                 else:
                     del self._repeats[text]
-        return self._drain()
+            return self._drain()
 
     def flush(self) -> tuple[SourceEvent, ...]:
         """Hand out all events, those held back for their second too.
@@ -74,11 +79,12 @@ class EventLog:
         Returns:
             In the order they happened.
         """
-        for text, repeats in self._repeats.items():
-            if repeats.held:
-                self._tell(self._now_ns(), repeats.level, text, repeats.held)
-                repeats.held = 0
-        return self._drain()
+        with self._lock:
+            for text, repeats in self._repeats.items():
+                if repeats.held:
+                    self._tell(self._now_ns(), repeats.level, text, repeats.held)
+                    repeats.held = 0
+            return self._drain()
 
     def _drain(self) -> tuple[SourceEvent, ...]:
         events, self._events = tuple(self._events), []

@@ -22,6 +22,7 @@ from ..errors import SourceError, UsageError
 from ..log.frames import FrameArray
 from ..robot import ClockDomain
 from .contract import SourceAddress
+from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
 from .slcan_text import SlcanText
@@ -45,6 +46,7 @@ _CHUNK = 65536
 _SHORT = 2048  # a terminal gives up to 4095 bytes a read; after fewer there are no more
 _MOST_BYTES = 1 << 20
 _ANSWER_S = 0.2
+_PAUSE_S = 0.001  # most adapters hand over what came once in a millisecond
 _QUIET_S = 0.05
 _WRITE_S = 1.0
 
@@ -141,6 +143,10 @@ class SlcanLink:
             return ()
         return (self._text.feed(b"".join(chunks), now_ns, self._tally),)
 
+    def fileno(self) -> int:
+        """The device."""
+        return -1 if self._fileno is None else self._fileno
+
     def close(self) -> None:
         """Close the channel and the device."""
         if self._fileno is None:
@@ -215,7 +221,7 @@ def slcan_source(
         raise SourceError(address.text, f"{path} is no serial device")
     return LinkedSource(
         address,
-        lambda tally: open_slcan(path, settings, tally),
+        lambda tally: DrainedLink(open_slcan(path, settings, tally), tally, pause_s=_PAUSE_S),
         place=path,
         clock=ClockDomain.DEVICE if settings.timestamps else ClockDomain.HOST,
         facts=facts,

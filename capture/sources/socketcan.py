@@ -18,6 +18,7 @@ from ..errors import SourceError
 from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
 from ..robot import ClockDomain
 from .contract import SourceAddress
+from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
 from .receive_many import (
@@ -40,6 +41,7 @@ _CAN_FRAME = np.dtype([("id", "=u4"), ("len", "u1"), ("pad", "V3"), ("data", "u1
 _BUFFER_BYTES = 8 << 20
 _PACKETS = 256
 _MOST_BATCHES = 64
+_PAUSE_S = 0.005  # the kernel has the times
 
 
 def frames_of(batch: Batch, times_ns: Sequence[int]) -> FrameArray:
@@ -119,6 +121,10 @@ class SocketcanLink:
             raise self._error
         return found
 
+    def fileno(self) -> int:
+        """The socket."""
+        return self._socket.fileno()
+
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
@@ -193,7 +199,7 @@ def socketcan_source(
         ) from error
     return LinkedSource(
         address,
-        lambda tally: open_socketcan(channel, tally),
+        lambda tally: DrainedLink(open_socketcan(channel, tally), tally, pause_s=_PAUSE_S),
         place=channel,
         clock=ClockDomain.HOST,
         facts=facts,
