@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Channel
 
 from ..log.sink import Description
 from .live_wire import (
@@ -29,9 +29,9 @@ from .live_wire import (
     DatagramHead,
     Kind,
     pack_datagram,
-    pack_description,
     pack_message,
 )
+from .live_words import LiveWords, Queued
 
 RENEW_NS = 2_000_000_000
 """How often a relay is told all definitions again, and the path is looked up again [ns]."""
@@ -44,25 +44,6 @@ _FILL = 16 << 10
 _DATAGRAM = 32 << 10
 _END_TRIES = 20
 _END_PAUSE_S = 0.005
-
-_STREAMS = {
-    "sensor_msgs/msg/JointState",
-    "nav_msgs/msg/Odometry",
-    "sensor_msgs/msg/Imu",
-    "sensor_msgs/msg/Range",
-    "sensor_msgs/msg/MagneticField",
-    "tf2_msgs/msg/TFMessage",
-    "sensor_msgs/msg/TimeReference",
-}
-"""Types whose messages are samples of something that goes on: fewer show the same."""
-
-_STATES = {"std_msgs/msg/String"}
-"""Types whose last message holds until the next: told to a relay that comes later."""
-
-_RAW = "/can/"
-
-_Queued = tuple[int, int, int, int, int, bytes]
-"""The fields of a :class:`capture.daemon.live_wire.LiveMessage`."""
 
 
 @dataclass
@@ -116,18 +97,15 @@ class LiveFeed:
         self.path = Path(path)
         self.counts = LiveCounts()
         self._max_messages, self._max_bytes = max_messages, max_bytes
-        self._period_ns = round(1e9 / max_rate_hz)
-        self._raw_frames = raw_frames
+        self._words = LiveWords(period_ns=round(1e9 / max_rate_hz), raw_frames=raw_frames)
         self._feed_id = int.from_bytes(os.urandom(8), "little")
         self._socket: socket.socket | None = None
-        self._known: dict[tuple[str, object], bytes] = {}
-        self._schemas: dict[int, str] = {}
-        self._periods: dict[int, int] = {}
+        self._periods = self._words.periods
         self._due: dict[int, int] = {}  # empty while nobody watches
-        self._states: dict[int, _Queued | None] = {}
-        self._queue: deque[_Queued] = deque()
+        self._states = self._words.states
+        self._queue: deque[Queued] = deque()
         self._queued_bytes = 0
-        self._words: deque[_Packed] = deque()
+        self._to_tell: deque[_Packed] = deque()
         self._waiting: _Packed | None = None
         self._full = False
         self._now_ns = time.monotonic_ns()
@@ -151,23 +129,17 @@ class LiveFeed:
             record: Schemas before their channels. Of metadata only ``undulog`` is told, of
                 attachments only the robot's description and its bus databases.
         """
-        key = self._key(record)
-        if key is None:
+        packed = self._words.pack(record)
+        if packed is None:
             return
-        packed = pack_description(record)
         if len(packed) > MAX_DATAGRAM - HEAD_SIZE:
             self.counts.too_big += 1
             return
-        self._known[key] = packed
-        if isinstance(record, Channel) and self._shown(record):
-            streams = self._schemas.get(record.schema_id) in _STREAMS
-            self._periods[record.id] = self._period_ns if streams else 0
-            if self._schemas.get(record.schema_id) in _STATES:
-                self._states.setdefault(record.id, None)
-            if self._socket is not None:
-                self._due[record.id] = 0
+        self._words.keep(record, packed)
         if self._socket is not None:
-            self._words.append(self._datagram_of_words([packed]))
+            if isinstance(record, Channel) and record.id in self._words.periods:
+                self._due[record.id] = 0
+            self._to_tell.append(self._told([packed]))
 
     def offer(
         self,
@@ -238,7 +210,7 @@ class LiveFeed:
                 pass
             if not self.connected:
                 return
-            if self._waiting is None and not self._queue and not self._words:
+            if self._waiting is None and not self._queue and not self._to_tell:
                 if self._taken(end):
                     break
                 self._waiting = None
@@ -248,40 +220,7 @@ class LiveFeed:
 
     # -- what is told ----------------------------------------------------------------------
 
-    def _key(self, record: Description) -> tuple[str, object] | None:
-        """What a definition replaces, or None for one that isn't told."""
-        match record:
-            case Schema():
-                self._schemas[record.id] = record.name
-                return "schema", record.id
-            case Channel():
-                return "channel", record.id
-            case Attachment():
-                name = record.name
-                return ("file", name) if name == "robot.toml" or name.endswith(".dbc") else None
-            case Metadata():
-                return ("facts", record.name) if record.name == "undulog" else None
-
-    def _shown(self, channel: Channel) -> bool:
-        return self._raw_frames or not channel.topic.startswith(_RAW)
-
-    def _all_words(self) -> deque[_Packed]:
-        """All definitions, then the states that hold: as few datagrams as they fit."""
-        found: deque[_Packed] = deque()
-        part: list[bytes] = []
-        size = 0
-        states = [pack_message(state) for state in self._states.values() if state is not None]
-        for packed in [*self._known.values(), *(one for one in states if len(one) < _DATAGRAM)]:
-            if part and size + len(packed) > _DATAGRAM:
-                found.append(self._datagram_of_words(part))
-                part, size = [], 0
-            part.append(packed)
-            size += len(packed)
-        if part:
-            found.append(self._datagram_of_words(part))
-        return found
-
-    def _datagram_of_words(self, records: list[bytes]) -> _Packed:
+    def _told(self, records: list[bytes]) -> _Packed:
         return _Packed(pack_datagram(self._head(Kind.DEFINITIONS, 0), records), 0)
 
     def _head(self, kind: Kind, messages: int) -> DatagramHead:
@@ -300,15 +239,15 @@ class LiveFeed:
     def _ripe(self, now_ns: int) -> bool:
         """Whether to send: a datagram is left to fill, and a full socket to itself, for 20 ms."""
         if now_ns < self._send_at_ns:
-            return not self._full and (bool(self._words) or self._queued_bytes >= _FILL)
-        return bool(self._queue or self._words or self._waiting is not None)
+            return not self._full and (bool(self._to_tell) or self._queued_bytes >= _FILL)
+        return bool(self._queue or self._to_tell or self._waiting is not None)
 
     def _next(self) -> _Packed | None:
         """The next datagram: what waits, then definitions, then the oldest messages."""
         if self._waiting is not None:
             return self._waiting
-        if self._words:
-            return self._words.popleft()
+        if self._to_tell:
+            return self._to_tell.popleft()
         if not self._queue:
             return None
         records: list[bytes] = []
@@ -369,8 +308,8 @@ class LiveFeed:
         if found:
             self.counts.connections += 1
             self._due = dict.fromkeys(self._periods, 0)
-        if not self._words:
-            self._words = self._all_words()
+        if not self._to_tell:
+            self._to_tell.extend(self._told(group) for group in self._words.groups(_DATAGRAM))
 
     def _lose(self, now_ns: int) -> None:
         """There is no relay any more: forget what was meant for it."""
@@ -381,6 +320,6 @@ class LiveFeed:
         self._waiting, self._full = None, False
         self._queue.clear()
         self._queued_bytes = 0
-        self._words.clear()
+        self._to_tell.clear()
         self._due = {}
         self._renew_at_ns = now_ns + RETRY_NS
