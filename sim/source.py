@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from queue import Empty, Full, Queue
 
-from capture.errors import SimulationError, UndulogError, UsageError
+from capture.errors import SimulationError, SourceError, UndulogError, UsageError
 from capture.robot import ClockDomain, Robot
 from capture.sources.contract import (
     Polled,
@@ -72,12 +72,22 @@ class TwinSource:
         """Set the robot on the ground and let it go.
 
         Args:
-            context: The recording; its fact ``fast`` lets the twin run as fast as it can.
+            context: The recording; its fact ``fast`` lets the twin run as fast as it can, and
+                ``duration_s`` is how long it runs, rather than as long as the scenario says.
 
         Raises:
-            UsageError: If the engine cannot hold the robot.
+            SourceError: If the engine cannot hold the robot, or can't run so long.
         """
         self._context = context
+        try:
+            self._begin(context)
+        except UsageError as error:
+            raise SourceError(self._address.text, str(error)) from error
+
+    def _begin(self, context: SourceContext) -> None:
+        duration_s = context.facts.get("duration_s")
+        if duration_s is not None:
+            self._scenario = self._scenario.changed(duration_s=float(duration_s))
         self._twin = Twin(self._scenario)
         self._log = SessionLog(context.writer, self._twin, epoch_ns=context.now_ns())
         fast = context.facts.get("fast") == "true"

@@ -11,9 +11,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from ..errors import LogWriteError, UsageError
+from ..errors import LogWriteError, SourceError, UsageError
 from ..interruption import StopRequest
 from ..log.writer import SessionWriter
+from ..robot import ClockDomain
 from ..sources.contract import SourceContext
 from ..sources.registry import open_sources
 from .clock import SessionClock
@@ -64,6 +65,7 @@ class Recording:
             ControlError: If the control socket can't be made.
         """
         self._settings, self._stop = settings, stop
+        self._useless = False
         self._show = show
         self._notifier = notifier or Notifier({})
         self._sources = open_sources(settings.sources)
@@ -106,9 +108,7 @@ class Recording:
                 writer=self._writer,
                 clock=self._clock,
                 sources=self._sources,
-                context=SourceContext(
-                    self._clock.now_ns, self._writer, {"fast": str(settings.fast).lower()}
-                ),
+                context=SourceContext(self._clock.now_ns, self._writer, _wishes(settings)),
                 robot=robot,
                 decoded=decoded,
                 each_tick=(self._each_tick,),
@@ -131,19 +131,25 @@ class Recording:
             What was recorded; its ending says whether it had to end.
 
         Raises:
-            SourceError: If a source can never work; the session is finalised nevertheless.
+            SourceError: If a source can never work; no file is left then.
         """
         ending = Ending("an error", failed=True)
         report: RecordReport | None = None
         try:
             self._notifier.ready(f"recording {self._settings.output}")
             ending = self._recorded()
+        except SourceError:
+            self._useless = True
+            raise
         finally:
             self._notifier.stopping()
             ending = self._finalised(ending)
             self._feed.close()
             report = self._report(ending)
             self._control.close(report.as_json())
+            if self._useless:  # nothing was recorded: the name is free for another try
+                for file in report.files:
+                    file.unlink(missing_ok=True)
         return report
 
     # -- what the control socket asks ---------------------------------------------------------
@@ -230,7 +236,10 @@ class Recording:
 
     def _recorded(self) -> Ending:
         try:
-            return self._recorder.run(self._stop, self._settings.duration_s)
+            # A scenario's time is its own: it is told how long to go on, and ends by itself.
+            simulated = all(source.clock is ClockDomain.SIMULATED for source in self._sources)
+            duration_s = None if simulated else self._settings.duration_s
+            return self._recorder.run(self._stop, duration_s)
         except LogWriteError as error:
             return Ending(str(error), failed=True)
 
@@ -336,3 +345,11 @@ class Recording:
             sources={s.name: dataclasses.asdict(s.counts) for s in self._sources},
             recorder=self._recorder_facts(ending),
         )
+
+
+def _wishes(settings: RecordSettings) -> dict[str, str]:
+    """What a scenario is told."""
+    wishes = {"fast": str(settings.fast).lower()}
+    if settings.duration_s is not None:
+        wishes["duration_s"] = repr(settings.duration_s)
+    return wishes

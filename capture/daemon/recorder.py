@@ -16,7 +16,7 @@ from ..interruption import StopRequest
 from ..log.recorder_channels import TimeReferenceChannel
 from ..log.writer import SessionWriter
 from ..robot import Robot
-from ..sources.contract import Source, SourceContext
+from ..sources.contract import Polled, Source, SourceContext
 from .bus_recorder import BusRecorder
 from .clock import SessionClock
 from .source_clock import SourceClock
@@ -101,6 +101,7 @@ class Recorder:
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
         self._came = 0  # frames in the last poll
+        self._failed: set[str] = set()
         self._odd_clocks: set[str] = set()
         self._unknown: dict[str, set[str]] = {source.name: set() for source in self._sources}
         self._on_event: Callable[[int, str, str, str], None] | None = None
@@ -179,8 +180,8 @@ class Recorder:
                 self.ending = Ending(f"{stop.signal.name} was received")
             elif end_ns is not None and now_ns >= end_ns:
                 self.ending = Ending(f"{duration_s:g} s are over")
-            elif all(source.finished for source in self._sources):
-                self.ending = Ending("all sources have ended")
+            elif all(source.finished or source.name in self._failed for source in self._sources):
+                self.ending = Ending("all sources have ended", failed=bool(self._failed))
             after_ns = time.monotonic_ns()
             self.ticks.add(after_ns - now_ns)
             tick += 1
@@ -208,7 +209,7 @@ class Recorder:
     def _poll(self) -> None:
         self._came = 0
         for source in self._sources:
-            polled = source.poll()
+            polled = self._asked(source)
             self._came += sum(map(len, polled.frames))
             for event in polled.events:
                 self.say(event.level, source.name, event.text, event.t_ns)
@@ -217,6 +218,20 @@ class Recorder:
                 if bus is None:
                     bus = self.buses[source.name] = self._open_bus(source)
                 bus.add(frames)
+
+    def _asked(self, source: Source) -> Polled:
+        """What a source has; one that fails in a way nobody foresaw doesn't end the others."""
+        if source.name in self._failed:
+            return Polled()
+        try:
+            return source.poll()
+        except LogWriteError:
+            raise
+        except Exception as error:  # noqa: BLE001 - the other sources go on
+            self._failed.add(source.name)
+            self.say("error", source.name, f"this source is given up: it failed with {error!r}")
+            source.stop()
+            return Polled()
 
     def _decode(self, name: str, bus: BusRecorder, until_ns: int) -> None:
         try:

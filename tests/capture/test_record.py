@@ -163,7 +163,7 @@ def test_the_verdict_at_the_end_is_that_of_a_check(tmp_path):
 def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     output = tmp_path / "twin.mcap"
     done = subprocess.run(
-        [*command(output, "twin:flat"), "--fast", "--duration", "1h", "--json", "--floor", "0"],
+        [*command(output, "twin:flat"), "--fast", "--duration", "4s", "--json", "--floor", "0"],
         cwd=ROOT, check=True, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     report = json.loads(done.stdout)
@@ -172,8 +172,19 @@ def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     with Session.open(output) as session:
         states = session.joints("/joint_states")
         np.testing.assert_array_equal(np.diff(states.t_ns[0]), 10_000_000)
-        assert len(states.t_ns[0]) == report["sources"]["flat"]["frames"]
+        assert len(states.t_ns[0]) == report["sources"]["flat"]["frames"] == 401
         assert {"scenario.toml", "robot.urdf", "robot.toml"} <= set(session.attachments)
+
+
+def test_a_source_that_can_never_work_leaves_no_file(tmp_path):
+    (tmp_path / "bus.sock").write_text("not a socket")
+    done = subprocess.run(
+        command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"),
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "is no socket" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["bus.sock"]
 
 
 def test_unknown_identifiers_are_told_and_kept(tmp_path):
