@@ -75,9 +75,10 @@ def _each_own(series: Series, offsets: Series) -> list[IntArray]:
 
 def _steps(offset_s: FloatArray) -> IntArray:
     """Offsets [ns]; those that are not finite, or beyond all reason, count as zero."""
-    steps = offset_s * _NS
-    np.rint(steps, out=steps)
-    usable = np.abs(steps) < _FAR_NS
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = offset_s * _NS
+        np.rint(steps, out=steps)
+        usable = np.abs(steps) < _FAR_NS
     if not usable.all():
         steps[~usable] = 0.0
     return steps.astype(np.int64)
