@@ -15,11 +15,14 @@ from typing import Any, cast
 import lz4.frame  # pyright: ignore[reportMissingTypeStubs]
 import numpy as np
 import zstandard
+from mcap.opcode import Opcode
 
 from ..arrays import IntArray
 
 PREFIX_SIZE = 9
 """Opcode (u8) and length (u64) before each record's body."""
+
+_NAME_AT = PREFIX_SIZE + 8 + 8 + 8 + 4  # of the compression's name in a chunk's record
 
 Buffer = bytes | bytearray | mmap.mmap
 
@@ -149,3 +152,31 @@ def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int
             return
         yield opcode, body, body + length
         at = body + length
+
+
+def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
+    """Search for a whole compressed chunk where the chain of records is broken.
+
+    Args:
+        data: The bytes.
+        start: First place to look at.
+        stop: One past the last byte.
+
+    Returns:
+        Offset of its record's opcode, or None.
+    """
+    found: list[int] = []
+    for name in (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"):
+        tag = data.find(name, start + _NAME_AT, stop)
+        while tag >= 0:
+            at = tag - _NAME_AT
+            size_at = tag + len(name)
+            if data[at] == Opcode.CHUNK and size_at + 8 <= stop:
+                (length,) = struct.unpack_from("<Q", data, at + 1)
+                (size,) = struct.unpack_from("<Q", data, size_at)
+                whole = size_at + 8 + size
+                if at + PREFIX_SIZE + length == whole <= stop:
+                    found.append(at)
+                    break
+            tag = data.find(name, tag + 1, stop)
+    return min(found, default=None)

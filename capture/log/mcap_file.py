@@ -46,6 +46,7 @@ from .chunk import (
     checks_itself,
     inflate,
     inflate_zstd_into,
+    next_chunk,
     walk_records,
 )
 
@@ -367,21 +368,30 @@ class McapFile:
         buffer, end = self._buffer, len(self._buffer)
         loose = Block(0, end, "", end, 0, 2**63 - 1, 0, offsets={})
         loose_at: dict[int, list[int]] = {}
-        at = len(MAGIC)
+        former = at = len(MAGIC)
         while at + PREFIX_SIZE <= end:
             opcode = buffer[at]
             (length,) = struct.unpack_from("<Q", buffer, at + 1)
             start, stop = at + PREFIX_SIZE, at + PREFIX_SIZE + length
             if stop > end or opcode == 0:
-                self._salvage(opcode, start, end)
-                break
+                # The break may be a wrong length in the record before, too.
+                following = next_chunk(buffer, former + 1, end)
+                if following is None:
+                    self._salvage(opcode, start, end)
+                    break
+                self.warnings.append(
+                    f"the record at byte {at} is damaged and was skipped: the next whole chunk is "
+                    f"at byte {following}"
+                )
+                former = at = following
+                continue
             try:
                 self._scan_record(opcode, start, stop, loose, loose_at)
             except (McapError, struct.error, ValueError, LogError) as error:
                 self.warnings.append(f"the record at byte {at} is damaged and was skipped: {error}")
             if opcode == Opcode.DATA_END:
                 break
-            at = stop
+            former, at = at, stop
         if loose_at:
             loose.offsets = {k: np.array(v, dtype=np.int64) for k, v in loose_at.items()}
             self._count(loose.offsets)

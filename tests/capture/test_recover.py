@@ -348,8 +348,8 @@ def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_pat
         recorder.write(sink, number)
     sink.close(())
     raw = bytearray(path.read_bytes())
-    middle = len(raw) // 2
-    raw[middle : middle + 4096] = bytes(4096)
+    third = len(raw) // 3
+    raw[third : third + 100_000] = bytes(100_000)
     path.write_bytes(raw[:-2000])
     report = recover_log(path, tmp_path / "out.mcap")
     assert report.missing is None
@@ -402,3 +402,30 @@ def test_edits_take_an_unfinished_session_as_it_is(tmp_path):
         assert "did not finish" in session.metadata["undulog.edit"]["warnings"]
     merge_logs([path, tmp_path / "cut.mcap"], tmp_path / "merged.mcap")
     assert len(read(tmp_path / "merged.mcap")[0]) == 1600
+
+
+def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = recorder.open_sink(path)
+    for number in range(12_000):
+        recorder.write(sink, number)
+    sink.close(())
+    raw = path.read_bytes()
+    with path.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    assert len(chunks) > 4
+    truth = recorder.truth(12_000)
+    for broken in (1, 2, len(chunks) - 2):  # the first one has the channels
+        index = chunks[broken]
+        whole = bytearray(raw[:-1000])  # nor is there a summary
+        at = index.chunk_start_offset
+        for length in (0, 1 << 40, index.chunk_length // 3):
+            whole[at + 1 : at + 9] = length.to_bytes(8, "little")
+            path.write_bytes(whole)
+            found, warnings = read(path)
+            first = (index.message_start_time - recorder.EPOCH_NS) // 10**6
+            last = (index.message_end_time - recorder.EPOCH_NS) // 10**6
+            rest = [m for m in found if not first <= (m[2] - recorder.EPOCH_NS) // 10**6 <= last]
+            assert rest == truth[:first] + truth[last + 1 :], (broken, length)
+            assert set(found) <= set(truth)
+            assert any("is damaged and was skipped" in text for text in warnings)
