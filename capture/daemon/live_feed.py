@@ -44,6 +44,7 @@ _FILL = 16 << 10
 _DATAGRAM = 32 << 10
 _END_TRIES = 20
 _END_PAUSE_S = 0.005
+_NEVER_NS = 1 << 63
 
 
 @dataclass
@@ -202,31 +203,33 @@ class LiveFeed:
 
     def close(self) -> None:
         """Send what is left and the end, if the relay takes it within 0.1 s; safe to call twice."""
-        if self._socket is None:
-            return
-        end = _Packed(pack_datagram(self._head(Kind.END, 0), ()), 0)
         for _ in range(_END_TRIES):
             while self._send_one():
                 pass
-            if not self.connected:
-                return
-            if self._waiting is None and not self._queue and not self._to_tell:
-                if self._taken(end):
-                    break
-                self._waiting = None
+            if not self.connected or (self._is_empty and self._taken(self._end())):
+                break
             time.sleep(_END_PAUSE_S)
         self._lose(time.monotonic_ns())
-        self._renew_at_ns = 1 << 63
+        self._renew_at_ns = _NEVER_NS
 
     # -- what is told ----------------------------------------------------------------------
 
     def _told(self, records: list[bytes]) -> _Packed:
         return _Packed(pack_datagram(self._head(Kind.DEFINITIONS, 0), records), 0)
 
+    def _end(self) -> _Packed:
+        return _Packed(pack_datagram(self._head(Kind.END, 0), ()), 0)
+
     def _head(self, kind: Kind, messages: int) -> DatagramHead:
         return DatagramHead(kind, messages, self._feed_id, self.counts.dropped)
 
     # -- the queue -------------------------------------------------------------------------
+
+    @property
+    def _is_empty(self) -> bool:
+        """Whether nothing waits; an end that the socket didn't take is made anew."""
+        messages_wait = self._waiting is not None and self._waiting.messages > 0
+        return not (self._queue or self._to_tell or messages_wait)
 
     def _drop_oldest(self) -> None:
         if self._waiting is not None and self._waiting.messages:

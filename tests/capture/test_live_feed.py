@@ -404,6 +404,8 @@ def test_the_end_is_told(make, listen):
     offer(feed, 0)
     feed.close()
     feed.close()
+    feed.pump()
+    assert not feed.connected
     heads, records = received(link)
     assert [one.sequence for one in messages(records)] == [0]
     assert heads[-1].kind is Kind.END
