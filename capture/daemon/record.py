@@ -28,6 +28,7 @@ from .notify import Notifier
 from .plan import decoded_source, robot_of
 from .recorder import Ending, Recorder
 from .report import RecordReport
+from .screen import plain_line
 from .settings import RecordSettings
 from .snapshot import EventLine, RecorderSnapshot
 from .statuses import statuses
@@ -214,7 +215,10 @@ class Recording:
             self._diagnostics.write(self._clock.now_ns(), statuses(self._snapshot))
 
     def _tell(self) -> None:
-        if self._snapshot is not None and self._show is not None:
+        if self._snapshot is None:
+            return
+        self._notifier.status(plain_line(self._snapshot))
+        if self._show is not None:
             self._show(self._snapshot)
 
     def _look_at_disk(self) -> None:
