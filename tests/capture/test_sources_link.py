@@ -10,7 +10,9 @@ from capture.errors import SourceError
 from capture.log.frames import FRAME_DTYPE
 from capture.robot import ClockDomain
 from capture.sources.address import parse_address
+from capture.sources.drained_link import DrainedLink
 from capture.sources.link import LinkedSource
+from capture.sources.receive_many import SO_RXQ_OVFL
 from capture.sources.socketcan import SocketcanLink
 
 FRAME = bytes.fromhex("23010000020000001122000000000000")
@@ -80,6 +82,28 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
     theirs.send(FRAME)
     heard.until_frames(1)
     assert heard.source.counts.reconnects == 1
+
+
+def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen) -> None:
+    ours, theirs = sockets
+    ours.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    heard = listen(
+        source_of(lambda tally: DrainedLink(SocketcanLink(ours, tally), tally, pause_s=0.01))
+    )
+    heard.until_event("connected")
+    sent = 3000
+    for _ in range(sent):  # nobody polls, and the socket holds a few at a time
+        theirs.send(FRAME)
+    deadline = time.monotonic() + 60
+    while len(heard.frames) + (heard.source.counts.dropped or 0) != sent:
+        assert time.monotonic() < deadline
+        theirs.send(FRAME)  # drops are told with the next packet
+        sent += 1
+        time.sleep(0.05)
+        heard.poll()
+    assert heard.source.counts.dropped
+    assert heard.source.counts.frames == len(heard.frames)
 
 
 def test_what_is_found_impossible_late_ends_the_source_only(listen) -> None:
