@@ -12,7 +12,7 @@ from capture.robot import ClockDomain
 from capture.sources.address import parse_address
 from capture.sources.drained_link import DrainedLink
 from capture.sources.link import LinkedSource
-from capture.sources.receive_many import SO_RXQ_OVFL
+from capture.sources.receive_many import SO_RXQ_OVFL, SO_TIMESTAMPNS
 from capture.sources.socketcan import SocketcanLink
 
 FRAME = bytes.fromhex("23010000020000001122000000000000")
@@ -86,6 +86,7 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
 
 def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen) -> None:
     ours, theirs = sockets
+    ours.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     ours.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     heard = listen(
