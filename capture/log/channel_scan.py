@@ -17,6 +17,7 @@ from .bus_tally import BusTally
 from .cdr import Layout, layout_of
 from .chunk import Buffer
 from .columns import fits_layout
+from .frame_messages import records_at
 from .frames import FRAME_DTYPE, FRAME_LAYOUT, empty_frames
 from .freeze import RangeTally
 from .health import LIMIT_RAD
@@ -249,18 +250,13 @@ class ChannelScan:
         found: list[tuple[IntArray, Matrix]] = []
         for rows, matrix in whole:
             try:
-                layout = layout_of(kind, matrix[0].tobytes())
+                at, number = _records_in(kind, matrix[0].tobytes())
             except DataError:
                 self.unread += len(rows)
                 continue
-            leaf = layout.leaves.get("data")
-            if leaf is None:
-                continue
-            if FRAME_LAYOUT not in layout.strings.values() or leaf.count % FRAME_DTYPE.itemsize:
-                self.unread += len(rows)
-                continue
-            found.append((rows, matrix[:, leaf.offset : leaf.offset + leaf.count]))
-            sizes[rows] = leaf.count // FRAME_DTYPE.itemsize
+            if number:
+                found.append((rows, matrix[:, at : at + number * FRAME_DTYPE.itemsize]))
+                sizes[rows] = number
         starts = np.cumsum(sizes) - sizes
         frames = empty_frames(int(sizes.sum()))
         for rows, data in found:
@@ -299,6 +295,20 @@ class ChannelScan:
             parts.append((_names(layout), rows[fits], layout, matrix[fits]))
             rows, matrix = rows[~fits], matrix[~fits]
         return parts
+
+
+def _records_in(kind: MessageType, message: bytes) -> tuple[int, int]:
+    """Offset and number of the frames in a message."""
+    found = records_at(message)
+    if found is not None:
+        return found
+    layout = layout_of(kind, message)
+    leaf = layout.leaves.get("data")
+    if leaf is None:
+        return 0, 0
+    if FRAME_LAYOUT not in layout.strings.values() or leaf.count % FRAME_DTYPE.itemsize:
+        raise DataError("not frames of this layout")
+    return leaf.offset, leaf.count // FRAME_DTYPE.itemsize
 
 
 def _names(layout: Layout) -> tuple[str, ...]:
