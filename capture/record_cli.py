@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +17,7 @@ from .errors import UndulogError
 if TYPE_CHECKING:
     from .daemon.report import RecordReport
     from .daemon.settings import RecordSettings
+    from .daemon.snapshot import RecorderSnapshot
     from .interruption import StopRequest
 
 _Words = Annotated[tuple[str, ...], Parameter(show_default=False)]
@@ -126,25 +128,46 @@ def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
 
     terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:
-        recording = Recording(settings, stop, show=terminal.show, notifier=Notifier(os.environ))
-        if settings.live:
-            _start_relay(recording.live_socket, relay)
+        recording = Recording(settings, stop, notifier=Notifier(os.environ))
+        watch = _live_view(recording.live_socket, relay) if settings.live else _nothing
+
+        def show(snapshot: RecorderSnapshot) -> None:
+            if complaint := watch():
+                recording.warn("live view", complaint)
+            terminal.show(snapshot)
+
         try:
-            return recording.run()
+            return recording.run(show)
         finally:
             terminal.close()
 
 
-def _start_relay(socket: Path, relay: ExitStack) -> None:
-    """Start the live view; the recording goes on without one."""
+def _nothing() -> str:
+    return ""
+
+
+def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
+    """Start the live view; returns what tells, once, why it has ended by itself."""
     from .daemon.live_spawn import spawn_relay
 
+    complaints: list[str] = []
     try:
         process = spawn_relay(socket)
-    except UndulogError as error:
-        sys.stderr.write(f"warning: {error}; recording without the live view\n")
-        return
+    except UndulogError as error:  # the recording goes on without
+        complaints.append(str(error))
+        return lambda: complaints.pop() if complaints else ""
     relay.callback(process.close, leave_window=True)
+    told = False
+
+    def look() -> str:
+        nonlocal told
+        code = None if told else process.poll()
+        if code is None:
+            return ""
+        told = True
+        return process.complaint().removeprefix("error: ") or f"has ended, exit code {code}" if code else ""
+
+    return look
 
 
 def _print_report(report: RecordReport) -> None:

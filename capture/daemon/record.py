@@ -48,7 +48,6 @@ class Recording:
         settings: RecordSettings,
         stop: StopRequest,
         *,
-        show: Callable[[RecorderSnapshot], None] | None = None,
         notifier: Notifier | None = None,
     ) -> None:
         """Open everything that must be there before the first sample.
@@ -56,7 +55,6 @@ class Recording:
         Args:
             settings: What to record, and how.
             stop: Ends the recording.
-            show: Is shown the recording once a second.
             notifier: Is told that it has begun, and then that it is alive.
 
         Raises:
@@ -67,7 +65,7 @@ class Recording:
         """
         self._settings, self._stop = settings, stop
         self._useless = False
-        self._show = show
+        self._show: Callable[[RecorderSnapshot], None] | None = None
         self._notifier = notifier or Notifier({})
         self._sources = open_sources(settings.sources)
         robot = self._robot = robot_of(settings, self._sources)
@@ -125,8 +123,23 @@ class Recording:
         """Where a live view may listen."""
         return self._feed.path
 
-    def run(self) -> RecordReport:
+    def warn(self, name: str, text: str) -> None:
+        """Write a warning into the session; for what happens beside the recording.
+
+        Args:
+            name: Who says it.
+            text: One sentence.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        self._recorder.say("warn", name, text)
+
+    def run(self, show: Callable[[RecorderSnapshot], None] | None = None) -> RecordReport:
         """Record until something ends it, and finalise.
+
+        Args:
+            show: Is shown the recording once a second.
 
         Returns:
             What was recorded; its ending says whether it had to end.
@@ -136,6 +149,7 @@ class Recording:
         """
         ending = Ending("an error", failed=True)
         report: RecordReport | None = None
+        self._show = show
         try:
             self._notifier.ready(f"recording {self._settings.output}")
             ending = self._recorded()
