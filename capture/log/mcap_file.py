@@ -28,7 +28,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    ChunkIndex,
     Header,
     Metadata,
     MetadataIndex,
@@ -52,6 +51,8 @@ from .chunk import (
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_SIZE = 1 + 8 + 20
+_CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
+_INDEX_OFFSET = np.dtype([("channel", "<u2"), ("at", "<u8")])
 _INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, channel, entries' size
 _MAX_BLOCK_SIZE = 1 << 30
 _CACHE_SIZE = 64 << 20
@@ -287,7 +288,7 @@ class McapFile:
                 break  # the header is the first record
             for opcode, start, stop in walk_records(self._buffer, summary_start, footer):
                 if opcode == Opcode.CHUNK_INDEX:
-                    self.blocks.append(self._block(self._parse(ChunkIndex.read, start, stop)))
+                    self.blocks.append(self._block(start, stop))
                 elif opcode == Opcode.STATISTICS:
                     statistics = self._parse(Statistics.read, start, stop)
                 elif opcode == Opcode.ATTACHMENT_INDEX:
@@ -341,13 +342,22 @@ class McapFile:
             self.metadata.setdefault(metadata.name, {}).update(metadata.metadata)
             self.appendices.append(metadata)
 
-    def _block(self, index: ChunkIndex) -> Block:
-        """The block of a chunk index; the chunk's own header is checked against it."""
-        at, file_size = index.chunk_start_offset, len(self._buffer)
-        if not (len(MAGIC) <= at and at + index.chunk_length <= file_size):
+    def _block(self, start: int, stop: int) -> Block:
+        """The block of a chunk index; the chunk's own header is checked against it.
+
+        An hour has thousands of them, so only what is used is read.
+        """
+        entries_at = start + _CHUNK_INDEX.size
+        if entries_at > stop:
+            raise LogError(self.path, "a chunk index is cut short")
+        at, length, size = _CHUNK_INDEX.unpack_from(self._buffer, start)
+        if size % _INDEX_OFFSET.itemsize or entries_at + size > stop:
+            raise LogError(self.path, "a chunk index is damaged")
+        if not len(MAGIC) <= at <= at + length <= len(self._buffer):
             raise LogError(self.path, f"a chunk index points to byte {at}, outside the file")
-        block = self._chunk_at(at + PREFIX_SIZE, at + index.chunk_length)
-        block.index_at = dict(index.message_index_offsets)
+        block = self._chunk_at(at + PREFIX_SIZE, at + length)
+        offsets = np.frombuffer(self._buffer[entries_at : entries_at + size], _INDEX_OFFSET)
+        block.index_at = dict(zip(offsets["channel"].tolist(), offsets["at"].tolist(), strict=True))
         return block
 
     def _chunk_at(self, start: int, stop: int) -> Block:

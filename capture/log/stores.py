@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from ..arrays import IntArray
 
 _SHORT_NS = 2**31
+_LARGE = 4 << 20
 
 
 class ColumnStore:
@@ -62,7 +64,15 @@ class ColumnStore:
 
     def _new(self, capacity: int) -> NDArray[Any]:
         shape = (capacity, self._width) if self._by_row else (self._width, capacity)
-        return np.empty(shape, dtype=self._dtype)
+        size = capacity * self._width * self._dtype.itemsize
+        if size < _LARGE:
+            return np.empty(shape, dtype=self._dtype)
+        # numpy would ask for huge pages, and in a virtual machine a new one costs milliseconds.
+        try:
+            memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        except OSError as error:
+            raise MemoryError(f"{size} bytes for a column") from error
+        return np.frombuffer(memory, dtype=self._dtype).reshape(shape)
 
     def _part(self, start: int, stop: int) -> NDArray[Any]:
         return self._data[start:stop] if self._by_row else self._data[:, start:stop].T
