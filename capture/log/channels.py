@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import FloatArray
 from ..errors import DataError
 from .cdr import Leaf, encode
-from .frames import FRAME_DTYPE, FRAME_LAYOUT, FrameArray
+from .frame_messages import frame_message
+from .frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .schemas import message_type
 
 Send = Callable[[int, int, bytes], None]
@@ -341,30 +342,26 @@ class LogChannel:
 
 
 class FrameChannel:
-    """Raw CAN frames."""
+    """Raw CAN frames of one kind, classic or CAN FD."""
 
-    def __init__(self, send: Send) -> None:
-        """Wrap what writes a message."""
+    def __init__(self, send: Send, *, fd: bool = False) -> None:
+        """Wrap what writes a message; ``fd``: the frames are CAN FD frames."""
         self._send = send
+        self._dtype = FD_FRAME_DTYPE if fd else FRAME_DTYPE
+        self._layout = FD_FRAME_LAYOUT if fd else FRAME_LAYOUT
 
     def write(self, t_ns: int, frames: FrameArray) -> None:
         """Write a batch of frames.
 
         Args:
             t_ns: Log time of the batch [Unix ns]; each frame has its own times inside.
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, on a channel of CAN FD
+                frames :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
 
         Raises:
             DataError: If the records have another layout.
             LogWriteError: If the file can't be written.
         """
-        if frames.dtype != FRAME_DTYPE:
-            raise DataError(f"frames have the layout {frames.dtype}, not {FRAME_DTYPE}")
-        size, count = FRAME_DTYPE.itemsize, len(frames)
-        dimensions = [
-            {"label": "frame", "size": count, "stride": count * size},
-            {"label": FRAME_LAYOUT, "size": size, "stride": size},
-        ]
-        data = np.frombuffer(frames.tobytes(), dtype=np.uint8)
-        values = {"layout": {"dim": dimensions}, "data": data}
-        self._send(t_ns, t_ns, encode(message_type("std_msgs/msg/UInt8MultiArray"), values))
+        if frames.dtype != self._dtype:
+            raise DataError(f"frames have the layout {frames.dtype}, not {self._dtype}")
+        self._send(t_ns, t_ns, frame_message(frames, self._layout, self._dtype))

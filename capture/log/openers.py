@@ -222,6 +222,20 @@ class ChannelOpeners:
         """
         return FrameChannel(self._sender(topic, "std_msgs/msg/UInt8MultiArray"))
 
+    def fd_frames(self, topic: str) -> FrameChannel:
+        """Open a channel of raw CAN FD frames, many frames a message.
+
+        Args:
+            topic: E.g. ``/can_fd/can0``.
+
+        Returns:
+            The channel.
+
+        Raises:
+            DataError: If the topic is open already.
+        """
+        return FrameChannel(self._sender(topic, "std_msgs/msg/UInt8MultiArray"), fd=True)
+
     def time_reference(self, topic: str, *, source: str) -> TimeReferenceChannel:
         """Open a TimeReference channel: a device's clock against the host's.
 

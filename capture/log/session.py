@@ -20,7 +20,14 @@ from ..errors import DataError, RobotFileError
 from ..robot import Robot
 from ..robot.description import parse_robot
 from .columns import Group, Messages
-from .frames import FRAME_DTYPE, FrameArray, join_batches
+from .frames import (
+    FD_FRAME_DTYPE,
+    FD_FRAME_LAYOUT,
+    FRAME_DTYPE,
+    FRAME_LAYOUT,
+    FrameArray,
+    join_batches,
+)
 from .joint_reader import JointReader
 from .signals import JointSignals
 from .stamp_clock import StampClock
@@ -305,16 +312,46 @@ class Session:
             MissingChannelError: If the session has no such topic.
             DataError: If the topic holds something else.
         """
-        batches: list[tuple[IntArray, IntArray, FrameArray]] = []
-        found = self._topics.read({topic: ["data"]}, (start_ns, stop_ns))[topic]
-        for group in self._groups(topic, found):
-            data = group.values("data")
-            if data.shape[1] % FRAME_DTYPE.itemsize or not group.layout.strings:
-                raise DataError(f"{self.path}: {topic} does not hold frames of 32 bytes")
-            batches.append((group.times(), group.order(), data.view(FRAME_DTYPE)))
-        return join_batches(batches)
+        return self._frames(topic, (start_ns, stop_ns), FRAME_DTYPE, FRAME_LAYOUT)
+
+    def fd_frames(
+        self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> FrameArray:
+        """Raw CAN FD frames of a bus, in the order they were logged.
+
+        Args:
+            topic: E.g. ``/can_fd/can0``.
+            start_ns: First log time of a message of frames wanted [Unix ns]; None for the
+                session's start.
+            stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
+
+        Returns:
+            Records of :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If the topic holds something else.
+        """
+        return self._frames(topic, (start_ns, stop_ns), FD_FRAME_DTYPE, FD_FRAME_LAYOUT)
 
     # -- inside ----------------------------------------------------------------------------
+
+    def _frames(
+        self,
+        topic: str,
+        window_ns: tuple[int | None, int | None],
+        dtype: np.dtype[np.void],
+        label: str,
+    ) -> FrameArray:
+        batches: list[tuple[IntArray, IntArray, FrameArray]] = []
+        found = self._topics.read({topic: ["data"]}, window_ns)[topic]
+        for group in self._groups(topic, found):
+            data = group.values("data")
+            if data.shape[1] % dtype.itemsize or label not in group.layout.strings.values():
+                kind = f"frames of {dtype.itemsize} bytes"
+                raise DataError(f"{self.path}: {topic} does not hold {kind}, {label}")
+            batches.append((group.times(), group.order(), data.view(dtype)))
+        return join_batches(batches, dtype)
 
     def _warn(self, sentence: str) -> None:
         if sentence not in self._warnings:
