@@ -46,7 +46,7 @@ _CHUNK = 65536
 _SHORT = 2048  # a terminal gives up to 4095 bytes a read; after fewer there are no more
 _MOST_BYTES = 1 << 20
 _ANSWER_S = 0.2
-_PAUSE_S = 0.001  # most adapters hand over what came once in a millisecond
+_PAUSE_S = 0.002  # a later stamp against more waking: at most this late
 _QUIET_S = 0.05
 _WRITE_S = 1.0
 
