@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .console import emit_json, progress
+from .log.frames import FD_TOPIC_PREFIX
 
 if TYPE_CHECKING:
     from .log.measures import BusHealth, SeriesHealth
@@ -164,7 +165,8 @@ def _source_line(source: SourceHealth) -> str:
 
 def _bus_line(bus: BusHealth) -> str:
     rate = f", {bus.rate_hz:.1f} Hz" if bus.rate_hz is not None else ""
-    load = ", load unknown (no bitrate)"
+    fd = bus.topic.startswith(FD_TOPIC_PREFIX)
+    load = ", load not estimated" if fd else ", load unknown (no bitrate)"
     if bus.load is not None and bus.peak_load is not None:
         load = (
             f", load {bus.load[0]:.1%} to {bus.load[1]:.1%} of the bitrate "

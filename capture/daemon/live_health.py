@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from ..errors import DataError
+from ..log.frames import FRAME_TOPIC_PREFIXES
 from ..log.health import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.measures import BusHealth, JointHealth
 from ..log.message_heads import BODY_AT, FIXED_SIZE, HEAD
@@ -220,7 +221,7 @@ class LiveHealth:
         self, topic: _Topic, measured: ChannelMeasures, joints: list[JointHealth]
     ) -> TopicSnapshot:
         # Frames come when a batch is full: their messages have no rhythm of their own.
-        framed = topic.name.startswith("/can/")
+        framed = topic.name.startswith(FRAME_TOPIC_PREFIXES)
         timings = [] if framed else [series.timing for series in measured.series]
         steady = [timing for timing in timings if timing.regular]
         jitters = [(timing.std_s or 0.0) / timing.median_s for timing in steady if timing.median_s]

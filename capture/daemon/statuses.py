@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 from ..log.diagnostics import ERROR, OK, STALE, WARN, DiagnosticStatus
+from ..log.frames import FRAME_TOPIC_PREFIXES
 from ..log.health import GOOD_LOSS, VERDICTS, has_rhythm
 from ..log.source_health import ELAPSED, RECORDER, SOURCE_PREFIX
 from .snapshot import RecorderSnapshot, SourceSnapshot, TopicSnapshot
@@ -61,7 +62,7 @@ def group_of(topic: str) -> str:
     """
     if topic.startswith("/joint_"):
         return "joints"
-    if topic.startswith("/can/"):
+    if topic.startswith(FRAME_TOPIC_PREFIXES):
         return topic.removeprefix("/")
     return topic.removeprefix("/").split("/")[0]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import IntArray
-from .frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameArray
+from .frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameArray, holds_fd
 from .measures import BusHealth
 from .tallies import NS, TimingTally
 
@@ -33,7 +33,11 @@ def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
 
 
 class BusTally:
-    """Frames of one bus."""
+    """Frames of one bus and one kind.
+
+    CAN FD frames are counted and timed. How long they are on the wire is not estimated: their data
+    may have a bit rate of their own, which no session tells.
+    """
 
     def __init__(self, horizon_s: int | None = None) -> None:
         """Start empty.
@@ -59,6 +63,8 @@ class BusTally:
         t_ns = frames["t_host_ns"].astype(np.int64)
         self._timing.add(t_ns)
         self._errors += int(((frames["id_flags"] & ERROR_FLAG) != 0).sum())
+        if holds_fd(frames):
+            return
         fewest, most = frame_bits(frames)
         seconds, place = np.unique(t_ns // NS, return_inverse=True)
         sums = [np.bincount(place, bits).astype(np.int64).tolist() for bits in (fewest, most)]
@@ -81,7 +87,7 @@ class BusTally:
         timing = self._timing.result()
         span_s = (timing.last_ns - timing.first_ns) / NS
         load = peak = None
-        if bitrate and span_s > 0:
+        if bitrate and span_s > 0 and self._bits:
             every = [self._closed, *self._bits.values()]
             low, high = (sum(bits[k] for bits in every) for k in (0, 1))
             load = low / span_s / bitrate, high / span_s / bitrate

@@ -18,7 +18,14 @@ from .cdr import Layout, layout_of
 from .chunk import Buffer
 from .columns import fits_layout
 from .frame_messages import records_at
-from .frames import FRAME_DTYPE, FRAME_LAYOUT, empty_frames
+from .frames import (
+    FD_FRAME_DTYPE,
+    FD_FRAME_LAYOUT,
+    FD_TOPIC_PREFIX,
+    FRAME_DTYPE,
+    FRAME_LAYOUT,
+    FRAME_TOPIC_PREFIXES,
+)
 from .freeze import RangeTally
 from .health import LIMIT_RAD
 from .message_heads import BODY_AT, FIXED_SIZE, gather
@@ -246,21 +253,23 @@ class ChannelScan:
         whole: list[tuple[IntArray, Matrix]],
         count: int,
     ) -> None:
+        fd = self.topic.startswith(FD_TOPIC_PREFIX)
+        dtype, label = (FD_FRAME_DTYPE, FD_FRAME_LAYOUT) if fd else (FRAME_DTYPE, FRAME_LAYOUT)
         sizes = np.zeros(count, np.int64)
         found: list[tuple[IntArray, Matrix]] = []
         for rows, matrix in whole:
             try:
-                at, number = _records_in(kind, matrix[0].tobytes())
+                at, number = _records_in(kind, matrix[0].tobytes(), dtype, label)
             except DataError:
                 self.unread += len(rows)
                 continue
             if number:
-                found.append((rows, matrix[:, at : at + number * FRAME_DTYPE.itemsize]))
+                found.append((rows, matrix[:, at : at + number * dtype.itemsize]))
                 sizes[rows] = number
         starts = np.cumsum(sizes) - sizes
-        frames = empty_frames(int(sizes.sum()))
+        frames = np.zeros(int(sizes.sum()), dtype)
         for rows, data in found:
-            records = np.ascontiguousarray(data).view(FRAME_DTYPE)
+            records = np.ascontiguousarray(data).view(dtype)
             frames[starts[rows][:, None] + np.arange(records.shape[1])] = records
         bus.add(frames)
 
@@ -297,18 +306,20 @@ class ChannelScan:
         return parts
 
 
-def _records_in(kind: MessageType, message: bytes) -> tuple[int, int]:
+def _records_in(
+    kind: MessageType, message: bytes, dtype: np.dtype[np.void], label: str
+) -> tuple[int, int]:
     """Offset and number of the frames in a message."""
-    found = records_at(message)
+    found = records_at(message, label, dtype)
     if found is not None:
         return found
     layout = layout_of(kind, message)
     leaf = layout.leaves.get("data")
     if leaf is None:
         return 0, 0
-    if FRAME_LAYOUT not in layout.strings.values() or leaf.count % FRAME_DTYPE.itemsize:
+    if label not in layout.strings.values() or leaf.count % dtype.itemsize:
         raise DataError("not frames of this layout")
-    return leaf.offset, leaf.count // FRAME_DTYPE.itemsize
+    return leaf.offset, leaf.count // dtype.itemsize
 
 
 def _names(layout: Layout) -> tuple[str, ...]:
@@ -351,7 +362,7 @@ def _is_stamped(kind: MessageType) -> bool:
 
 
 def _holds_frames(topic: str, kind: MessageType) -> bool:
-    return topic.startswith("/can/") and kind.name == "std_msgs/msg/UInt8MultiArray"
+    return topic.startswith(FRAME_TOPIC_PREFIXES) and kind.name == "std_msgs/msg/UInt8MultiArray"
 
 
 def _has_numbers(kind: MessageType) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from .frames import FRAME_TOPIC_PREFIXES, bus_of
 from .freeze import FROZEN_SAMPLES
 from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
 from .tallies import NS, PAUSE_PERIODS, PAUSE_S
@@ -248,12 +249,11 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Finding]:
     return found
 
 
-def judge_bus(health: BusHealth, start_ns: int) -> list[Finding]:
+def judge_bus(health: BusHealth) -> list[Finding]:
     """Findings on a bus.
 
     Args:
         health: Its measures.
-        start_ns: Start of the session [Unix ns].
 
     Returns:
         The findings.
@@ -264,12 +264,34 @@ def judge_bus(health: BusHealth, start_ns: int) -> list[Finding]:
         weight = 2 if part >= BAD_LOSS else int(part > GOOD_LOSS)
         sentence = f"{health.topic}: {health.error_frames} of {health.frames} are error frames"
         found.append(Finding(weight, sentence))
-    if health.longest_s > PAUSE_S:
-        when = _at(health.longest_at_ns, start_ns)
-        found.append(Finding(1, f"{health.topic}: silent for {health.longest_s:.3g} s, {when}"))
     if health.peak_load is not None and health.peak_load[0] > MAX_BUS_LOAD:
         sentence = f"{health.topic}: {health.peak_load[0]:.0%} of the bitrate in the busiest second"
         found.append(Finding(1, sentence))
+    return found
+
+
+def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
+    """Findings on times without any frame of a bus, classic or CAN FD.
+
+    Of a bus that has both kinds, the longest silences of the two are held against each other.
+
+    Args:
+        buses: Measures of all topics of frames.
+        start_ns: Start of the session [Unix ns].
+
+    Returns:
+        The findings.
+    """
+    silences: dict[str, tuple[str, int, int]] = {}
+    for bus in buses:
+        begin, end = bus.longest_at_ns, bus.longest_at_ns + round(bus.longest_s * NS)
+        topic, earlier, later = silences.get(bus_of(bus.topic), (bus.topic, begin, end))
+        silences[bus_of(bus.topic)] = topic, max(begin, earlier), min(end, later)
+    found: list[Finding] = []
+    for topic, begin, end in silences.values():
+        if (silent_s := (end - begin) / NS) > PAUSE_S:
+            when = _at(begin, start_ns)
+            found.append(Finding(1, f"{topic}: silent for {silent_s:.3g} s, {when}"))
     return found
 
 
@@ -287,17 +309,18 @@ def judge_topics(
         The findings.
     """
     found: list[Finding] = []
+    framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
     others = sorted(topic for topic, kind in types.items() if kind.endswith("/JointState"))
     for topic in ("/joint_states", "/joint_commands"):
         if topic in types:
             continue
         if others:
             sentence = f"{topic} is missing; JointStates are on {', '.join(others)}"
-        elif any(topic.startswith("/can/") for topic in types):
+        elif framed:
             sentence = f"{topic} is missing; there are raw CAN frames"
         else:
             sentence = f"{topic} is missing, and no other topic has joints"
-        nothing = not others and not any(topic.startswith("/can/") for topic in types)
+        nothing = not others and not framed
         found.append(Finding(2 if nothing else 1, sentence))
     present = set(seen)
     missing = [name for name in joints if name not in present]

@@ -23,6 +23,7 @@ from .health import (
     judge_channel,
     judge_joints,
     judge_series,
+    judge_silences,
     judge_topics,
     verdict_of,
 )
@@ -233,7 +234,8 @@ class SessionScan:
                 findings += judge_series(each, start_ns, end_ns)
         findings += judge_joints(joints, start_ns)
         for bus in buses:
-            findings += judge_bus(bus, start_ns)
+            findings += judge_bus(bus)
+        findings += judge_silences(buses, start_ns)
         for source in sources:
             findings += judge_source(source)
         findings.sort(key=lambda finding: -finding.weight)
