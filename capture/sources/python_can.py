@@ -115,6 +115,7 @@ class PythonCanLink:
             self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
+        found: OSError | None = None
         try:
             while not self._stop.is_set():
                 message = self._bus.recv(_WAIT_S)
@@ -125,12 +126,12 @@ class PythonCanLink:
                 else:
                     self._lost += 1
         except Exception as error:  # noqa: BLE001 (a driver's fault is the end of its connection)
-            self._error = failure(error)
-        finally:
-            try:
-                self._bus.shutdown()
-            except Exception as error:  # noqa: BLE001 (a dead device can't be closed: it is lost)
-                self._error = self._error or failure(error)
+            found = failure(error)
+        try:
+            self._bus.shutdown()
+        except Exception as error:  # noqa: BLE001 (a dead device can't be closed: it is lost)
+            found = found or failure(error)
+        self._error = found  # last, so that nobody who sees it has to wait for the driver
 
 
 def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:

@@ -8,6 +8,7 @@ whether the controller itself is listen-only is set when the interface is brough
 
 from __future__ import annotations
 
+import os
 import socket
 import struct
 from collections.abc import Mapping, Sequence
@@ -164,6 +165,10 @@ def open_socketcan(interface: str, tally: Tally) -> SocketcanLink:
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, every_class)
         sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         sock.bind((interface,))
+        # An interface that is down can be bound, but the kernel leaves an error behind.
+        code = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if code:
+            raise OSError(code, os.strerror(code))
     except OSError:
         sock.close()
         raise
