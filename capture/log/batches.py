@@ -24,7 +24,9 @@ from .storage import LogFile
 
 _ARENA_SIZE = 8 << 20
 _START = struct.Struct("<BQ")  # of a record: opcode, length
+_START_KIND = np.dtype(f"V{_START.size}")
 _LOG_TIME_AT = 15
+_LOG_TIME_KIND = np.dtype("<i8")
 
 Window = tuple[int | None, int | None]
 
@@ -156,8 +158,8 @@ def _records(
     offsets, limits, stops = _offsets(log_file, placed, wanted)
     if not len(offsets):
         return [Records(offsets, offsets, None) for _ in wanted]
-    starts = gather(data, offsets, f"V{_START.size}")
-    log_ns = gather(data, offsets + _LOG_TIME_AT, "<i8")
+    starts = gather(data, offsets, _START_KIND)
+    log_ns = gather(data, offsets, _LOG_TIME_KIND, _LOG_TIME_AT)
     found: list[Records] = []
     for a, b, lasts in zip(limits[:-1], limits[1:], stops, strict=True):
         length = None

@@ -33,6 +33,7 @@ _EXPANSION = 64
 
 _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 _NS = 1_000_000_000
+_PAIR = np.dtype("<i8")
 
 Matrix = NDArray[np.uint8]
 
@@ -69,6 +70,11 @@ class Group:
             for path, leaf in leaves.items()
             if leaf not in (self._stamp or ()) and (paths is None or path in paths)
         }
+        self._parts = [
+            (leaves[path].offset, _run(leaves[path]), np.dtype(leaves[path].dtype), store)
+            for path, store in self._columns.items()
+        ]
+        self._hull = [(start, np.dtype(f"V{stop - start}")) for start, stop in layout.hull]
         self._tiles = [b"" for _ in layout.hull]
 
     def __len__(self) -> int:
@@ -116,11 +122,11 @@ class Group:
         Returns:
             True if all do; False if some don't, or differ in padding.
         """
-        for k, (start, stop) in enumerate(self.layout.hull):
-            width = stop - start
+        for k, (start, run) in enumerate(self._hull):
+            width = run.itemsize
             if len(self._tiles[k]) < width * len(at):
-                self._tiles[k] = self.layout.example[start:stop] * (2 * len(at))
-            if not self._tiles[k].startswith(gather(data, at + start, f"V{width}").tobytes()):
+                self._tiles[k] = self.layout.example[start : start + width] * (2 * len(at))
+            if not self._tiles[k].startswith(gather(data, at, run, start).tobytes()):
                 return False
         return True
 
@@ -138,15 +144,8 @@ class Group:
         if self._stamp:
             stamp_ns = _stamp_ns(data, at, *self._stamp)
         self._times.append(log_ns, stamp_ns)
-        for path, store in self._columns.items():
-            leaf = self.layout.leaves[path]
-            if leaf.count == 1:
-                store.append(gather(data, at + leaf.offset, leaf.dtype))
-                continue
-            width = leaf.count * np.dtype(leaf.dtype).itemsize
-            store.append(
-                gather(data, at + leaf.offset, f"V{width}").view(leaf.dtype).reshape(len(at), -1)
-            )
+        for start, run, kind, store in self._parts:
+            store.append(gather(data, at, run, start).view(kind))
 
 
 @dataclass
@@ -347,17 +346,21 @@ class _GroupReader:
         return max(seen, min(self._expected, self._reserve // max(length, 1)))
 
 
+def _run(leaf: Leaf) -> np.dtype[Any]:
+    """All numbers of a leaf as one item: it is copied as a whole."""
+    kind = np.dtype(leaf.dtype)
+    return kind if leaf.count == 1 else np.dtype(f"V{leaf.count * kind.itemsize}")
+
+
 def _stamp_ns(data: Buffer, at: IntArray, seconds: Leaf, rest: Leaf) -> IntArray:
     """Stamps of messages [ns], shape (n,)."""
     if (seconds.dtype, rest.dtype, rest.offset - seconds.offset) == ("<i4", "<u4", 4):
-        pairs = gather(data, at + seconds.offset, "<i8")  # one look for both
+        pairs = gather(data, at, _PAIR, seconds.offset)  # one look for both
         stamps = pairs.view("<i4")[::2].astype(np.int64)
         stamps *= _NS
         stamps += pairs.view("<u4")[1::2]
         return stamps
-    parts = [
-        gather(data, at + leaf.offset, leaf.dtype).astype(np.int64) for leaf in (seconds, rest)
-    ]
+    parts = [gather(data, at, leaf.dtype, leaf.offset).astype(np.int64) for leaf in (seconds, rest)]
     return parts[0] * _NS + parts[1]
 
 

@@ -47,17 +47,18 @@ def read_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] |
     return heads if whole.all() else None
 
 
-def gather(data: Buffer, at: IntArray, kind: np.dtype[Any] | str) -> NDArray[Any]:
+def gather(data: Buffer, at: IntArray, kind: np.dtype[Any] | str, shift: int = 0) -> NDArray[Any]:
     """Records of one type at any offsets: an overlapping view with a stride of one byte.
 
     Args:
         data: The bytes.
-        at: Where the records start, shape (n,); all whole.
+        at: Where to count from, shape (n,).
         kind: Their type.
+        shift: Where the records start, from there; all are whole.
 
     Returns:
         A copy, shape (n,).
     """
     record = np.dtype(kind)
-    size = max(len(data) - record.itemsize + 1, 0)
-    return np.ndarray((size,), dtype=record, buffer=data, strides=(1,))[at]
+    size = max(len(data) - shift - record.itemsize + 1, 0)
+    return np.ndarray((size,), record, data, shift, (1,))[at]

@@ -43,15 +43,19 @@ class ColumnStore:
         """Add rows.
 
         Args:
-            rows: Shape (n, width), or (n,) where the width is 1.
+            rows: Numbers row by row, shape (n * width,).
         """
-        stop = self._count + len(rows)
+        count = len(rows) // self._width
+        stop = self._count + count
         if stop > self._capacity:
             self._capacity = max(2 * self._capacity, stop)
             old = self.values()
             self._data = self._new(self._capacity)
             self._part(0, self._count)[...] = old
-        self._part(self._count, stop)[...] = rows.reshape(len(rows), self._width)
+        if self._width == 1 and not self._by_row:
+            self._data[0, self._count : stop] = rows
+        else:
+            self._part(self._count, stop)[...] = rows.reshape(count, self._width)
         self._count = stop
 
     def values(self) -> NDArray[Any]:
