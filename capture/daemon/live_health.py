@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from ..errors import DataError
-from ..log.frames import FRAME_TOPIC_PREFIXES
+from ..log.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES
 from ..log.health import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.measures import BusHealth, JointHealth
 from ..log.message_heads import BODY_AT, FIXED_SIZE, HEAD
@@ -251,23 +251,29 @@ class LiveHealth:
         Returns:
             What it and its frames say.
         """
-        counts, topic = source.counts, f"/can/{source.name}"
-        buses: list[BusHealth] = [bus for bus in self.result().buses if bus.topic == topic]
-        recent = self._frames.get(topic)
-        last = max((t.last_ns for t in self._topics.values() if t.name == topic), default=0)
+        counts = source.counts
+        topics = [prefix + source.name for prefix in FRAME_TOPIC_PREFIXES]
+        buses: list[BusHealth] = [bus for bus in self.result().buses if bus.topic in topics]
+        rates = [
+            _Topic(topic, recent=self._frames[topic]).rate_hz()
+            for topic in topics
+            if self._frames.get(topic)
+        ]
+        rates = [rate for rate in rates if rate is not None]
+        last = max((t.last_ns for t in self._topics.values() if t.name in topics), default=0)
         return SourceSnapshot(
             name=source.name,
             address=address,
             connected=source.connected,
             finished=source.finished,
             frames=None if source.robot is not None and not counts.frames else counts.frames,
-            rate_hz=_Topic(topic, recent=recent).rate_hz() if recent else None,
+            rate_hz=sum(rates) if rates else None,
             age_s=max(self._now_ns - last, 0) / _NS if last else None,
             dropped=counts.dropped,
             malformed=counts.malformed,
             error_frames=counts.error_frames,
             reconnects=counts.reconnects,
-            load=self._scan.last_load(topic) if buses else None,
+            load=self._scan.last_load(FRAME_TOPIC_PREFIX + source.name) if buses else None,
             clock=clock.result() if clock is not None and clock.pair() is not None else None,
         )
 
