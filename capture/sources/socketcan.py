@@ -158,22 +158,26 @@ def open_socketcan(interface: str, tally: Tally) -> SocketcanLink:
     """
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     try:
-        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-        enlarge_buffer(sock, SO_RCVBUFFORCE, socket.SO_RCVBUF, _BUFFER_BYTES)
-        every_class = struct.pack("=I", socket.CAN_ERR_MASK)
-        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, every_class)
-        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
-        sock.bind((interface,))
-        # An interface that is down can be bound, but the kernel leaves an error behind.
-        code = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        if code:
-            raise OSError(code, os.strerror(code))
+        _set_up(sock, interface)
     except OSError:
         sock.close()
         raise
     tally.counts.dropped = tally.counts.dropped or 0
     return SocketcanLink(sock, tally)
+
+
+def _set_up(sock: socket.socket, interface: str) -> None:
+    sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+    enlarge_buffer(sock, SO_RCVBUFFORCE, socket.SO_RCVBUF, _BUFFER_BYTES)
+    every_class = struct.pack("=I", socket.CAN_ERR_MASK)
+    sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, every_class)
+    sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+    sock.bind((interface,))
+    # An interface that is down can be bound, but the kernel leaves an error behind.
+    code = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    if code:
+        raise OSError(code, os.strerror(code))
 
 
 def socketcan_source(
