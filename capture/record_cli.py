@@ -165,7 +165,8 @@ def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
         if code is None:
             return ""
         told = True
-        return process.complaint().removeprefix("error: ") or f"has ended, exit code {code}" if code else ""
+        why = process.complaint().removeprefix("error: ") or f"has ended, exit code {code}"
+        return why if code else ""
 
     return look
 
