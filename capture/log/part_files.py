@@ -26,6 +26,14 @@ class PartFiles:
     missing: list[str] = field(default_factory=list[str])
     paths: list[Path] = field(default_factory=list[Path])
 
+    @property
+    def finalised(self) -> bool:
+        """Whether the last file has its end and says of no other to follow."""
+        if not self.files:
+            return False
+        last = self.files[max(self.files)]
+        return not last.cut and "next" not in _part_record(last)
+
     def close(self) -> None:
         """Release all files."""
         for file in self.files.values():

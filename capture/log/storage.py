@@ -259,6 +259,8 @@ class LogFile:
         if rest:
             tail = WalTail(rest)
             self._add(tail, tail.blocks, tail.counts)
+        if not (rest or wal.live) and self.parts.finalised and wal.accepted <= in_files:
+            return  # the recorder died when all was done but the tidying up
         accepted = wal.accepted if wal.messages else None
         self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted)
         told = list(wal.warnings)

@@ -58,7 +58,7 @@ def write(sink, number):
     sink.write(channel, log_ns, publish_ns, sequence, payload)
 
 
-def run(path, count=1 << 40, splits=(), split_every=0, **options):
+def run(path, count=1 << 40, splits=(), split_every=0, close=False, **options):
     """Write, tell each number after it was accepted, and die of a kill.
 
     Args:
@@ -66,6 +66,7 @@ def run(path, count=1 << 40, splits=(), split_every=0, **options):
         count: Messages; when the disk has what it can have of them, the process kills itself.
         splits: Numbers of messages after which a part begins.
         split_every: Messages of a part.
+        close: Whether it is closed in good order instead, and the end told with a 0.
         options: Of the sink.
     """
     sink = open_sink(path, **options)
@@ -74,6 +75,10 @@ def run(path, count=1 << 40, splits=(), split_every=0, **options):
         os.write(1, (number + 1).to_bytes(8, "little"))
         if number + 1 in splits or (split_every and (number + 1) % split_every == 0):
             sink.split()
+    if close:
+        sink.close((Metadata("undulog.health", {"verdict": "good", "reasons": "[]"}),))
+        os.write(1, bytes(8))
+        return
     while sink.backlog:
         time.sleep(0.001)
     os.kill(os.getpid(), signal.SIGKILL)

@@ -149,6 +149,33 @@ def test_thirty_kills_lose_no_accepted_message(tmp_path):
         shutil.rmtree(path.parent)
 
 
+@pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.slow)])
+def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
+    rng = random.Random(8)
+    whole = 0
+    for run in range(runs):
+        path = tmp_path / str(run) / "run.mcap"
+        path.parent.mkdir()
+        splits = [3000] if run % 2 else []
+        with start(path, count=6000, splits=splits, close=True) as child:
+            told = b""
+            while len(told) < 6000 * 8:
+                told += os.read(child.stdout.fileno(), 1 << 16)
+            time.sleep(rng.uniform(0.0, 0.04))
+            child.kill()
+            child.stdout.read()
+        before = fingerprint(path.parent)
+        found, warnings = read(path)
+        assert found == recorder.truth(6000)
+        assert fingerprint(path.parent) == before
+        if warnings:
+            assert "none is missing" in warnings[0] or "can't be told" in warnings[0]
+        with Session(path) as session:  # what was known at the end is in the log before it
+            whole += session.verdict == "good"
+        shutil.rmtree(path.parent)
+    assert whole > 0
+
+
 def test_a_recording_that_runs_can_be_read(tmp_path):
     path = tmp_path / "run.mcap"
     sink = recorder.open_sink(path, segment_size=1 << 16)
