@@ -58,6 +58,7 @@ _EXTRAS = {
     "jinja2": "report",
     "markupsafe": "report",
     "matplotlib": "report",
+    "asammdf": "mf4",
     "distributed": "cluster",
 }
 """Optional package to the extra that installs it."""

@@ -13,6 +13,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "replay": ("rerun-sdk",),
     "report": ("jinja2", "matplotlib"),
     "parquet": ("pyarrow",),
+    "mf4": ("asammdf",),
     "cluster": ("dask", "distributed"),
 }
 

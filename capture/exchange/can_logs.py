@@ -1,8 +1,8 @@
-"""Logs of CAN frames that other tools write: candump by ourselves, the rest by python-can.
+"""Logs of CAN frames that other tools write: candump and MF4 by ourselves, the rest by python-can.
 
 python-can hands out times as floating-point seconds, which at today's Unix time resolve 0.24 us;
 they are rounded to 1 us, the resolution of the formats it reads. Logs whose times count from their
-own start (ASC, some TRC) are put at :data:`RELATIVE_EPOCH_NS`.
+own start (ASC, some TRC) are put at :data:`capture.exchange.undated.RELATIVE_EPOCH_NS`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,12 @@ from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 from ..errors import ImportFormatError
 from ..log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from .candump import read_candump
+from .mf4 import open_mf4
+from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
 
 if TYPE_CHECKING:
     from can import Message
     from can.io.generic import MessageReader
-
-RELATIVE_EPOCH_NS = 946_684_800_000_000_000
-"""Where a log without a date is put: 2000-01-01T00:00:00Z [Unix ns]."""
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 """Suffixes of the logs that can be read, each also with ``.gz`` behind it where it is text."""
@@ -38,7 +37,6 @@ SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 CSV_HEADER = "timestamp,arbitration_id,"
 """How a CSV file begins that python-can wrote; any other needs a column map."""
 
-_EARLIEST_S = 1e8  # less is no date but a time since the log's start
 _WITHOUT_DIRECTIONS = (".csv", ".db")
 _READ_ERRORS = (
     ValueError,  # text that is no number, a wrong file version
@@ -66,6 +64,7 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
     Raises:
         ImportFormatError: If there is no such file, its format isn't known or isn't what its
             suffix says, or it holds no frames; also while its blocks are taken.
+        MissingExtraError: If the format is MF4 and its extra is not installed.
     """
     if not path.is_file():
         raise ImportFormatError(path, "no such file")
@@ -76,6 +75,10 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
         opener = gzip.open if path.suffix == ".gz" else open
         with cast("TextIO", opener(path, "rt", encoding="ascii", errors="replace")) as lines:
             yield read_candump(path, _lines(path, lines))
+        return
+    if suffix == ".mf4":
+        with open_mf4(path) as log:
+            yield log
         return
     reader = _reader(path)
     try:
@@ -104,10 +107,6 @@ def _reader(path: Path) -> MessageReader:
         if log_suffix(path) == ".blf" and path.suffix != ".gz":
             _check_blf(path)  # its reader would leave the file open
         return LogReader(path)
-    except NotImplementedError as error:  # raised for MF4 where asammdf is not installed
-        raise ImportFormatError(
-            path, "MF4 is read by the package asammdf, which is not installed: pip install asammdf"
-        ) from error
     except _READ_ERRORS as error:
         raise ImportFormatError(path, f"can't be read: {error}") from error
 
@@ -123,7 +122,7 @@ def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
     first = next(messages, None)
     if first is None:
         raise ImportFormatError(path, "holds no CAN frames")
-    relative = first.timestamp < _EARLIEST_S
+    relative = first.timestamp * 1e9 < EARLIEST_NS
     log = FrameLog(
         blocks=iter(()),
         buses=[],

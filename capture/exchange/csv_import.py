@@ -22,9 +22,10 @@ from ..log.writer import SessionWriter
 from ..robot import Quantity, Robot
 from ..strict_table import listed
 from ..units import SESSION_UNIT, TIME_UNITS, unit_for
-from .can_logs import CSV_HEADER, RELATIVE_EPOCH_NS
+from .can_logs import CSV_HEADER
 from .column_map import Column, ColumnMap
 from .import_output import ImportReport, imported_session
+from .undated import RELATIVE_EPOCH_NS
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
 _ROWS_PER_UPDATE = 4096

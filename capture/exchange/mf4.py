@@ -1,0 +1,304 @@
+"""MF4, the measurement format of ASAM (MDF 4), as loggers write CAN frames into it; by asammdf.
+
+The frames lie in channel groups, one for each kind of frame and often one for each bus. A group has
+a channel for each field, as columns: ``CAN_DataFrame.ID``, ``.IDE``, ``.DLC``, ``.DataLength``,
+``.DataBytes``, ``.Dir``, ``.BusChannel``; ``CAN_RemoteFrame`` and ``CAN_ErrorFrame`` have the same
+names. Source: "MDF bus logging" of https://www.asam.net/standards/detail/mdf/.
+
+python-can reads the format too, but a frame at a time, without the length codes above 8, and with
+times as floating-point Unix seconds; the file has them from its start, good to 1 ns.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+from ..bus.frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock
+from ..errors import ImportFormatError, MissingExtraError
+from ..log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    ID_MASK,
+    REMOTE_FLAG,
+    FrameArray,
+    empty_frames,
+)
+from .mf4_faults import readable, said
+from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
+
+_KIND_FLAGS = {"CAN_DataFrame": 0, "CAN_RemoteFrame": REMOTE_FLAG, "CAN_ErrorFrame": ERROR_FLAG}
+_NS = 1_000_000_000
+_LOCAL_TIME = 1  # bit of the header's time flags: civil time, of no zone
+_PLACES: IntArray = np.arange(8)
+_VERSION_4 = (b"MDF", b"UnFinMF")
+
+
+@dataclass(frozen=True)
+class _Group:
+    """A channel group of CAN frames of one kind."""
+
+    index: int
+    kind: str
+    count: int
+    channels: dict[str, int]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Frames of one group; ``order`` never falls, not even where their times do."""
+
+    order: IntArray
+    bus: IntArray  # number of the bus, as the file has it
+    frames: FrameArray
+
+
+@contextmanager
+def open_mf4(path: Path) -> Generator[FrameLog]:
+    """Open an MF4 file of CAN frames.
+
+    Args:
+        path: The file, also compressed, with ``.gz`` behind its suffix.
+
+    Yields:
+        The log: frames of all groups merged by their times, to the nanosecond; a bus is named
+        after its number, ``can0`` where it has none.
+
+    Raises:
+        ImportFormatError: If the file can't be read or holds no CAN frames; also while its blocks
+            are taken.
+        MissingExtraError: If asammdf is not installed.
+    """
+    try:
+        from asammdf import MDF
+    except ImportError as error:
+        raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf") from error
+    # What it says here is about decoding by databases inside the file, which is not asked for.
+    with said([]), readable(path, "can't be read"):
+        _check_head(path)
+        mdf = MDF(BytesIO(gzip.decompress(path.read_bytes())) if path.suffix == ".gz" else path)
+    try:
+        with readable(path, "can't be read"):
+            log = _log(path, mdf)
+        yield log
+    finally:
+        mdf.close()
+
+
+def _check_head(path: Path) -> None:
+    """Refuse what asammdf would take for something else, or leave open."""
+    opener = gzip.open if path.suffix == ".gz" else open
+    with opener(path, "rb") as stream:
+        head = stream.read(64)
+    if head[:8].strip() not in _VERSION_4:
+        raise ValueError("not an MF4 file")
+    if not head[8:16].startswith(b"4"):
+        version = head[8:16].decode("ascii", "replace").strip(" \0")
+        raise ValueError(f"it is of version {version!r}; bus logging began with MDF 4")
+
+
+def _log(path: Path, mdf: Any) -> FrameLog:
+    groups, problems = _groups(mdf)
+    total = sum(group.count for group in groups)
+    if not total:
+        raise ImportFormatError(path, "holds no CAN frames")
+    start_ns, zone = _start(mdf.header)
+    with_way = sum(group.count for group in groups if "Dir" in group.channels)
+    log = FrameLog(
+        blocks=iter(()),
+        buses=[],
+        directions=with_way > 0,
+        time=f"to 1 ns from a start to 1 us, in {zone}",
+        problems=problems,
+    )
+    if 0 < with_way < total:
+        log.problems.append(f"{total - with_way} frames have no direction, unlike others")
+    log.blocks = _blocks(path, _Reader(mdf, start_ns, log), groups, total)
+    return log
+
+
+def _groups(mdf: Any) -> tuple[list[_Group], list[str]]:
+    """The groups of CAN frames, and what is left out."""
+    groups: list[_Group] = []
+    left_out: dict[str, int] = {}
+    for index, group in enumerate(mdf.groups):
+        names: list[str] = [str(channel.name) for channel in group.channels]
+        count = int(group.channel_group.cycles_nr)
+        kind = next((name for name in _KIND_FLAGS if name in names), None)
+        if kind is not None:
+            fields = {
+                name.removeprefix(f"{kind}."): place
+                for place, name in enumerate(names)
+                if name.startswith(f"{kind}.")
+            }
+            groups.append(_Group(index, kind, count, fields))
+        elif count:
+            what = names[1] if len(names) > 1 else names[0] if names else f"group {index}"
+            left_out[what] = left_out.get(what, 0) + count
+    told = [
+        f"{count} records of {what} left out: only CAN data, remote and error frames are kept"
+        for what, count in left_out.items()
+    ]
+    return groups, told
+
+
+def _start(header: Any) -> tuple[int, str]:
+    """The start of the measurement [Unix ns], and what its clock is.
+
+    It is taken to 1 us: asammdf computes it in floating point, to 0.1 us.
+    """
+    start_ns = (int(header.abs_time) + 500) // 1000 * 1000
+    if not header.time_flags & _LOCAL_TIME:
+        return start_ns, "UTC"
+    seconds, rest = divmod(start_ns, _NS)
+    civil = datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None)
+    return int(civil.timestamp()) * _NS + rest, "local time of no zone, taken as this machine's"
+
+
+class _Reader:
+    """Takes the frames out of the groups."""
+
+    def __init__(self, mdf: Any, start_ns: int, log: FrameLog) -> None:
+        self.log = log
+        self.fd_frames = 0
+        self._mdf = mdf
+        self._start_ns = start_ns
+
+    def pieces(self, group: _Group) -> Iterator[_Piece]:
+        """The classic frames of a group, in the order they were logged."""
+        latest = np.iinfo(np.int64).min
+        for first in range(0, group.count, FRAMES_PER_BLOCK):
+            count = min(FRAMES_PER_BLOCK, group.count - first)
+            times = self._mdf.get_master(group.index, record_offset=first, record_count=count)
+            t_ns = self._start_ns + np.rint(np.asarray(times) * 1e9).astype(np.int64)
+            frames, bus, fd = self._frames(group, first, count)
+            frames["t_host_ns"] = t_ns.astype(np.uint64)
+            self.fd_frames += int(fd.sum())
+            order = np.maximum(np.maximum.accumulate(t_ns), latest)
+            latest = int(order[-1])
+            if not fd.all():
+                yield _Piece(order[~fd], bus[~fd], frames[~fd])
+
+    def _frames(
+        self, group: _Group, first: int, count: int
+    ) -> tuple[FrameArray, IntArray, NDArray[np.bool_]]:
+        def column(name: str, *, converted: bool = False) -> NDArray[Any] | None:
+            if name not in group.channels:
+                return None
+            found, _ = self._mdf.get(
+                group=group.index,
+                index=group.channels[name],
+                raw=not converted,
+                samples_only=True,
+                record_offset=first,
+                record_count=count,
+            )
+            if len(found) != count:
+                raise ValueError(f"{group.kind}.{name} has {len(found)} of {count} values")
+            return np.asarray(found)
+
+        def numbers(name: str) -> IntArray | None:
+            found = column(name)
+            return None if found is None else found.astype(np.int64)
+
+        frames = empty_frames(count)
+        none = np.zeros(count, dtype=np.int64)
+        identifier = none if (found := numbers("ID")) is None else found
+        extended = identifier & EXTENDED_FLAG != 0
+        if (wide := numbers("IDE")) is not None:
+            extended |= wide != 0
+        if group.kind == "CAN_ErrorFrame":
+            extended[:] = False  # an error frame has no identifier, and no width of it
+        frames["id_flags"] = (
+            (identifier & ID_MASK) | extended * EXTENDED_FLAG | _KIND_FLAGS[group.kind]
+        )
+        data, size = column("DataBytes"), numbers("DataLength")
+        dlc = numbers("DLC")
+        if size is None:
+            size = none if data is None or dlc is None else np.minimum(dlc, 8)
+        frames["dlc"] = size if dlc is None else dlc
+        if data is not None:
+            cells = np.ascontiguousarray(data).view(np.uint8).reshape(count, -1)[:, :8]
+            cells = cells * (_PLACES[: cells.shape[1]] < size[:, None])
+            frames["data"][:, : cells.shape[1]] = cells
+        frames["dir"] = _ways(column("Dir", converted=True), count)
+        bus = none if (found := numbers("BusChannel")) is None else found
+        fd = size > 8
+        if (longer := numbers("EDL")) is not None:
+            fd |= longer != 0
+        return frames, bus, fd
+
+
+def _ways(column: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
+    """Directions: the file has them as numbers, or as texts Rx and Tx."""
+    if column is None:
+        return np.full(count, DIR_RX, dtype=np.uint8)
+    texts = column.dtype.kind in "SU"
+    sent = np.char.lower(column.astype("S")) == b"tx" if texts else column != 0
+    return np.where(sent, DIR_TX, DIR_RX).astype(np.uint8)
+
+
+def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> Iterator[LogBlock]:
+    log, taken, epoch_ns = reader.log, 0, None
+    with said(log.problems):
+        merged = _merged([reader.pieces(group) for group in groups])
+        while True:
+            with readable(path, f"can't be read after {taken} frames"):
+                piece = next(merged, None)
+            if piece is None:
+                break
+            frames = piece.frames
+            t_ns = frames["t_host_ns"].astype(np.int64)
+            if epoch_ns is None:
+                epoch_ns = RELATIVE_EPOCH_NS if t_ns[0] < EARLIEST_NS else 0
+                if epoch_ns:
+                    log.time = "counted from the log's start, put at 2000-01-01T00:00:00Z; to 1 ns"
+            if (earliest := int(t_ns.min()) + epoch_ns) < 0:
+                raise ImportFormatError(path, f"has a frame at {earliest / _NS} s, before 1970")
+            frames["t_host_ns"] = (t_ns + epoch_ns).astype(np.uint64)
+            taken += len(frames)
+            yield LogBlock(frames, _indices(piece.bus, log.buses), taken / total)
+    if reader.fd_frames:
+        text = f"{reader.fd_frames} CAN FD frames left out: only classic frames are kept"
+        log.problems.append(text)
+
+
+def _indices(numbers: IntArray, buses: list[str]) -> IntArray:
+    """Indices of buses by their numbers; a bus that is new is added, in order of appearance."""
+    found, first, which = np.unique(numbers, return_index=True, return_inverse=True)
+    for place in np.argsort(first):
+        name = f"can{found[place]}"
+        if name not in buses:
+            buses.append(name)
+    return np.array([buses.index(f"can{number}") for number in found], dtype=np.int64)[which]
+
+
+def _merged(streams: list[Iterator[_Piece]]) -> Iterator[_Piece]:
+    """Pieces of several groups as one stream; only one piece of each is held."""
+    heads = [next(stream, None) for stream in streams]
+    while live := [(i, head) for i, head in enumerate(heads) if head is not None]:
+        # What comes later in any group is not before the end of the piece that ends first.
+        until = min(int(head.order[-1]) for _, head in live)
+        parts: list[_Piece] = []
+        for i, head in live:
+            cut = int(np.searchsorted(head.order, until, side="right"))
+            parts.append(_Piece(head.order[:cut], head.bus[:cut], head.frames[:cut]))
+            rest = _Piece(head.order[cut:], head.bus[cut:], head.frames[cut:])
+            heads[i] = rest if len(rest.order) else next(streams[i], None)
+        order = np.concatenate([part.order for part in parts])
+        by_time = np.argsort(order, kind="stable")
+        bus = np.concatenate([part.bus for part in parts])
+        frames = np.concatenate([part.frames for part in parts])
+        yield _Piece(order[by_time], bus[by_time], frames[by_time])

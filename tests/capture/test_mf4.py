@@ -1,0 +1,304 @@
+"""MF4 files of other makers: python-can's writer, and asammdf with the groups that loggers have."""
+
+import gzip
+import math
+import random
+import sys
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+import undulog
+from capture import Session, load_robot
+from capture.errors import ImportFormatError
+from capture.exchange.can_import import import_can
+from capture.exchange.can_logs import open_frame_log
+from capture.exchange.undated import RELATIVE_EPOCH_NS
+from capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+
+asammdf = pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
+from asammdf.blocks.v4_blocks import SourceInformation  # noqa: E402
+from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS  # noqa: E402
+
+T0 = 1_700_000_000.25
+T0_NS = 1_700_000_000_250_000_000
+START = datetime(2024, 2, 29, 12, 0, 0, 125_000, tzinfo=UTC)
+START_NS = 1_709_208_000_125_000_000
+
+
+def read(path: Path):
+    """Everything in a file: frames, name of each one's bus, the log."""
+    with open_frame_log(path) as log:
+        blocks = list(log.blocks)
+        frames = np.concatenate([block.frames for block in blocks])
+        buses = [log.buses[i] for block in blocks for i in block.bus]
+    assert blocks[-1].done == pytest.approx(1.0)
+    return frames, buses, log
+
+
+def group(kind, times, columns, *, bus=True):
+    """A channel group as loggers write it, for asammdf's ``append``."""
+    size = len(times)
+    dtype = [(f"{kind}.{name}", *field) for name, (field, _) in columns.items()]
+    samples = np.zeros(size, dtype=dtype)
+    for name, (_, values) in columns.items():
+        samples[f"{kind}.{name}"] = values
+    source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN) if bus else None
+    return asammdf.Signal(samples, np.asarray(times, dtype="<f8"), name=kind, source=source)
+
+
+def data_group(times, ids, data, *, way=None, bus=None, wide=None, dlc=None, width=8):
+    lengths = [len(each) for each in data]
+    cells = np.array([list(each.ljust(width, b"\xee")) for each in data], dtype=np.uint8)
+    columns = {
+        "ID": (("<u4",), ids),
+        "DLC": (("u1",), lengths if dlc is None else dlc),
+        "DataLength": (("u1",), lengths),
+        "DataBytes": (("u1", (width,)), cells),
+    }
+    for name, values in (("Dir", way), ("BusChannel", bus), ("IDE", wide)):
+        if values is not None:
+            columns[name] = (("u1",), values)
+    return group("CAN_DataFrame", times, columns)
+
+
+def written(path: Path, *groups, start=START, compression=0):
+    mdf = asammdf.MDF(version="4.10")
+    mdf.header.start_time = start
+    for each in groups:
+        mdf.append(each)
+    mdf.save(path, compression=compression)
+    mdf.close()
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mf4", ".mf4.gz"])
+def test_every_kind_of_frame_of_python_cans_writer(suffix, tmp_path: Path):
+    rng = np.random.default_rng(3)
+    messages = []
+    for i in range(500):
+        kind = i % 6
+        messages.append(
+            can.Message(
+                timestamp=T0 + i * 1e-3,
+                arbitration_id=0x1800_0000 + i if kind == 1 else 0x80 + i,
+                is_extended_id=kind == 1,
+                is_remote_frame=kind == 3,
+                is_error_frame=kind == 5,
+                dlc=i % 9 if kind == 3 else 15 if kind == 4 else None,
+                data=None if kind == 3 else rng.bytes(8 if kind == 4 else i % 9),
+                is_rx=bool(rng.integers(2)),
+                channel=i % 3,
+                check=False,
+            )
+        )
+    plain = tmp_path / "log.mf4"
+    with can.MF4Writer(plain) as writer:
+        for message in messages:
+            writer(message)
+    source = tmp_path / f"log{suffix}"
+    if suffix.endswith(".gz"):
+        source.write_bytes(gzip.compress(plain.read_bytes()))
+    frames, buses, log = read(source)
+    flags = [
+        EXTENDED_FLAG * (m.is_extended_id and not m.is_error_frame)
+        | REMOTE_FLAG * m.is_remote_frame
+        | ERROR_FLAG * m.is_error_frame
+        for m in messages
+    ]
+    assert frames["id_flags"].tolist() == [
+        m.arbitration_id | f for m, f in zip(messages, flags, strict=True)
+    ]
+    assert frames["dlc"].tolist() == [m.dlc for m in messages]
+    assert [bytes(row) for row in frames["data"]] == [
+        bytes(m.data).ljust(8, b"\0") for m in messages
+    ]
+    assert frames["dir"].tolist() == [DIR_RX if m.is_rx else DIR_TX for m in messages]
+    assert buses == [f"can{m.channel}" for m in messages]
+    assert (log.directions, log.problems) == (True, [])
+    # The writer keeps differences of Unix times as floating-point seconds: 0.24 us at worst.
+    late = frames["t_host_ns"].astype(np.int64) - [T0_NS + i * 1_000_000 for i in range(500)]
+    assert abs(late).max() <= 250
+
+
+@pytest.mark.parametrize("compression", [0, 1, 2])
+def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_path: Path):
+    """One group for each bus, with texts for directions, the extended bit in the identifier."""
+    steps = np.arange(200_000) * 12_345  # more than one block of either
+    times = steps / 1e9
+    ways = {"val_0": 0, "text_0": b"Rx", "val_1": 1, "text_1": b"Tx"}
+    expected = []
+    groups = []
+    for bus in (1, 2):
+        mine = np.flatnonzero(steps % 5 < 3 if bus == 1 else steps % 5 >= 3)
+        ids = np.where(mine % 2, 0x8000_0000 | mine, mine % 2048)
+        data = mine.astype("<u8").view(np.uint8).reshape(-1, 8)
+        columns = {
+            "BusChannel": (("u1",), bus),
+            "ID": (("<u4",), ids),
+            "DLC": (("u1",), 8),
+            "DataLength": (("u1",), 8),
+            "DataBytes": (("u1", (8,)), data),
+            "Dir": (("u1",), mine % 3 == 0),
+        }
+        groups.append(group("CAN_DataFrame", times[mine], columns))
+        expected.append(np.stack([mine, ids, mine % 3 == 0, np.full(len(mine), bus)]))
+    path = tmp_path / "log.mf4"
+    mdf = asammdf.MDF(version="4.10")
+    mdf.header.start_time = START
+    for each in groups:
+        mdf.append(each)
+    for each in mdf.groups:  # as the makers of loggers have it: numbers that stand for texts
+        channel = next(c for c in each.channels if c.name == "CAN_DataFrame.Dir")
+        channel.conversion = asammdf.blocks.conversion_utils.from_dict(ways)
+    mdf.save(path, compression=compression)
+    mdf.close()
+    frames, buses, log = read(path)
+    truth = np.concatenate(expected, axis=1)
+    truth = truth[:, np.argsort(truth[0])]
+    np.testing.assert_array_equal(frames["t_host_ns"].astype(np.int64) - START_NS, steps)
+    np.testing.assert_array_equal(frames["id_flags"], truth[1])
+    np.testing.assert_array_equal(frames["dir"], truth[2])
+    np.testing.assert_array_equal(frames["data"].view("<u8")[:, 0], truth[0])
+    assert buses == [f"can{number}" for number in truth[3]]
+    assert log.time == "to 1 ns from a start to 1 us, in UTC"
+    assert log.problems == []
+
+
+def test_fields_that_a_group_may_lack(tmp_path: Path):
+    path = written(
+        tmp_path / "log.mf4",
+        data_group([0.5, 1.5], [0x123, 0x456], [b"\1\2", b""]),
+        group("CAN_ErrorFrame", [1.0], {"BusChannel": (("u1",), 0)}),
+        group("CAN_RemoteFrame", [2.0], {"ID": (("<u4",), 7), "DLC": (("u1",), 6)}),
+    )
+    frames, buses, log = read(path)
+    assert frames["id_flags"].tolist() == [0x123, ERROR_FLAG, 0x456, 7 | REMOTE_FLAG]
+    assert frames["dlc"].tolist() == [2, 0, 0, 6]
+    assert [bytes(row[:3]) for row in frames["data"]] == [
+        b"\1\2\0",
+        b"\0\0\0",
+        b"\0\0\0",
+        b"\0\0\0",
+    ]
+    assert (frames["t_host_ns"] - START_NS).tolist() == [5e8, 1e9, 1.5e9, 2e9]
+    assert set(buses) == {"can0"}
+    assert log.directions is False
+
+
+def test_what_is_left_out_is_told(tmp_path: Path):
+    long_columns = {
+        "ID": (("<u4",), 2),
+        "DLC": (("u1",), 15),
+        "DataLength": (("u1",), 64),
+        "DataBytes": (("u1", (64,)), 1),
+        "EDL": (("u1",), 1),
+        "Dir": (("u1",), 0),
+    }
+    path = written(
+        tmp_path / "log.mf4",
+        data_group([0.0], [1], [b"\1"]),
+        group("CAN_DataFrame", [1.0, 2.0], long_columns),
+        group("CAN_OverloadFrame", [3.0], {"BusChannel": (("u1",), 0)}),
+        asammdf.Signal(np.arange(4.0), np.arange(4.0), name="motor_temperature"),
+    )
+    report = import_can(path, tmp_path / "run.mcap", load_robot("arcsnake-joint"))
+    left_out = "left out: only CAN data, remote and error frames are kept"
+    assert report.frames == 1
+    assert report.problems == [
+        f"1 records of CAN_OverloadFrame {left_out}",
+        f"4 records of motor_temperature {left_out}",
+        "1 frames have no direction, unlike others",
+        "2 CAN FD frames left out: only classic frames are kept",
+    ]
+    assert report.verdict == "degraded"
+    with Session.open(tmp_path / "run.mcap") as session:
+        facts = session.metadata["undulog"]
+        assert (facts["import.format"], facts["import.directions"]) == ("mf4", "recorded")
+
+
+@pytest.mark.parametrize(
+    ("start", "truth_ns"),
+    [
+        (START.astimezone(timezone(timedelta(hours=9))), START_NS),
+        (datetime(1970, 1, 1, tzinfo=UTC), RELATIVE_EPOCH_NS),
+        (START.astimezone().replace(tzinfo=None), START_NS),
+    ],
+)
+def test_the_start_of_the_measurement(start, truth_ns, tmp_path: Path):
+    path = written(tmp_path / "log.mf4", data_group([0.0, 0.25], [1, 2], [b"", b""]), start=start)
+    frames, _, log = read(path)
+    assert (frames["t_host_ns"].astype(np.int64) - truth_ns).tolist() == [0, 250_000_000]
+    assert ("this machine's" in log.time) == (start.tzinfo is None)
+
+
+def test_times_that_go_back_stay_in_their_order(tmp_path: Path):
+    times = [0.0, 2.0, 1.0, 3.0]
+    ids = [1, 2, 3, 4]
+    other = data_group([1.5, 2.5], [5, 6], [b"", b""])
+    frames, *_ = read(written(tmp_path / "log.mf4", data_group(times, ids, [b""] * 4), other))
+    assert frames["id_flags"].tolist() == [1, 5, 2, 3, 6, 4]
+
+
+def test_files_that_hold_no_frames(tmp_path: Path):
+    temperature = asammdf.Signal(np.arange(4.0), np.arange(4.0), name="temperature")
+    path = written(tmp_path / "log.mf4", temperature)
+    with pytest.raises(ImportFormatError, match=r"log\.mf4: holds no CAN frames"):
+        read(path)
+    old = asammdf.MDF(version="3.30")
+    old.append(temperature)
+    old.save(tmp_path / "old.mdf")
+    old.close()
+    path.write_bytes((tmp_path / "old.mdf").read_bytes())
+    with pytest.raises(ImportFormatError, match=r"version '3\.30'; bus logging began with MDF 4"):
+        read(path)
+    path.write_bytes(b"MDF")
+    with pytest.raises(ImportFormatError, match="can't be read"):
+        read(path)
+
+
+def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, monkeypatch):
+    """Read or refused, whatever is damaged; neither asammdf nor the interpreter says a word."""
+    said = []
+    monkeypatch.setattr(sys, "unraisablehook", said.append)
+    path = tmp_path / "log.mf4"
+    with can.MF4Writer(path) as writer:
+        for i in range(300):
+            writer(can.Message(timestamp=T0 + i, arbitration_id=i, data=bytes(i % 9)))
+    whole, chance, refused = path.read_bytes(), random.Random(7), 0
+    for k in range(60):
+        damaged = bytearray(whole[: chance.randrange(len(whole))] if k % 3 == 0 else whole)
+        for _ in range(k % 5):
+            damaged[chance.randrange(len(damaged))] = chance.randrange(256)
+        path.write_bytes(damaged)
+        try:
+            read(path)
+        except ImportFormatError as error:
+            assert str(path) in str(error)  # noqa: PT017
+            refused += 1
+    assert refused > 20
+    assert said == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_without_asammdf_the_command_names_the_extra(tmp_path: Path, capsys, monkeypatch):
+    (tmp_path / "x.mf4").write_bytes(b"MDF     4.10    ".ljust(64, b"\0"))
+    monkeypatch.setitem(sys.modules, "asammdf", None)
+    arguments = ["import", str(tmp_path / "x.mf4"), "-o", str(tmp_path / "run.mcap")]
+    assert undulog.run([*arguments, "--robot", "snake25"]) == 2
+    assert capsys.readouterr().err == (
+        "error: importing x.mf4 needs the package asammdf, which is not installed: "
+        "pip install 'undulog[mf4]'\n"
+    )
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_the_times_are_rounded_not_cut(tmp_path: Path):
+    """A time as a floating-point number of seconds lies beside its nanosecond."""
+    steps = [1, 3, 999_999_999, 1_000_000_001, 3_600_000_000_007]
+    times = [math.nextafter(step / 1e9, 0) for step in steps]
+    path = written(tmp_path / "log.mf4", data_group(times, [1] * 5, [b""] * 5))
+    assert (read(path)[0]["t_host_ns"].astype(np.int64) - START_NS).tolist() == steps
