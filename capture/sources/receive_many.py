@@ -166,7 +166,8 @@ class ArrivalClock:
             now_ns: The session's clock [Unix ns].
         """
         self._now_ns = now_ns
-        before, wall, after = now_ns(), time.time_ns(), now_ns()
+        readings = [(now_ns(), time.time_ns(), now_ns()) for _ in range(5)]
+        before, wall, after = min(readings, key=lambda reading: reading[2] - reading[0])
         self._offset_ns = (before + after) // 2 - wall
 
     def times(self, stamps_ns: Sequence[int], floor_ns: int) -> list[int]:
