@@ -1,0 +1,142 @@
+"""Reading in bulk: one pass for joints and tables, windows, own times, frames of any batch size."""
+
+import numpy as np
+import pytest
+import zstandard
+
+from capture import Session, SessionWriter
+from capture.errors import DataError
+from capture.log.frames import empty_frames
+from capture.log.own_times import Series, own_times
+from capture.log.stores import ColumnStore, TimeStore
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NAMES = [f"joint{k:02d}" for k in range(1, 6)]
+STEP_NS = 10_000_000
+
+
+def write_session(path, ticks, *, stall=None):
+    """Joints polled in turn; from tick ``stall`` on, 300 ticks are logged late, all at once."""
+    rng = np.random.default_rng(3)
+    values, offsets = rng.normal(size=(ticks, 5)), rng.uniform(0, 8e-3, size=(ticks, 5))
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
+        times = writer.joint_state("/joint_sample_offset", NAMES, unit="s")
+        current = writer.joint_state("/joint_current", NAMES, unit="A")
+        imu = writer.imu("/imu", frame="head")
+        for tick in range(ticks):
+            t_ns = EPOCH_NS + tick * STEP_NS
+            late = stall is not None and stall <= tick < stall + 300
+            log = {"log_time_ns": EPOCH_NS + (stall + 300) * STEP_NS if late else t_ns}
+            states.write(t_ns, values[tick], -values[tick], **log)
+            times.write(t_ns, offsets[tick], **log)
+            current.write(t_ns, 2 * values[tick], **log)
+            imu.write(t_ns, values[tick, :3], **log)
+    t_ns = EPOCH_NS + np.arange(ticks)[:, None] * STEP_NS + np.rint(offsets * 1e9).astype(np.int64)
+    return t_ns, values
+
+
+def test_one_pass_gives_what_each_reader_gives(tmp_path):
+    path = tmp_path / "s.mcap"
+    t_ns, values = write_session(path, 5000)
+    wanted = {"/joint_states": ["position", "velocity"], "/joint_current": ["position"]}
+    with Session(path) as session:
+        signals, tables = session.columns(wanted, {"/imu": ["linear_acceleration.z"]})
+        table = session.table("/imu")
+    for (topic, field), scale in {
+        ("/joint_states", "position"): 1,
+        ("/joint_states", "velocity"): -1,
+        ("/joint_current", "position"): 2,
+    }.items():
+        found = signals[topic, field]
+        np.testing.assert_array_equal(np.array(found.values).T, scale * values)
+        np.testing.assert_array_equal(np.array(found.t_ns).T, t_ns)
+    assert list(tables["/imu"].columns) == ["linear_acceleration.z"]
+    assert tables["/imu"].equals(table[["linear_acceleration.z"]])
+    np.testing.assert_array_equal(tables["/imu"]["linear_acceleration.z"], values[:, 2])
+
+
+def test_offsets_that_are_asked_for_are_not_overwritten(tmp_path):
+    t_ns, _ = write_session(tmp_path / "s.mcap", 50)
+    wanted = {"/joint_states": ["position"], "/joint_sample_offset": ["position"]}
+    with Session(tmp_path / "s.mcap") as session:
+        found = session.joint_columns(wanted)
+    stamps = EPOCH_NS + np.arange(50) * STEP_NS
+    offsets = np.array(found["/joint_sample_offset", "position"].values)
+    np.testing.assert_allclose(offsets, (t_ns.T - stamps) * 1e-9, atol=1e-9)
+    np.testing.assert_array_equal(np.array(found["/joint_states", "position"].t_ns).T, t_ns)
+
+
+def test_a_topic_is_asked_for_one_way(tmp_path):
+    write_session(tmp_path / "s.mcap", 5)
+    with Session(tmp_path / "s.mcap") as session, pytest.raises(DataError, match="not for both"):
+        session.columns({"/joint_states": ["position"]}, {"/joint_sample_offset": None})
+
+
+@pytest.mark.parametrize("stall", [None, 1500])
+def test_a_window_is_what_the_whole_has_of_it(tmp_path, stall):
+    path = tmp_path / "s.mcap"
+    t_ns, values = write_session(path, 4000, stall=stall)
+    rng = np.random.default_rng(4)
+    with Session(path) as session:
+        for start in [0, 1450, 1550, 1790, *rng.integers(0, 3900, 20).tolist()]:
+            window = EPOCH_NS + start * STEP_NS + 3_000_000
+            window = window, window + int(rng.integers(1, 100)) * STEP_NS
+            found = session.joints("/joint_states", start_ns=window[0], stop_ns=window[1])
+            for j in range(5):
+                inside = (t_ns[:, j] >= window[0]) & (t_ns[:, j] < window[1])
+                np.testing.assert_array_equal(found.t_ns[j], t_ns[inside, j])
+                np.testing.assert_array_equal(found.values[j], values[inside, j])
+
+
+def test_frames_come_in_the_order_they_were_logged(tmp_path):
+    rng = np.random.default_rng(5)
+    order, number = [], 0
+    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS) as writer:
+        channel = writer.frames("/can/can0")
+        for tick in range(200):
+            frames = empty_frames(int(rng.integers(0, 5)))
+            frames["id_flags"] = number + np.arange(len(frames))
+            number += len(frames)
+            late = EPOCH_NS + (tick if tick % 7 else max(tick - 9, 0)) * STEP_NS
+            order.append((late, tick, frames["id_flags"].tolist()))
+            channel.write(late, frames)
+    with Session(tmp_path / "s.mcap") as session:
+        found = session.frames("/can/can0")["id_flags"].tolist()
+    assert found == [number for _, _, batch in sorted(order) for number in batch]
+
+
+def test_own_times_of_series_that_are_stamped_differently():
+    stamps = np.array([100, 200, 300, 400])
+    offsets = Series(("a",), [stamps], [np.array([1e-9, 2e-9, np.nan, 4e-9])])
+    series = Series(("a", "b"), [np.array([50, 250, 350])] * 2, [np.zeros(3)] * 2)
+    (own,) = own_times([series], offsets)
+    assert own[0].tolist() == [51, 252, 350]
+    assert own[1].tolist() == [50, 250, 350]
+
+
+def test_stores_grow_and_keep_far_log_times():
+    store = ColumnStore("<f8", 3, 1)
+    rows = np.random.default_rng(6).normal(size=(1000, 3))
+    for part in np.array_split(rows, 37):
+        store.append(part.reshape(-1))
+    np.testing.assert_array_equal(store.values(), rows)
+    times = TimeStore(1, stamped=True)
+    stamps = EPOCH_NS + np.arange(5)
+    for behind in (10, 2**31, -(2**40)):
+        times.append(stamps + behind, stamps)
+    assert (times.log() - times.stamps()).tolist() == [10] * 5 + [2**31] * 5 + [-(2**40)] * 5
+
+
+def test_a_damaged_frame_is_found_by_its_own_checksum(tmp_path):
+    path = tmp_path / "s.mcap"
+    write_session(path, 20)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x28\xb5\x2f\xfd")
+    assert zstandard.get_frame_parameters(bytes(data[at : at + 64])).has_checksum
+    size = int.from_bytes(data[at - 8 : at], "little")
+    data[at + size - 1] ^= 1  # the checksum itself: all else is whole
+    path.write_bytes(data)
+    with Session(path) as session:
+        assert len(session.table("/imu")) == 0
+        assert any("can't be decompressed" in text for text in session.warnings)
