@@ -69,6 +69,7 @@ class UnixPeer:
     def __init__(self, path: str) -> None:
         """Connect to a recorder that may still be starting."""
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)  # cut to the limit
         deadline = time.monotonic() + 60
         while True:
             try:

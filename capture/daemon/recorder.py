@@ -6,8 +6,10 @@ slices. What is due once a second is spread over the second's ticks, so that no 
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from select import select
 
@@ -29,8 +31,12 @@ DECODE_TICKS = 5
 """Frames are decoded every so many ticks, a backlog in every one."""
 
 _PRESSED = 1000
-_PRESSED_TICK_NS = 3_000_000
-"""After so many frames in a tick the next one comes sooner: the kernel's buffers are small."""
+"""After so many frames in a tick the next one follows at once, and decoding waits: the kernel's
+buffers hold only milliseconds of a burst."""
+
+_BREATH_NS = 1_000_000
+_MOST_WAITING = 2_000_000
+"""So many frames may wait to be decoded, 64 MB; then the burst is no burst."""
 
 _DECODE_BUDGET_NS = 4_000_000
 _BACKLOG = 16_384
@@ -95,7 +101,7 @@ class Recorder:
         self._robot, self._decoded = robot, decoded
         self._each_tick = tuple(each_tick)
         self._second: dict[int, Callable[[], object]] = {}
-        tasks = (self._write_clocks, *each_second)
+        tasks = (self._write_clocks, _tidy, *each_second)
         for k, task in enumerate(tasks):
             self._second[(k + 1) * _SECOND_TICKS // (len(tasks) + 1)] = task
         self._events = writer.log("/rosout")
@@ -153,7 +159,8 @@ class Recorder:
         """
         try:
             self._start()
-            self._loop(stop, duration_s)
+            with _tidied_by_hand():
+                self._loop(stop, duration_s)
             self._finish()
         finally:
             for source in self._sources:
@@ -185,7 +192,7 @@ class Recorder:
             after_ns = time.monotonic_ns()
             self.ticks.add(after_ns - now_ns)
             tick += 1
-            due_ns += TICK_NS if self._came < _PRESSED else _PRESSED_TICK_NS
+            due_ns = after_ns + _BREATH_NS if self._came >= _PRESSED else due_ns + TICK_NS
             if after_ns < due_ns:
                 select([], [], [], (due_ns - after_ns) / _NS)
             elif after_ns > due_ns + _NS:  # stopped for a while: ticks are not made up for
@@ -196,7 +203,9 @@ class Recorder:
         self._poll()
         for bus in self.buses.values():
             bus.write_raw(self._clock.now_ns)
-        if tick % DECODE_TICKS == 1 or self.backlog > _BACKLOG:
+        waits = self.backlog
+        pressed = self._came >= _PRESSED and waits < _MOST_WAITING
+        if not pressed and (tick % DECODE_TICKS == 1 or waits > _BACKLOG):
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
                 self._decode(name, bus, until_ns)
@@ -301,3 +310,23 @@ class Recorder:
         ending = self.ending
         assert ending is not None  # noqa: S101 - set by the loop
         self.say("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
+
+
+@contextmanager
+def _tidied_by_hand() -> Generator[None]:
+    """No collection of garbage at a moment of the interpreter's choosing: a full one takes long.
+
+    What is there by now stays; the young generations are looked at once a second.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
+def _tidy() -> None:
+    gc.collect(1)
