@@ -7,7 +7,6 @@ files' blocks as one more block, in memory; nothing on the disk is changed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -21,6 +20,7 @@ from .mcap_file import McapFile
 from .message_heads import read_heads
 from .part_files import PartFiles, first_part, open_parts
 from .part_names import PART_RECORD
+from .recovered import Recovered
 from .wal_tail import MessageKey, WalContents, WalTail, beyond, read_wal
 
 
@@ -34,50 +34,6 @@ class _Part(Protocol):
     def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]: ...
     def offsets(self, block: Block, channel_id: int) -> IntArray: ...
     def close(self) -> None: ...
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """What was put together of a session that was not finalised.
-
-    Attributes:
-        folder: Its write-ahead log.
-        live: Whether its recorder is still writing.
-        in_files: Messages that the files have.
-        from_wal: Messages that only the write-ahead log has.
-        accepted: Messages that the recorder accepted; None where nothing tells.
-    """
-
-    folder: Path
-    live: bool
-    in_files: int
-    from_wal: int
-    accepted: int | None
-
-    @property
-    def missing(self) -> int | None:
-        """Messages that were accepted and are in neither; None where nothing tells."""
-        if self.accepted is None:
-            return None
-        return max(0, self.accepted - self.in_files - self.from_wal)
-
-    def __str__(self) -> str:
-        """One sentence."""
-        total = self.in_files + self.from_wal
-        if self.live:
-            return (
-                f"this recording is running: its first {total} messages are read, "
-                f"{self.from_wal} of them from its write-ahead log"
-            )
-        missing = (
-            "how many are missing can't be told" if self.missing is None else "none is missing"
-        )
-        if self.missing:
-            missing = f"{self.missing} of {self.accepted} are missing"
-        return (
-            f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
-            f"from its write-ahead log; {missing}; 'undulog log recover' writes a whole file"
-        )
 
 
 class LogFile:
