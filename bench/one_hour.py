@@ -92,15 +92,16 @@ def load_frames(path: Path) -> object:
 
 def rates(path: Path, window: tuple[int, int]) -> tuple[float, float]:
     """Seconds a message of our reader (all of the session) and of the peer (a window of it)."""
+    topics = [*JOINT_TOPICS, "/joint_sample_offset", "/joint_command_offset"]  # ours needs them too
     with Session.open(path) as session:
-        count = sum(session.channels[topic].count for topic in JOINT_TOPICS)
+        count = sum(session.channels[topic].count for topic in topics)
     ours = statistics.median(cpu_s(lambda: _joints(path)) for _ in range(3)) / count
     read = 0
     start = time.process_time()
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         for _ in reader.iter_decoded_messages(
-            topics=list(JOINT_TOPICS), starting_at=window[0], ending_before=window[1]
+            topics=topics, starting_at=window[0], ending_before=window[1]
         ):
             read += 1
     return ours, (time.process_time() - start) / read
@@ -135,12 +136,11 @@ def memory(path: Path) -> dict[str, int]:
     load(load_some)  # what is imported late is imported now
     load_some.unlink()
     clear.write_text("5")  # the high-water mark begins anew
-    before = _status("VmRSS") - _status("RssFile")
+    before = _status("VmRSS")
     found = load(path)
     peak = _status("VmHWM")
-    mapped = _status("RssFile")
     arrays = sum(_sizes(found).values())
-    return {"arrays": arrays, "over": peak - before - arrays - max(mapped, path.stat().st_size)}
+    return {"arrays": arrays, "over": peak - before - arrays - path.stat().st_size}
 
 
 def _sizes(found: Loaded) -> dict[int, int]:

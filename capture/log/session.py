@@ -390,6 +390,6 @@ def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
         else:
             columns[path] = values[:, 0]
     t_ns = group.stamps()
-    if group.is_stamped:
+    if group.is_stamped and (shift_ns or not t_ns.all()):
         t_ns = np.where(t_ns == 0, group.times(), t_ns + shift_ns)
     return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"), copy=False)
