@@ -37,6 +37,8 @@ SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 CSV_HEADER = "timestamp,arbitration_id,"
 """How a CSV file begins that python-can wrote; any other needs a column map."""
 
+_MOST_TEXTS = 20  # different warnings of a library that are told
+_LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
 _WITHOUT_DIRECTIONS = (".csv", ".db")
 _READ_ERRORS = (
     ValueError,  # text that is no number, a wrong file version
@@ -119,6 +121,8 @@ def _check_blf(path: Path) -> None:
 
 def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
     messages = _messages(path, reader)
+    if suffix == ".asc":
+        messages = map(_with_length_code, messages)
     first = next(messages, None)
     if first is None:
         raise ImportFormatError(path, "holds no CAN frames")
@@ -220,23 +224,47 @@ def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, 
     )
 
 
+def _with_length_code(message: Message) -> Message:
+    """A frame of ASC, whose reader takes a length code for CAN FD's: 9 comes as 12 bytes."""
+    from can.util import len2dlc
+
+    if not message.is_fd and not message.is_remote_frame:
+        message.dlc = len2dlc(message.dlc)
+    return message
+
+
 class _Noting(logging.Handler):
-    """Keeps the warnings of a logger."""
+    """Keeps the warnings of a logger: each text once, with how often it came."""
 
     def __init__(self, problems: list[str]) -> None:
-        super().__init__(logging.WARNING)
+        super().__init__(logging.INFO)
         self._problems = problems
+        self._seen: dict[str, tuple[int, int]] = {}  # text to its place and how often
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._problems.append(record.getMessage())
+        text = record.getMessage()
+        if record.levelno < logging.WARNING and not any(word in text for word in _LINES_LEFT_OUT):
+            return
+        if text not in self._seen and len(self._seen) >= _MOST_TEXTS:
+            text = "more lines of this kind"
+        place, count = self._seen.get(text, (len(self._problems), 0))
+        self._seen[text] = place, count + 1
+        if count:
+            self._problems[place] = f"{text} ({count + 1} times)"
+        else:
+            self._problems.append(text)
 
 
 @contextmanager
 def _noted(name: str, problems: list[str]) -> Generator[None]:
     """Note what a library only warns of, e.g. a line that it passes over."""
     logger, handler = logging.getLogger(name), _Noting(problems)
+    trc = logging.getLogger("can.io.trc")  # it passes over lines without a warning
+    level = trc.level
     logger.addHandler(handler)
+    trc.setLevel(logging.INFO)
     try:
         yield
     finally:
+        trc.setLevel(level)
         logger.removeHandler(handler)

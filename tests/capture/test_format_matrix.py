@@ -1,0 +1,350 @@
+"""Every format of CAN frames, whatever the frames: exact, or counted as lost.
+
+Two ways round: a session exported and imported again, and a trace of python-can's writers imported.
+The truth is the frames that went in and the limits that each format documents.
+"""
+
+import itertools
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from capture import Session, SessionWriter, load_robot
+from capture.exchange.can_import import import_can
+from capture.exchange.log_export import export_log
+from capture.exchange.undated import RELATIVE_EPOCH_NS
+from capture.log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    REMOTE_FLAG,
+    empty_frames,
+)
+
+T0 = 1_700_000_003_250_000_000
+S = 1_000_000_000
+BUSES = ("can0", "can1")
+
+
+@dataclass(frozen=True, order=True)
+class Frame:
+    """One frame of the truth."""
+
+    t_ns: int
+    bus: str
+    kind: str
+    identifier: int
+    extended: bool
+    dlc: int
+    data: bytes
+    sent: bool
+
+
+@st.composite
+def frame(draw):
+    kind = draw(st.sampled_from(["data", "data", "data", "remote", "error"]))
+    extended = kind != "error" and draw(st.booleans())
+    limit = 0x7FF if kind != "error" and not extended else 0x1FFF_FFFF
+    dlc = draw(st.integers(0, 15) if kind == "data" else st.integers(0, 8))
+    size = 0 if kind == "remote" else min(dlc, 8)
+    return Frame(
+        t_ns=draw(
+            st.integers(0, 3_000_000_000) | st.integers(0, 3_000_000).map(lambda t: t * 1000)
+        ),
+        bus=draw(st.sampled_from(BUSES)),
+        kind=kind,
+        identifier=draw(st.integers(0, limit)),
+        extended=extended,
+        dlc=dlc,
+        data=draw(st.binary(min_size=size, max_size=size)),
+        sent=draw(st.booleans()),
+    )
+
+
+def in_order(frames):
+    """By time; those of one time keep the order of their buses, as a merge has it."""
+    ordered = sorted(frames, key=lambda each: (each.t_ns, each.bus))
+    return [replace(each, t_ns=T0 + each.t_ns) for each in ordered]
+
+
+traces = st.lists(frame(), min_size=1, max_size=40).map(in_order)
+EVERY_KIND = in_order(
+    Frame(k * 1_001_000, bus, kind, 0x7F, extended and kind != "error", dlc, b"\xa5" * size, sent)
+    for k, (bus, kind, extended, dlc, sent) in enumerate(
+        itertools.product(
+            BUSES, ("data", "remote", "error"), (False, True), (0, 5, 8), (False, True)
+        )
+    )
+    for size in [0 if kind == "remote" else dlc]
+)
+many = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow], database=None
+)
+
+
+def record_of(frames):
+    array = empty_frames(len(frames))
+    for row, each in zip(array, frames, strict=True):
+        flags = {"data": 0, "remote": REMOTE_FLAG, "error": ERROR_FLAG}[each.kind]
+        row["t_host_ns"] = each.t_ns
+        row["id_flags"] = each.identifier | flags | (EXTENDED_FLAG if each.extended else 0)
+        row["dlc"], row["dir"] = each.dlc, DIR_TX if each.sent else DIR_RX
+        row["data"][: len(each.data)] = list(each.data)
+    return array
+
+
+def frame_of(row, bus):
+    flags = int(row["id_flags"])
+    kind = "error" if flags & ERROR_FLAG else "remote" if flags & REMOTE_FLAG else "data"
+    dlc = int(row["dlc"])
+    data = bytes(row["data"])
+    size = 0 if kind == "remote" else min(dlc, 8)
+    assert not any(data[size:])
+    return Frame(
+        t_ns=int(row["t_host_ns"]),
+        bus=bus,
+        kind=kind,
+        identifier=flags & 0x1FFF_FFFF,
+        extended=bool(flags & EXTENDED_FLAG),
+        dlc=dlc,
+        data=data[:size],
+        sent=int(row["dir"]) == DIR_TX,
+    )
+
+
+def session_of(path, frames):
+    with SessionWriter(path, session_id="s", epoch_ns=T0) as writer:
+        for bus in BUSES:
+            own = record_of([each for each in frames if each.bus == bus])
+            if len(own):
+                writer.frames(f"/can/{bus}").write(int(own["t_host_ns"].max()), own)
+    return path
+
+
+def frames_in(path):
+    """The frames of a session by bus, each in its order."""
+    with Session.open(path) as session:
+        return {
+            bus: [frame_of(row, bus) for row in session.frames(f"/can/{bus}")]
+            for bus in (t.removeprefix("/can/") for t in session.channels if t.startswith("/can/"))
+        }
+
+
+def imported(trace, folder):
+    report = import_can(trace, folder / "back.mcap", load_robot("snake13"), force=True)
+    return frames_in(folder / "back.mcap"), report
+
+
+def by_bus(frames):
+    return {bus: own for bus in BUSES if (own := [each for each in frames if each.bus == bus])}
+
+
+def by_kind(frames_of_bus):
+    split = {}
+    for bus, frames in frames_of_bus.items():
+        for each in frames:
+            split.setdefault((bus, each.kind), []).append(each)
+    return split
+
+
+def same_but_time(found, expected):
+    assert found.keys() == expected.keys()
+    for bus, frames in found.items():
+        assert [replace(each, t_ns=0) for each in frames] == [
+            replace(each, t_ns=0) for each in expected[bus]
+        ]
+
+
+def time_errors(found, expected, shift_ns=0):
+    return np.array(
+        [
+            each.t_ns + shift_ns - truth.t_ns
+            for bus, frames in found.items()
+            for each, truth in zip(frames, expected[bus], strict=True)
+        ]
+    )
+
+
+# -- session -> export -> import -----------------------------------------------------------
+
+
+def held_by_blf(each):
+    return replace(each, sent=False) if each.kind == "error" else each
+
+
+def held_by_asc(each):
+    if each.kind == "error":
+        return replace(each, identifier=0, dlc=0, data=b"", sent=False)
+    return replace(each, dlc=min(each.dlc, 8))
+
+
+EXPORTED = {
+    # suffix: what it holds of a frame, error of its time [ns]
+    ".log": (lambda each: each, 0),
+    ".blf": (held_by_blf, 620),  # 0.12 us of python-can's reader, rounded to 1 us
+    ".asc": (held_by_asc, 500),
+}
+FIELDS = {
+    "identifier": lambda each: each.identifier,
+    "length code": lambda each: each.dlc,
+    "data": lambda each: each.data,
+    "direction": lambda each: each.sent,
+}
+
+
+def losses(frames, held, *, sub_us):
+    """The sentences that must be said, from the truth alone."""
+    counts = {}
+    for each in frames:
+        kept = held(each)
+        lost = {name for name, of in FIELDS.items() if of(each) != of(kept)}
+        # Data is compared as eight bytes: a loss of zeros is none.
+        if "data" in lost and not any(each.data) and not any(kept.data):
+            lost.discard("data")
+        if sub_us and each.t_ns % 1000:
+            lost.add("time below 1 us")
+        for name in lost:
+            counts[each.kind, name] = counts.get((each.kind, name), 0) + 1
+    return sorted(
+        f"1 {kind} frame loses its {name}" if n == 1 else f"{n} {kind} frames lose their {name}"
+        for (kind, name), n in counts.items()
+    )
+
+
+@pytest.mark.parametrize("suffix", EXPORTED)
+@given(frames=traces)
+@example(frames=EVERY_KIND)
+@many
+def test_export_and_import(suffix, frames):
+    held, error_ns = EXPORTED[suffix]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        trace = folder / f"x{suffix}"
+        report = export_log(session_of(folder / "run.mcap", frames), trace)
+        back, _ = imported(trace, folder)
+    expected = by_bus([held(each) for each in frames])
+    assert report.buses == {bus: len(own) for bus, own in by_bus(frames).items()}
+    assert sorted(report.warnings) == losses(frames, held, sub_us=suffix == ".asc")
+    same_but_time(back, expected)
+    # ASC has its date as local time, and an import leaves it alone: its times count from 2000.
+    shift = frames[0].t_ns // S * S - RELATIVE_EPOCH_NS if suffix == ".asc" else 0
+    assert abs(time_errors(back, expected, shift)).max() <= error_ns
+
+
+# -- python-can's writers -> import --------------------------------------------------------
+
+
+def message_of(each):
+    return can.Message(
+        timestamp=each.t_ns / S,
+        arbitration_id=each.identifier,
+        is_extended_id=each.extended or each.kind == "error",
+        is_remote_frame=each.kind == "remote",
+        is_error_frame=each.kind == "error",
+        dlc=each.dlc,
+        data=each.data,
+        is_rx=not each.sent,
+        channel=int(each.bus.removeprefix("can")),
+        check=False,
+    )
+
+
+def held_by_python_cans_candump(each):
+    if each.kind == "error":  # its writer has one identifier for all of them, and no direction
+        size = len(each.data)
+        return replace(each, identifier=0x80, dlc=size, sent=False)
+    if each.kind == "remote":
+        return replace(each, dlc=0)
+    return replace(each, dlc=len(each.data))
+
+
+def held_by_csv(each):
+    return replace(each, sent=False, bus="can0")
+
+
+def held_by_trc(each):
+    """Channels are counted from 1, in the format and in python-can's reader of it."""
+    return replace(each, bus=f"can{int(each.bus.removeprefix('can')) + 1}")
+
+
+def held_by_python_cans_asc(each):
+    if each.kind == "error":
+        return replace(each, identifier=0, dlc=0, data=b"", sent=False)
+    return each
+
+
+WRITTEN = {
+    # suffix: what it holds of a frame, error of its time [ns], kinds that its writer has
+    ".log": (held_by_python_cans_candump, 1000, ("data", "remote", "error")),
+    ".blf": (held_by_blf, 1000, ("data", "remote", "error")),
+    ".asc": (held_by_python_cans_asc, 1000, ("data", "remote", "error")),
+    ".trc": (held_by_trc, 1500, ("data",)),
+    ".csv": (held_by_csv, 1000, ("data", "remote", "error")),
+    ".db": (held_by_csv, 1000, ("data", "remote", "error")),
+    ".mf4": (lambda each: each, 400, ("data", "remote", "error")),
+}
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+@given(frames=traces)
+@example(frames=EVERY_KIND)
+@many
+def test_python_cans_writer_and_import(suffix, frames):
+    if suffix == ".mf4":
+        pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
+    held, error_ns, kinds = WRITTEN[suffix]
+    frames = [each for each in frames if each.kind in kinds]
+    if not frames:
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        trace = folder / f"x{suffix}"
+        with can.Logger(str(trace)) as writer:
+            for each in frames:
+                writer(message_of(each))
+        back, report = imported(trace, folder)
+    kept = [held(each) for each in frames]
+    expected = {}
+    for each in kept:
+        expected.setdefault(each.bus, []).append(each)
+    if suffix == ".mf4":  # a group for each kind: the order of kinds at one time isn't in the file
+        back, expected = by_kind(back), by_kind(expected)
+    assert report.frames == len(frames)
+    same_but_time(back, expected)
+    late = time_errors(back, expected)
+    if suffix in {".asc", ".trc"}:  # of the first frame's time, ASC has nothing, TRC 9 us
+        first = min(each.t_ns for own in back.values() for each in own)
+        assert suffix == ".asc" or abs(first - kept[0].t_ns) < 10_000
+        assert suffix == ".trc" or first == RELATIVE_EPOCH_NS
+        late -= first - kept[0].t_ns
+    assert abs(late).max() <= error_ns
+
+
+def test_lines_that_a_reader_passes_over_are_counted(tmp_path: Path):
+    """Status and error lines of PEAK's format, which python-can has no frames for."""
+    lines = [
+        ";$FILEVERSION=2.1",
+        ";$STARTTIME=43000.5",
+        ";$COLUMNS=N,O,T,B,I,d,R,L,D",
+        "1 1.000 DT 1 0123 Rx - 2 11 22",
+        *(f"{n} 2.000 ER 1 - Rx - 5 04 00 02 00 00" for n in (2, 3)),
+        "4 3.000 ST 1 - Rx - 4 00 00 00 08",
+        "5 4.000 DT 1 0124 Tx - 1 33",
+    ]
+    (tmp_path / "x.trc").write_text("\n".join(lines) + "\n")
+    frames, report = imported(tmp_path / "x.trc", tmp_path)
+    assert [(each.identifier, each.data) for each in frames["can1"]] == [
+        (0x123, b"\x11\x22"),
+        (0x124, b"\x33"),
+    ]
+    assert report.problems[:2] == [
+        "TRCReader: Unsupported type 'ER' (2 times)",
+        "TRCReader: Unsupported type 'ST'",
+    ]
