@@ -111,7 +111,7 @@ def recover_log(
                 messages=dict(sorted(log.counts.items())),
                 warnings=source.warnings,
                 from_wal=found.from_wal if found is not None else 0,
-                missing=found.missing if found is not None else None,
+                missing=_missing(source, log),
             )
             _note(source, log, report)
     if found is None and not source.warnings:
@@ -132,6 +132,14 @@ def _copy(source: RawLog, log: EditedLog, stop: StopRequest) -> None:
             if done % _LOOK_EVERY == 0:
                 refuse_stopped(stop)
                 bar.update(done)
+
+
+def _missing(source: RawLog, log: EditedLog) -> int | None:
+    """How many messages that were accepted are not in the new file; None where nothing tells."""
+    found = source.file.recovered
+    if found is None or found.accepted is None:
+        return None
+    return max(0, found.accepted - sum(log.counts.values()))
 
 
 def _note(source: RawLog, log: EditedLog, report: RecoverReport) -> None:

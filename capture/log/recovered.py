@@ -16,6 +16,8 @@ class Recovered:
         in_files: Messages that the files have.
         from_wal: Messages that only the write-ahead log has.
         accepted: Messages that the recorder accepted; None where nothing tells.
+        looked: Whether all was read to count them; else summaries were believed, or something of
+            the write-ahead log can't be read.
     """
 
     folder: Path
@@ -23,6 +25,7 @@ class Recovered:
     in_files: int
     from_wal: int
     accepted: int | None
+    looked: bool
 
     @property
     def missing(self) -> int | None:
@@ -39,11 +42,14 @@ class Recovered:
                 f"this recording is running: its first {total} messages are read, "
                 f"{self.from_wal} of them from its write-ahead log"
             )
-        missing = (
-            "how many are missing can't be told" if self.missing is None else "none is missing"
-        )
-        if self.missing:
+        if self.missing is None:
+            missing = "how many are missing can't be told"
+        elif self.missing:
             missing = f"{self.missing} of {self.accepted} are missing"
+        elif self.looked:
+            missing = "none is missing"
+        else:
+            missing = "none is missing as far as can be told"
         return (
             f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
             f"from its write-ahead log; {missing}; 'undulog log recover' writes a whole file"

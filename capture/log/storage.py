@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
@@ -208,17 +209,19 @@ class LogFile:
     def _join_wal(self, wal: WalContents) -> None:
         self._define(wal)
         self._leave_cut_chunk(wal)
-        in_files = sum(self.counts.values())
         # The log may begin before the files' end, and they may have grown beyond its own since.
-        overlap = max(wal.accepted, in_files) - wal.before
-        rest = beyond(wal.messages, self._last_keys(overlap) if wal.messages else set())
+        overlap = max(wal.accepted, sum(self.counts.values())) - wal.before
+        keys, looked = self._last_keys(overlap if wal.messages else 0)
+        in_files = sum(self.counts.values())
+        rest = beyond(wal.messages, keys)
         if rest:
             tail = WalTail(rest)
             self._add(tail, tail.blocks, tail.counts)
         if not (rest or wal.live) and self.parts.finalised and wal.accepted <= in_files:
             return  # the recorder died when all was done but the tidying up
         accepted = wal.accepted if wal.messages else None
-        self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted)
+        looked = looked and not wal.damaged
+        self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
         told = list(wal.warnings)
         if self.recovered.missing == 0:  # then what was only begun held nothing
             gone = [text for text in self.parts.missing if "can't be read" in text]
@@ -251,33 +254,64 @@ class LogFile:
         block = self.blocks[-1] if self.blocks else None
         if block is None or block.complete or not wal.messages:
             return
-        found = {key: len(at) for key, at in (block.offsets or {}).items()}
-        whole = sum(self.counts.values()) - sum(found.values())
-        if wal.before <= whole:
-            self.blocks.pop()
-            for channel_id, count in found.items():
-                self.counts[channel_id] -= count
+        if wal.before <= sum(self.counts.values()) - sum(map(len, (block.offsets or {}).values())):
+            self._leave_out(block)
 
-    def _last_keys(self, least: int) -> set[MessageKey]:
-        """The keys of the files' last messages, at least so many where there are."""
+    def _last_keys(self, least: int) -> tuple[set[MessageKey], bool]:
+        """The keys of the files' last messages, at least so many where there are.
+
+        A chunk that can't be read is left out: the write-ahead log may have its messages.
+
+        Returns:
+            The keys, and whether all of the files was read to count their messages.
+        """
         keys: set[MessageKey] = set()
-        for block in reversed(self.blocks):
-            if len(keys) >= least:
+        passed = 0
+        trusted = {part for part, file in enumerate(self.files) if not file.cut}
+        unread = {id(block) for block in self.blocks if block.part in trusted}
+        for block in reversed(self.blocks.copy()):
+            if passed >= least:
                 break
-            ids = block.offsets if block.offsets is not None else block.index_at
-            offsets = [self.offsets(block, channel_id) for channel_id in ids]
-            if not offsets:
-                continue
             try:
-                data, base = self.payload(block)
-                stop = len(data) if block.compression else block.stop
-                heads = read_heads(data, np.concatenate(offsets) + base, stop)
-            except LogError:  # told where its messages are read
-                continue
-            if heads is not None:
+                heads = self._heads(block)
+            except LogError as error:
+                self._leave_out(block)
+                self.warnings.append(
+                    f"{error}; of its messages only the write-ahead log's are read"
+                )
+            else:
                 columns = (heads[name].tolist() for name in ("channel", "sequence", "log"))
                 keys.update(zip(*columns, strict=True))
-        return keys
+                passed += len(heads)
+                unread.discard(id(block))
+        return keys, not unread
+
+    def _heads(self, block: Block) -> NDArray[np.void]:
+        """The heads of all messages of a block.
+
+        Raises:
+            LogError: If it can't be read.
+        """
+        ids = block.offsets if block.offsets is not None else block.index_at
+        offsets = [self.offsets(block, channel_id) for channel_id in ids]
+        data, base = self.payload(block)
+        stop = len(data) if block.compression else block.stop
+        places = np.concatenate([np.empty(0, dtype=np.int64), *offsets])
+        heads = read_heads(data, places + base, stop)
+        if heads is None:
+            where = f"the message index of the chunk at byte {block.start}"
+            raise LogError(self.files[block.part].path, f"{where} does not list its messages")
+        return heads
+
+    def _leave_out(self, block: Block) -> None:
+        """Forget a block; its messages are no longer counted, as far as its index tells them."""
+        self.blocks = [other for other in self.blocks if other is not block]
+        for channel_id in block.offsets if block.offsets is not None else block.index_at:
+            try:
+                count = len(self.offsets(block, channel_id))
+            except LogError:  # then the sum stays too high, and is not called sure
+                continue
+            self.counts[channel_id] = max(0, self.counts.get(channel_id, 0) - count)
 
 
 def _is_of_the_end(warning: str) -> bool:

@@ -53,6 +53,11 @@ class WalContents:
         """How many messages were accepted before the first that the log still has."""
         return self.messages[0].position - 1 if self.messages else 0
 
+    @property
+    def damaged(self) -> bool:
+        """Whether something of it can't be read: then it may have had more messages."""
+        return any("header" not in text for text in self.warnings)
+
 
 def read_wal(first: Path) -> WalContents | None:
     """Read the write-ahead log of a session, without changing it.

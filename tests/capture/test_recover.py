@@ -119,9 +119,9 @@ def test_a_killed_session_reads_as_if_it_had_been_closed(tmp_path, run, split_si
     path = tmp_path / "run.mcap"
     accepted = kill_at(path, seconds, split_size=split_size, split_every=split_every)
     warnings = check_killed(path, accepted)
-    assert len(warnings) == 1, warnings
     assert "the recorder did not finish" in warnings[0]
     assert "none is missing" in warnings[0]
+    assert all("no whole records" in text for text in warnings[1:])  # it was being written
     with Session(path) as session:
         assert session.session_id == "killed"
         total = sum(channel.count for channel in session.channels.values())
