@@ -80,18 +80,21 @@ class BitField:
         """The bits as numbers, not yet scaled.
 
         Args:
-            data: Data bytes, shape (n, 8), C-contiguous; ``size`` is at most 8.
+            data: Data bytes, shape (n, k) with k of 8 or more, C-contiguous; ``size`` is at most k.
 
         Returns:
             Shape (n,), of type uint64, int64 or the field's floating type.
         """
-        words: NDArray[np.uint64] = data.view("<u8" if self.little_endian else ">u8")[:, 0]
-        words = words.astype(np.uint64)
         unused = 64 - self.length
         # The field goes to the top of the word, so that one shift down drops the bits above it
         # and, arithmetic for signed fields, extends the sign.
-        up = unused - self.start if self.little_endian else self._from_top
-        top = words << np.uint64(up)
+        if data.shape[1] == 8:
+            words: NDArray[np.uint64] = data.view("<u8" if self.little_endian else ">u8")[:, 0]
+            words = words.astype(np.uint64)
+            up = unused - self.start if self.little_endian else self._from_top
+            top = words << np.uint64(up)
+        else:
+            top = self._at_top(data, unused)
         if self.is_float:
             bits = (top >> np.uint64(unused)).astype(_UNSIGNED[self.length])
             return bits.view(_FLOATS[self.length])
@@ -99,11 +102,34 @@ class BitField:
             return top.view(np.int64) >> np.int64(unused)
         return top >> np.uint64(unused)
 
+    def _at_top(self, data: NDArray[np.uint8], unused: int) -> NDArray[np.uint64]:
+        """The field at the top of words, out of more than 8 bytes.
+
+        A word is taken where the field begins; one that doesn't begin with a byte may reach into a
+        ninth.
+        """
+        position = self.start if self.little_endian else self._from_top
+        first = min(position // 8, data.shape[1] - 8)
+        shift = position - 8 * first
+        window = np.ascontiguousarray(data[:, first : first + 8])
+        words = window.view("<u8" if self.little_endian else ">u8")[:, 0].astype(np.uint64)
+        over = shift + self.length - 64
+        if not self.little_endian:
+            words <<= np.uint64(shift)
+            if over > 0:
+                words |= data[:, first + 8].astype(np.uint64) >> np.uint64(8 - shift)
+            return words
+        if over <= 0:
+            return words << np.uint64(unused - shift)
+        words >>= np.uint64(shift)
+        words |= data[:, first + 8].astype(np.uint64) << np.uint64(64 - shift)
+        return words << np.uint64(unused)
+
     def values(self, data: NDArray[np.uint8]) -> FloatArray:
         """The physical values.
 
         Args:
-            data: Data bytes, shape (n, 8), C-contiguous; ``size`` is at most 8.
+            data: Data bytes, shape (n, k) with k of 8 or more, C-contiguous; ``size`` is at most k.
 
         Returns:
             ``scale * raw + offset``, shape (n,).

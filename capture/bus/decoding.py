@@ -260,7 +260,8 @@ class BusDecoder:
         """Decode frames.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, or of
+                :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
 
         Returns:
             The samples of the map entries that occur, and what became of the frames.
@@ -316,7 +317,8 @@ def _decode(
 ) -> list[DecodedSignals]:
     """Decode the frames of one family; ``rows`` are their rows in all frames."""
     data: NDArray[np.uint8] = frames["data"][rows]
-    size = np.minimum(frames["dlc"][rows], 8)
+    room = data.shape[1]
+    size = np.minimum(frames["len" if room > 8 else "dlc"][rows], room)
     t_ns = frames["t_host_ns"][rows].astype(np.int64)
     shortest = int(size.min())
     carries = np.zeros(len(rows), dtype=np.bool_)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..arrays import IntArray
 from ..bus.decoded_topics import DecodedTopics, Message
 from ..bus.decoding import BusDecoder, FrameTally
 from ..bus.frame_log import FrameLog, LogBlock
@@ -15,14 +16,11 @@ from ..console import progress
 from ..errors import ImportFormatError
 from ..interruption import StopRequest
 from ..log.channels import FrameChannel
-from ..log.frames import FrameArray
+from ..log.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
 from ..log.writer import SessionWriter
 from ..robot import Robot
 from .can_logs import log_suffix, open_frame_log
 from .import_output import ImportReport, imported_session
-
-FRAME_TOPIC_PREFIX = "/can/"
-"""Raw frames of bus ``can0`` are on ``/can/can0``."""
 
 DIRECTIONS_KEY = "import.directions"
 """Metadata key: ``recorded``, or ``none`` for a log that doesn't tell sent from received."""
@@ -41,8 +39,8 @@ def import_can(
 ) -> ImportReport:
     """Turn a log of CAN frames into a session.
 
-    Every classic frame is kept raw on ``/can/<bus>``. The frames of one bus are decoded by the
-    robot's databases and bus map onto the topics of the log contract
+    Every frame is kept raw, on ``/can/<bus>`` or, CAN FD frames, on ``/can_fd/<bus>``. The frames
+    of one bus are decoded by the robot's databases and bus map onto the topics of the log contract
     (:mod:`capture.bus.decoded_topics`); each sample keeps the time of its frame.
 
     Args:
@@ -66,15 +64,15 @@ def import_can(
         blocks = iter(log.blocks)
         first = next(blocks, None)
         if first is None:
-            raise ImportFormatError(source, "holds no classic CAN frames")
-        chosen = bus or log.buses[int(first.bus[0])]
+            raise ImportFormatError(source, "holds no CAN frames")
+        chosen = bus or log.buses[first.first_bus()]
         facts = {
             "import.format": log_suffix(source).removeprefix("."),
             "import.time": log.time,
             DIRECTIONS_KEY: "recorded" if log.directions else "none",
             "import.bus": chosen,
         }
-        report.start_ns = report.end_ns = int(first.frames["t_host_ns"][0])
+        report.start_ns = report.end_ns = int(first.times_ns()[0])
         with imported_session(
             source, output, robot, epoch_ns=report.start_ns, facts=facts, force=force
         ) as writer:
@@ -112,10 +110,13 @@ class _Import:
     def add(self, block: LogBlock) -> None:
         messages: list[Message] = []
         for index, name in enumerate(self._log.buses):
-            frames = block.frames[block.bus == index]
+            frames = block.of_bus(index)
             if not len(frames):
                 continue
-            messages += self._raw_messages(name, frames)
+            classic = block.frames[block.bus == index]
+            fd_frames = block.fd_frames[block.fd_bus == index]
+            messages += self._raw_messages(FRAME_TOPIC_PREFIX + name, classic)
+            messages += self._raw_messages(FD_TOPIC_PREFIX + name, fd_frames)
             if name != self._chosen:
                 self._other_buses[name] = self._other_buses.get(name, 0) + len(frames)
             elif self._decoder is not None and self._topics is not None:
@@ -123,7 +124,7 @@ class _Import:
                 self._tally.add(tally)
                 messages += self._topics.add(samples)
         self._write(messages)
-        self._note_times(block.frames)
+        self._note_times(block.times_ns())
 
     def finish(self) -> None:
         report, log = self._report, self._log
@@ -146,25 +147,26 @@ class _Import:
             samples = self._report.samples
             samples[message.topic] = samples.get(message.topic, 0) + 1
 
-    def _note_times(self, frames: FrameArray) -> None:
-        t_ns = frames["t_host_ns"].astype(np.int64)
+    def _note_times(self, t_ns: IntArray) -> None:
         report = self._report
-        report.frames = (report.frames or 0) + len(frames)
+        report.frames = (report.frames or 0) + len(t_ns)
         self._backward += int((np.diff(t_ns, prepend=report.end_ns) < 0).sum())
         report.start_ns = min(report.start_ns, int(t_ns.min()))
         report.end_ns = max(report.end_ns, int(t_ns.max()))
 
-    def _raw_messages(self, name: str, frames: FrameArray) -> Iterator[Message]:
+    def _raw_messages(self, topic: str, frames: FrameArray) -> Iterator[Message]:
         """Batches of raw frames; their log times increase, so that their order is kept."""
-        topic = FRAME_TOPIC_PREFIX + name
-        if name not in self._channels:
-            self._channels[name] = self._writer.frames(topic)
-        channel = self._channels[name]
+        if not len(frames):
+            return
+        if topic not in self._channels:
+            opened = self._writer.fd_frames if holds_fd(frames) else self._writer.frames
+            self._channels[topic] = opened(topic)
+        channel = self._channels[topic]
         t_ns = np.maximum.accumulate(frames["t_host_ns"].astype(np.int64))
         ends = np.flatnonzero(np.diff(t_ns // _BATCH_NS)) + 1
         for batch in np.split(np.arange(len(frames)), ends):
-            latest_ns = max(self._latest_ns.get(name, 0) + 1, int(t_ns[batch[-1]]))
-            self._latest_ns[name] = latest_ns
+            latest_ns = max(self._latest_ns.get(topic, 0) + 1, int(t_ns[batch[-1]]))
+            self._latest_ns[topic] = latest_ns
             yield Message(topic, latest_ns, _writing(channel, frames[batch]))
 
 

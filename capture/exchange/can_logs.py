@@ -22,7 +22,15 @@ from typing import TYPE_CHECKING, TextIO, cast
 
 from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 from ..errors import ImportFormatError
-from ..log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from ..log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    REMOTE_FLAG,
+)
 from .candump import read_candump
 from .mf4 import open_mf4
 from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
@@ -185,18 +193,19 @@ def _blocks(
     done: Callable[[], float],
 ) -> Iterator[LogBlock]:
     rows = BlockBuilder()
-    fd_frames = 0
+    unmarked = 0
     with _noted("can", log.problems):
         for message in messages:
-            if message.is_fd:
-                fd_frames += 1
-                continue
+            unmarked += not message.is_fd and len(message.data) > 8
             _append(rows, message, log, epoch_ns, path)
             if len(rows) == FRAMES_PER_BLOCK:
                 yield rows.block(done())
                 rows = BlockBuilder()
-    if fd_frames:
-        log.problems.append(f"{fd_frames} CAN FD frames left out: only classic frames are kept")
+    if unmarked:
+        log.problems.append(
+            f"{unmarked} frames of more than 8 bytes are CAN FD frames; the log doesn't say so, "
+            "and shorter ones count as classic"
+        )
     if len(rows):
         yield rows.block(1.0)
 
@@ -214,6 +223,19 @@ def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, 
     bus = f"can{channel}" if isinstance(channel, int) else str(channel or "can0")
     if bus not in log.buses:
         log.buses.append(bus)
+    # An error frame tells what happened on the bus, and is of neither kind.
+    if (message.is_fd or len(message.data) > 8) and not message.is_error_frame:
+        rows.append_fd(
+            t_ns=t_ns,
+            # There are no remote frames in CAN FD: python-can takes empty ones for such.
+            id_flags=message.arbitration_id | (flags & ~REMOTE_FLAG),
+            fd_flags=(FD_BRS if message.bitrate_switch else 0)
+            | (FD_ESI if message.error_state_indicator else 0),
+            way=DIR_RX if message.is_rx else DIR_TX,
+            bus=log.buses.index(bus),
+            data=bytes(message.data[:64]),
+        )
+        return
     rows.append(
         t_ns=t_ns,
         id_flags=message.arbitration_id | flags,

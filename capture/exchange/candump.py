@@ -7,7 +7,8 @@ One frame a line::
 that is time [s], interface, identifier (three hexadecimal digits, eight if extended or an error
 frame), data, and in newer versions the direction: ``T`` sent, ``R`` received. ``ID#R`` or
 ``ID#R8`` is a remote frame; ``_9`` to ``_F`` after eight data bytes is a raw length code above 8;
-``ID##`` begins a CAN FD frame. Source: ``lib.c`` of https://github.com/linux-can/can-utils.
+``ID##F`` begins a CAN FD frame with up to 64 data bytes, where ``F`` is a digit of flags. Source:
+``lib.c`` of https://github.com/linux-can/can-utils.
 
 Times are kept as integers, so what is read here and written again is the same text.
 """
@@ -33,11 +34,13 @@ from ..log.frames import (
     ID_MASK,
     REMOTE_FLAG,
     FrameArray,
+    holds_fd,
 )
 
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
-    r"(?:((?:[0-9A-Fa-f]{2}){0,8})(?:_([9A-Fa-f]))?|R([0-8]?)|#[0-9A-Fa-f]+)"
+    r"(?:((?:[0-9A-Fa-f]{2}){0,8})(?:_([9A-Fa-f]))?|R([0-8]?)|"
+    r"#([0-9A-Fa-f])((?:[0-9A-Fa-f]{2}){0,64}))"
     r"(?:\s+([RTrt]))?\s*"
 )
 _NS = 1_000_000_000
@@ -60,14 +63,14 @@ def read_candump(path: Path, lines: Iterator[str]) -> FrameLog:
     match = _LINE.fullmatch(head)
     if match is None:
         raise ImportFormatError(path, f"is not a candump log; its first line is {_quoted(head)}")
-    log = FrameLog(iter(()), [], match[8] is not None, "as recorded, exact")
+    log = FrameLog(iter(()), [], match[10] is not None, "as recorded, exact")
     log.blocks = _blocks(path, chain([head], lines), log)
     return log
 
 
 def _blocks(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[LogBlock]:
     rows = BlockBuilder()
-    fd_frames = other_way = done = 0
+    other_way = done = 0
     size = max(path.stat().st_size, 1)
     for number, line in enumerate(lines, start=1):
         done += len(line)
@@ -79,16 +82,11 @@ def _blocks(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[LogBloc
                 log.problems.append(f"the last line is cut short and left out: {_quoted(line)}")
                 break
             raise ImportFormatError(path, f"line {number} is no candump line: {_quoted(line)}")
-        if match[5] is None and match[7] is None:
-            fd_frames += 1
-            continue
-        other_way += (match[8] is not None) != log.directions
+        other_way += (match[10] is not None) != log.directions
         _append(rows, match, log.buses)
         if len(rows) == FRAMES_PER_BLOCK:
             yield rows.block(done / size)
             rows = BlockBuilder()
-    if fd_frames:
-        log.problems.append(f"{fd_frames} CAN FD frames left out: only classic frames are kept")
     if other_way:
         having = "without" if log.directions else "with"
         log.problems.append(f"{other_way} frames {having} a direction, unlike the first one")
@@ -97,22 +95,38 @@ def _blocks(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[LogBloc
 
 
 def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
-    seconds, fraction, bus, digits, data, raw_dlc, remote_dlc, way = match.groups()
+    seconds, fraction, bus, digits, data, raw_dlc, remote_dlc, fd_flags, fd_data, way = (
+        match.groups()
+    )
     identifier = int(digits, 16)
-    if remote_dlc is not None:
-        flags, dlc, data = REMOTE_FLAG, int(remote_dlc or 0), ""
-    else:
-        flags, dlc = 0, int(raw_dlc, 16) if raw_dlc else len(data) // 2
+    flags = 0
     if len(digits) == 8:
         # candump prints the error flag within the digits, and nothing else above 29 bits.
-        flags |= ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
+        flags = ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
     if bus not in buses:
         buses.append(bus)
+    t_ns = int(seconds) * _NS + int(fraction.ljust(9, "0"))
+    way = DIR_TX if way in {"T", "t"} else DIR_RX
+    if fd_flags is not None:
+        rows.append_fd(
+            t_ns=t_ns,
+            id_flags=(identifier & ID_MASK) | flags,
+            fd_flags=int(fd_flags, 16),
+            way=way,
+            bus=buses.index(bus),
+            data=bytes.fromhex(fd_data),
+        )
+        return
+    if remote_dlc is not None:
+        dlc, data = int(remote_dlc or 0), ""
+        flags |= REMOTE_FLAG
+    else:
+        dlc = int(raw_dlc, 16) if raw_dlc else len(data) // 2
     rows.append(
-        t_ns=int(seconds) * _NS + int(fraction.ljust(9, "0")),
+        t_ns=t_ns,
         id_flags=(identifier & ID_MASK) | flags,
         dlc=dlc,
-        way=DIR_TX if way in {"T", "t"} else DIR_RX,
+        way=way,
         bus=buses.index(bus),
         data=bytes.fromhex(data),
     )
@@ -129,7 +143,7 @@ def candump_lines(
     """Frames as candump writes them.
 
     Args:
-        frames: The frames, in the order wanted, shape (n,).
+        frames: The frames, classic or CAN FD, in the order wanted, shape (n,).
         buses: Interface names.
         bus: Index into ``buses`` for each frame, shape (n,).
         directions: Whether to write ``R`` and ``T``.
@@ -143,18 +157,22 @@ def candump_lines(
     if nanoseconds is None:
         nanoseconds = bool((t_ns % 1000).any())
     digits, unit = (9, 1) if nanoseconds else (6, 1000)
+    fd = holds_fd(frames)
     columns = (
         t_ns.tolist(),
         frames["id_flags"].tolist(),
-        frames["dlc"].tolist(),
+        frames["len" if fd else "dlc"].tolist(),
         frames["dir"].tolist(),
         bus.tolist(),
+        (frames["fd_flags"] & 0xF).tolist() if fd else [0] * len(frames),
     )
-    data = frames["data"].tobytes()
-    for i, (t, id_flags, dlc, way, which) in enumerate(zip(*columns, strict=True)):
+    data, room = frames["data"].tobytes(), 64 if fd else 8
+    for i, (t, id_flags, dlc, way, which, fd_flags) in enumerate(zip(*columns, strict=True)):
         seconds, rest = divmod(t, _NS)
-        payload = data[8 * i : 8 * i + min(dlc, 8)].hex().upper()
-        if id_flags & REMOTE_FLAG:
+        payload = data[room * i : room * i + min(dlc, room)].hex().upper()
+        if fd:
+            payload = f"#{fd_flags:X}{payload}"
+        elif id_flags & REMOTE_FLAG:
             payload = f"R{dlc or ''}"
         elif dlc > 8:
             payload += f"_{dlc:X}"

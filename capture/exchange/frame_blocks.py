@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
+from ..arrays import IntArray
 from ..bus.frame_log import LogBlock
 from ..errors import MissingChannelError
-from ..log.frames import FrameArray, empty_frames
+from ..log.frames import (
+    FD_TOPIC_PREFIX,
+    FRAME_TOPIC_PREFIX,
+    FRAME_TOPIC_PREFIXES,
+    FrameArray,
+    bus_of,
+    empty_fd_frames,
+    empty_frames,
+)
 from ..log.session import Session
-from .can_import import DIRECTIONS_KEY, FRAME_TOPIC_PREFIX
+from .can_import import DIRECTIONS_KEY
 
 _MESSAGES_PER_BLOCK = 200  # of 10 to 100 ms each
 _LATEST_NS = 1_000_000_000  # a frame is logged at most this long after its time
@@ -24,11 +33,12 @@ class FrameFacts:
 
     Attributes:
         session_id: Of the session.
-        counts: Bus to number of frames, in the order of the bus indices.
+        counts: Bus to number of classic frames, in the order of the bus indices.
         directions: Whether the frames' directions were recorded.
         start_ns: Earliest time of a frame [Unix ns]; 0 where there is none.
         end_ns: Latest time of a frame [Unix ns]; 0 where there is none.
         nanoseconds: Whether a time isn't a whole microsecond.
+        fd_counts: Bus to number of CAN FD frames.
     """
 
     session_id: str
@@ -37,6 +47,7 @@ class FrameFacts:
     start_ns: int
     end_ns: int
     nanoseconds: bool
+    fd_counts: Mapping[str, int] = field(default_factory=dict[str, int])
 
     @property
     def buses(self) -> list[str]:
@@ -57,11 +68,9 @@ def chosen_buses(session: Session, bus: str | None) -> list[str]:
     Raises:
         MissingChannelError: If the session has no raw frames, or no such bus.
     """
-    names = [
-        topic.removeprefix(FRAME_TOPIC_PREFIX)
-        for topic in sorted(session.channels)
-        if topic.startswith(FRAME_TOPIC_PREFIX)
-    ]
+    names = sorted(
+        {bus_of(topic) for topic in session.channels if topic.startswith(FRAME_TOPIC_PREFIXES)}
+    )
     if not names:
         raise MissingChannelError(session.path, "raw CAN frames", sorted(session.channels))
     if bus is not None and bus not in names:
@@ -69,27 +78,45 @@ def chosen_buses(session: Session, bus: str | None) -> list[str]:
     return [bus] if bus is not None else names
 
 
-def frame_blocks(session: Session, buses: Sequence[str]) -> Iterator[LogBlock]:
+@dataclass(frozen=True)
+class _Topic:
+    """A topic of frames."""
+
+    name: str
+    bus: int
+    is_fd: bool
+
+    def frames(self, session: Session, start_ns: int | None, stop_ns: int | None) -> FrameArray:
+        read = session.fd_frames if self.is_fd else session.frames
+        return read(self.name, start_ns=start_ns, stop_ns=stop_ns)
+
+
+def frame_blocks(session: Session, buses: Sequence[str], *, fd: bool = True) -> Iterator[LogBlock]:
     """The frames of some buses, never all in memory.
 
-    Those of one bus come in the order they were logged. Those of several are sorted by their
-    times, with the order of ``buses`` among equal ones.
+    Those of one topic, which is one kind of frame of one bus, come in the order they were logged.
+    Those of several are sorted by their times; among equal ones classic frames come first, and
+    then the order of ``buses`` holds.
 
     Args:
         session: The session.
         buses: Names of the buses.
+        fd: Whether CAN FD frames are wanted, too.
 
     Yields:
         Blocks; the bus of a frame is its index into ``buses``.
     """
-    held: list[FrameArray] = [empty_frames(0) for _ in buses]
-    windows = list(pairwise(_edges(session, buses)))
+    topics = [
+        _Topic(prefix + bus, index, prefix == FD_TOPIC_PREFIX)
+        for prefix in (FRAME_TOPIC_PREFIXES if fd else (FRAME_TOPIC_PREFIX,))
+        for index, bus in enumerate(buses)
+        if prefix + bus in session.channels
+    ]
+    held = [empty_fd_frames(0) if topic.is_fd else empty_frames(0) for topic in topics]
+    windows = list(pairwise(_edges(session, [topic.name for topic in topics])))
     for number, (start_ns, stop_ns) in enumerate(windows, start=1):
-        found = [
-            session.frames(FRAME_TOPIC_PREFIX + bus, start_ns=start_ns, stop_ns=stop_ns)
-            for bus in buses
-        ]
-        if len(buses) > 1 and stop_ns is not None:
+        found = [topic.frames(session, start_ns, stop_ns) for topic in topics]
+        if len(topics) > 1 and stop_ns is not None:
             both = [np.concatenate(pair) for pair in zip(held, found, strict=True)]
             # What comes in the next window may be earlier than these, so they wait for it.
             early = [frames["t_host_ns"] < stop_ns - _LATEST_NS for frames in both]
@@ -97,13 +124,30 @@ def frame_blocks(session: Session, buses: Sequence[str]) -> Iterator[LogBlock]:
             held = [frames[~ready] for frames, ready in zip(both, early, strict=True)]
         else:
             found = [np.concatenate(pair) for pair in zip(held, found, strict=True)]
-        frames = np.concatenate(found)
-        bus = np.repeat(np.arange(len(buses)), [len(part) for part in found])
-        if len(buses) > 1:
-            order = np.argsort(frames["t_host_ns"], kind="stable")
-            frames, bus = frames[order], bus[order]
-        if len(frames):
-            yield LogBlock(frames, bus, number / len(windows))
+        block = _block(topics, found, number / len(windows))
+        if len(block):
+            yield block
+
+
+def _block(topics: Sequence[_Topic], found: Sequence[FrameArray], done: float) -> LogBlock:
+    """One block of frames of several topics, by their times; of one topic in their order."""
+    parts: list[tuple[FrameArray, IntArray]] = []
+    for is_fd in (False, True):
+        own = [(t, frames) for t, frames in zip(topics, found, strict=True) if t.is_fd == is_fd]
+        empty = empty_fd_frames(0) if is_fd else empty_frames(0)
+        bus = np.repeat([topic.bus for topic, _ in own], [len(frames) for _, frames in own])
+        parts.append((np.concatenate([empty, *(frames for _, frames in own)]), bus.astype(int)))
+    (frames, bus), (fd_frames, fd_bus) = parts
+    is_fd = np.repeat([False, True], [len(frames), len(fd_frames)])
+    if len(topics) > 1:
+        order = np.argsort(
+            np.concatenate([frames["t_host_ns"], fd_frames["t_host_ns"]]), kind="stable"
+        )
+        is_fd = order >= len(frames)
+        by_time, fd_by_time = order[~is_fd], order[is_fd] - len(frames)
+        frames, bus = frames[by_time], bus[by_time]
+        fd_frames, fd_bus = fd_frames[fd_by_time], fd_bus[fd_by_time]
+    return LogBlock(frames, bus, done, fd_frames, fd_bus, is_fd if len(fd_frames) else None)
 
 
 def frame_facts(session: Session, buses: Sequence[str]) -> FrameFacts:
@@ -116,12 +160,13 @@ def frame_facts(session: Session, buses: Sequence[str]) -> FrameFacts:
     Returns:
         The facts.
     """
-    counts = np.zeros(len(buses), dtype=np.int64)
+    counts, fd_counts = np.zeros((2, len(buses)), dtype=np.int64)
     times: list[int] = []
     nanoseconds = False
     for block in frame_blocks(session, buses):
-        t_ns = block.frames["t_host_ns"]
+        t_ns = block.times_ns()
         counts += np.bincount(block.bus, minlength=len(buses))
+        fd_counts += np.bincount(block.fd_bus, minlength=len(buses))
         times += [int(t_ns.min()), int(t_ns.max())]
         nanoseconds |= bool((t_ns % 1000).any())
     facts = session.metadata.get("undulog", {})
@@ -132,12 +177,13 @@ def frame_facts(session: Session, buses: Sequence[str]) -> FrameFacts:
         start_ns=min(times, default=0),
         end_ns=max(times, default=0),
         nanoseconds=nanoseconds,
+        fd_counts=dict(zip(buses, fd_counts.tolist(), strict=True)),
     )
 
 
-def _edges(session: Session, buses: Sequence[str]) -> list[int | None]:
+def _edges(session: Session, topics: Sequence[str]) -> list[int | None]:
     """Borders of the windows of log times; open at both ends."""
-    messages = sum(session.channels[FRAME_TOPIC_PREFIX + bus].count for bus in buses)
+    messages = sum(session.channels[topic].count for topic in topics)
     count = max(1, -(-messages // _MESSAGES_PER_BLOCK))
     span = session.end_ns - session.start_ns
     inner = [session.start_ns + span * k // count for k in range(1, count)]

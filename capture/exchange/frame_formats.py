@@ -8,7 +8,7 @@ Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`capture.exchang
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +17,19 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from ..arrays import IntArray
-from ..log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
+from ..bus.frame_log import LogBlock
+from ..log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    ID_MASK,
+    REMOTE_FLAG,
+    FrameArray,
+    holds_fd,
+)
 from .candump import candump_lines
 from .frame_blocks import FrameFacts
 from .frame_losses import is_error, is_remote, without_content
@@ -30,8 +42,8 @@ _NS = 1_000_000_000
 _BLF_EPOCH_NS = 631_152_000 * _NS  # 1990: python-can takes less for no date
 _NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
 
-WriteFrames = Callable[[FrameArray, IntArray], None]
-"""Writes frames, shape (n,), and the index of each one's bus, shape (n,)."""
+WriteFrames = Callable[[LogBlock], None]
+"""Writes a stretch of frames; of CAN FD frames only where the format holds them."""
 
 
 class FrameFormat(Protocol):
@@ -40,11 +52,14 @@ class FrameFormat(Protocol):
     title: str
     """Its name, as in ``in the format of ...``."""
 
+    holds_fd: bool
+    """Whether it has CAN FD frames."""
+
     def kept(self, frames: FrameArray) -> FrameArray:
         """What the format keeps of frames.
 
         Args:
-            frames: Records, shape (n,).
+            frames: Records, classic or, where the format holds them, CAN FD, shape (n,).
 
         Returns:
             What a reader of the format gets, shape (n,); the device times are not looked at.
@@ -82,12 +97,15 @@ class Candump:
     """Text of ``candump -L``."""
 
     title = "candump -L"
+    holds_fd = True
 
     def kept(self, frames: FrameArray) -> FrameArray:
         """Everything but data of remote frames and further flags of error frames."""
         kept = frames.copy()
         error, remote = is_error(frames), is_remote(frames)
         kept["id_flags"][error] &= ID_MASK | ERROR_FLAG
+        if holds_fd(frames):
+            return _without_remote(kept)
         kept["data"][remote] = 0
         kept["dlc"][remote] = np.minimum(frames["dlc"][remote], 8)
         return kept
@@ -101,16 +119,18 @@ class Candump:
         """Create a file."""
         with path.open("w", encoding="utf-8", newline="\n") as stream:
 
-            def write(frames: FrameArray, bus: IntArray) -> None:
-                stream.writelines(
-                    candump_lines(
-                        frames,
-                        facts.buses,
-                        bus,
-                        directions=facts.directions,
-                        nanoseconds=facts.nanoseconds,
-                    )
+            def lines(frames: FrameArray, bus: IntArray) -> Iterator[str]:
+                return candump_lines(
+                    frames,
+                    facts.buses,
+                    bus,
+                    directions=facts.directions,
+                    nanoseconds=facts.nanoseconds,
                 )
+
+            def write(block: LogBlock) -> None:
+                classic, fd = lines(block.frames, block.bus), lines(block.fd_frames, block.fd_bus)
+                stream.writelines(block.interleaved(classic, fd))
 
             yield write
 
@@ -119,12 +139,15 @@ class Blf:
     """Vector's binary logging format, by python-can."""
 
     title = "Vector BLF"
+    holds_fd = True
 
     def kept(self, frames: FrameArray) -> FrameArray:
         """Everything but data of remote frames, and directions and flags of error frames."""
         kept = frames.copy()
         error = is_error(frames)
         kept["id_flags"][error] &= ID_MASK | ERROR_FLAG
+        if holds_fd(frames):
+            return _without_remote(kept)
         kept["dlc"][error] = np.minimum(frames["dlc"][error], 8)
         kept["dir"][error] = DIR_RX
         kept["data"][is_remote(frames)] = 0
@@ -157,16 +180,19 @@ class Asc:
     """Vector's text format, by python-can."""
 
     title = "Vector ASC"
+    holds_fd = True
 
     def kept(self, frames: FrameArray) -> FrameArray:
         """Data and remote frames at whole microseconds; of error frames only the time."""
         kept = frames.copy()
+        kept["t_host_ns"] = (frames["t_host_ns"] + 500) // 1000 * 1000
+        if holds_fd(frames):
+            return _without_remote(kept)
         remote = is_remote(frames)
         without_content(kept, is_error(frames))
         # Readers take a length code above 8 for that of a CAN FD frame.
         kept["dlc"] = np.minimum(kept["dlc"], 8)
         kept["data"][remote] = 0
-        kept["t_host_ns"] = (frames["t_host_ns"] + 500) // 1000 * 1000
         return kept
 
     def notes(self, facts: FrameFacts) -> list[str]:
@@ -216,6 +242,13 @@ def channel_numbers(buses: Sequence[str]) -> list[int]:
     return [int(match[1]) if match else next(free) for match in matches]
 
 
+def _without_remote(fd_frames: FrameArray) -> FrameArray:
+    """CAN FD frames as they can be: none of them is a remote frame, none has over 64 bytes."""
+    fd_frames["id_flags"] &= ~np.uint32(REMOTE_FLAG)
+    fd_frames["len"] = np.minimum(fd_frames["len"], 64)
+    return fd_frames
+
+
 def _notes_on_buses(facts: FrameFacts) -> list[str]:
     numbers = channel_numbers(facts.buses)
     notes = [
@@ -234,29 +267,38 @@ def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFra
 
     channels = channel_numbers(facts.buses)
 
-    def write(frames: FrameArray, bus: IntArray) -> None:
+    def messages(frames: FrameArray, bus: IntArray) -> Iterator[Message]:
+        fd = holds_fd(frames)
+        room = 64 if fd else 8
         columns: tuple[list[int], ...] = (
             (frames["t_host_ns"].astype(np.int64) - start_s * _NS).tolist(),
             frames["id_flags"].tolist(),
-            frames["dlc"].tolist(),
+            frames["len" if fd else "dlc"].tolist(),
             frames["dir"].tolist(),
+            frames["fd_flags"].tolist() if fd else [0] * len(frames),
         )
         numbers: list[int] = np.array(channels)[bus].tolist()
         data = frames["data"].tobytes()
         rows = zip(*columns, numbers, strict=True)
-        for i, (t_ns, id_flags, dlc, way, number) in enumerate(rows):
-            writer(
-                Message(
-                    timestamp=(t_ns + 0.5) / _NS,  # python-can cuts to whole ns
-                    arbitration_id=id_flags & ID_MASK,
-                    is_extended_id=bool(id_flags & EXTENDED_FLAG),
-                    is_remote_frame=bool(id_flags & REMOTE_FLAG),
-                    is_error_frame=bool(id_flags & ERROR_FLAG),
-                    channel=number,
-                    dlc=dlc,
-                    data=data[8 * i : 8 * i + min(dlc, 8)],
-                    is_rx=way != DIR_TX,
-                )
+        for i, (t_ns, id_flags, length, way, fd_flags, number) in enumerate(rows):
+            yield Message(
+                timestamp=(t_ns + 0.5) / _NS,  # python-can cuts to whole ns
+                arbitration_id=id_flags & ID_MASK,
+                is_extended_id=bool(id_flags & EXTENDED_FLAG),
+                is_remote_frame=bool(id_flags & REMOTE_FLAG),
+                is_error_frame=bool(id_flags & ERROR_FLAG),
+                channel=number,
+                dlc=length,
+                data=data[room * i : room * i + min(length, room)],
+                is_rx=way != DIR_TX,
+                is_fd=fd,
+                bitrate_switch=bool(fd_flags & FD_BRS),
+                error_state_indicator=bool(fd_flags & FD_ESI),
             )
+
+    def write(block: LogBlock) -> None:
+        classic = messages(block.frames, block.bus)
+        for message in block.interleaved(classic, messages(block.fd_frames, block.fd_bus)):
+            writer(message)
 
     return write

@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..log.frames import DIR_RX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
+from ..log.frames import (
+    DIR_RX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    ID_MASK,
+    REMOTE_FLAG,
+    FrameArray,
+    holds_fd,
+)
 
 Mask = NDArray[np.bool_]
 _FLAGS = ERROR_FLAG | REMOTE_FLAG | EXTENDED_FLAG
@@ -22,7 +32,16 @@ _FIELDS: dict[str, Callable[[FrameArray], NDArray[Any]]] = {
     "direction": lambda frames: frames["dir"],
     "time below 1 us": lambda frames: frames["t_host_ns"],
 }
-"""What is compared: name to one number a frame."""
+"""What is compared of a classic frame: name to one number a frame."""
+
+_FD_FIELDS: dict[str, Callable[[FrameArray], NDArray[Any]]] = {
+    **{name: _FIELDS[name] for name in ("identifier", "flags", "direction", "time below 1 us")},
+    "length": lambda frames: frames["len"],
+    "data": lambda frames: frames["data"],
+    "bit rate switch": lambda frames: frames["fd_flags"] & FD_BRS,
+    "error state": lambda frames: frames["fd_flags"] & FD_ESI,
+}
+"""The same of a CAN FD frame."""
 
 
 def is_error(frames: FrameArray) -> Mask:
@@ -73,14 +92,20 @@ class LossTally:
         """Compare frames with what the format keeps of them.
 
         Args:
-            frames: As the session has them, shape (n,).
+            frames: As the session has them, classic or CAN FD, shape (n,).
             kept: The same as the format has them, shape (n,).
         """
-        error, remote = is_error(frames), is_remote(frames)
-        kinds = {"error frame": error, "remote frame": remote, "data frame": ~error & ~remote}
+        if holds_fd(frames):
+            kinds = {"CAN FD frame": np.ones(len(frames), dtype=np.bool_)}
+            fields = _FD_FIELDS
+        else:
+            error, remote = is_error(frames), is_remote(frames)
+            kinds = {"error frame": error, "remote frame": remote, "data frame": ~error & ~remote}
+            fields = _FIELDS
         for kind, mask in kinds.items():
-            for name, number in _FIELDS.items():
-                self._count(kind, name, number(frames[mask]) != number(kept[mask]))
+            for name, number in fields.items():
+                lost = number(frames[mask]) != number(kept[mask])
+                self._count(kind, name, lost if lost.ndim == 1 else lost.any(axis=1))
         device, host = frames["t_device_ns"], frames["t_host_ns"]
         self._count("frame", "device time", (device != 0) & (device != host))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..console import progress, refuse_existing
@@ -44,10 +44,10 @@ def export_log(
 ) -> ExportReport:
     """Write the raw frames of a session as a trace of another format.
 
-    The frames of one bus come in the order they were logged, those of several by their times.
-    Identifier, flags, length code, data, direction and time are kept as far as the format holds
-    them; what it doesn't hold is counted in the report. A candump log that was imported comes back
-    bit for bit.
+    The frames of one bus come in the order they were logged, those of several, and of a bus with
+    both classic and CAN FD frames, by their times. Identifier, flags, length code, data, direction
+    and time are kept as far as the format holds them; what it doesn't hold is counted in the
+    report. A candump log that was imported comes back bit for bit.
 
     Args:
         source: The session.
@@ -81,14 +81,24 @@ def export_log(
             progress(f"export {output.name}", 1.0) as bar,
             chosen.open(part, facts) as write,
         ):
-            for block in frame_blocks(session, facts.buses):
-                kept = chosen.kept(block.frames)
-                tally.add(block.frames, kept)
-                write(kept, block.bus)
+            for block in frame_blocks(session, facts.buses, fd=chosen.holds_fd):
+                kept = replace(
+                    block,
+                    frames=chosen.kept(block.frames),
+                    fd_frames=chosen.kept(block.fd_frames) if chosen.holds_fd else block.fd_frames,
+                )
+                tally.add(block.frames, kept.frames)
+                tally.add(block.fd_frames, kept.fd_frames)
+                write(kept)
                 bar.update(block.done)
                 check_stop(output, stop)
-        warnings = [*session.warnings, *chosen.notes(facts), *tally.sentences()]
-    return ExportReport(source, output, chosen.title, dict(facts.counts), warnings)
+        counts, warnings = dict(facts.counts), [*session.warnings, *chosen.notes(facts)]
+        if chosen.holds_fd:
+            counts = {bus: count + facts.fd_counts[bus] for bus, count in counts.items()}
+        elif left_out := sum(facts.fd_counts.values()):
+            warnings.append(f"{left_out} CAN FD frames left out: the format has 8 bytes a frame")
+        warnings += tally.sentences()
+    return ExportReport(source, output, chosen.title, counts, warnings)
 
 
 def refuse_same(source: Path, output: Path) -> None:

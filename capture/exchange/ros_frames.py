@@ -19,6 +19,7 @@ import numpy as np
 from mcap.writer import Writer
 
 from ..arrays import IntArray
+from ..bus.frame_log import LogBlock
 from ..log.cdr import encode, layout_of
 from ..log.frames import (
     DIR_RX,
@@ -59,6 +60,7 @@ class RosFrames:
     """An MCAP file of ``can_msgs/msg/Frame``."""
 
     title = f"{TYPE_NAME}, one message a frame"
+    holds_fd = False
 
     def kept(self, frames: FrameArray) -> FrameArray:
         """Everything."""
@@ -89,8 +91,9 @@ class RosFrames:
             channels: dict[tuple[int, int], int] = {}
             place = 0
 
-            def write(frames: FrameArray, bus: IntArray) -> None:
+            def write(block: LogBlock) -> None:
                 nonlocal place
+                frames, bus = block.frames, block.bus
                 messages = _interleaved(templates, frames, bus)
                 which: list[int] = bus.tolist()
                 way: list[int] = np.where(frames["dir"] == DIR_TX, DIR_TX, DIR_RX).tolist()

@@ -56,6 +56,29 @@ def test_integers_of_every_layout(rng):
             assert BitField.of(signal).values(data).tolist() == reference(signal, data), signal
 
 
+@given(
+    position=st.integers(0, 511),
+    length=st.integers(1, 64),
+    byte_order=st.sampled_from(["little_endian", "big_endian"]),
+    kind=st.sampled_from(["unsigned", "signed", "float"]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_every_layout_in_the_64_bytes_of_can_fd(position, length, byte_order, kind, seed):
+    if kind == "float":
+        length = (16, 32, 64)[length % 3]
+    position = min(position, 512 - length)
+    start = position
+    if byte_order == "big_endian":
+        start = 8 * (position // 8) + 7 - position % 8
+    conversion = BaseConversion.factory(scale=0.5, offset=-3, is_float=kind == "float")
+    signal = Signal("s", start, length, byte_order, kind != "unsigned", conversion=conversion)
+    data = np.random.default_rng(seed).integers(0, 256, (5, 64), dtype=np.uint8)
+    data[0] = 255
+    message = Message(1, "m", 64, [signal], strict=True)
+    expected = [float(message.decode(row.tobytes(), decode_choices=False)["s"]) for row in data]
+    np.testing.assert_allclose(BitField.of(signal).values(data), expected, rtol=1e-15, atol=0)
+
+
 @pytest.mark.parametrize("length", [16, 32, 64])
 @pytest.mark.parametrize("byte_order", ["little_endian", "big_endian"])
 def test_floats_of_every_layout(byte_order, length, rng):

@@ -172,13 +172,12 @@ def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
         writer(can.Message(timestamp=T0, is_error_frame=True, arbitration_id=0x80))
         writer(can.Message(timestamp=T0, is_fd=True, arbitration_id=2, data=bytes(64)))
     report = import_can(source, output, load_robot("arcsnake-joint"))
-    assert report.problems == [
-        "1 CAN FD frames left out: only classic frames are kept",
-        "1 error frames",
-    ]
+    assert report.problems == ["1 error frames"]
     assert report.verdict == "degraded"
     with Session.open(output) as session:
         assert session.frames("/can/can0")["id_flags"].tolist() == [1, 0x80 | ERROR_FLAG]
+        (frame,) = session.fd_frames("/can_fd/can0")
+        assert (frame["id_flags"], frame["len"]) == (2 | EXTENDED_FLAG, 64)
         assert session.verdict == "degraded"
 
 

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from capture.errors import ImportFormatError
 from capture.exchange.candump import candump_lines, read_candump
-from capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from capture.log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    REMOTE_FLAG,
+)
 
 
 def read(path):
@@ -23,17 +31,31 @@ def read(path):
 
 def written(text, path, **options):
     path.write_text(text)
-    log, frames, bus = read(path)
+    with path.open() as stream:
+        log = read_candump(path, stream)
+        blocks = list(log.blocks)
     options.setdefault("directions", log.directions)
-    return "".join(candump_lines(frames, log.buses, bus, **options))
+    times = np.concatenate([block.times_ns() for block in blocks])
+    options.setdefault("nanoseconds", bool((times % 1000).any()))
+    return "".join(
+        line
+        for block in blocks
+        for line in block.interleaved(
+            candump_lines(block.frames, log.buses, block.bus, **options),
+            candump_lines(block.fd_frames, log.buses, block.fd_bus, **options),
+        )
+    )
 
 
 HEX = st.binary(max_size=8).map(lambda data: data.hex().upper())
+FD_HEX = st.binary(max_size=64).map(lambda data: data.hex().upper())
 CONTENT = st.one_of(
     st.builds("{:03X}#{}".format, st.integers(0, 0x7FF), HEX),
     st.builds("{:08X}#{}".format, st.integers(0, 0x1FFF_FFFF), HEX),
     st.builds("{:08X}#{}".format, st.integers(0x2000_0000, 0x2000_01FF), HEX),
     st.builds("{:03X}#R{}".format, st.integers(0, 0x7FF), st.sampled_from(["", *"12345678"])),
+    st.builds("{:03X}##{:X}{}".format, st.integers(0, 0x7FF), st.integers(0, 15), FD_HEX),
+    st.builds("{:08X}##{:X}{}".format, st.integers(0, 0x1FFF_FFFF), st.integers(0, 15), FD_HEX),
     st.builds("{:03X}#{}_{}".format, st.just(5), st.just("00" * 8), st.sampled_from("9ABCDEF")),
 )
 TIME = st.builds("{}.{:06d}".format, st.integers(0, 4_102_444_800), st.integers(0, 999_999))
@@ -91,12 +113,24 @@ def test_python_can_reads_what_is_written(tmp_path: Path):
     assert [m.is_rx for m in messages] == [i % 2 == 0 for i in range(500)]
 
 
-def test_can_fd_frames_are_counted(tmp_path: Path):
+def test_can_fd_frames(tmp_path: Path):
     path = tmp_path / "x.log"
-    path.write_text("(1.000000) can0 001#00\n(1.000001) can0 001##1" + "00" * 64 + "\n")
-    log, frames, _ = read(path)
-    assert len(frames) == 1
-    assert log.problems == ["1 CAN FD frames left out: only classic frames are kept"]
+    path.write_text(
+        "(1.000000) can1 001#00\n(1.000001) can0 001##3"
+        + "AB" * 64
+        + "\n(1.000002) can1 00000002##5\n"
+    )
+    with path.open() as stream:
+        log = read_candump(path, stream)
+        (block,) = log.blocks
+    assert (len(block), len(block.frames), log.problems) == (3, 1, [])
+    assert block.is_fd.tolist() == [False, True, True]
+    assert block.times_ns().tolist() == [1_000_000_000, 1_000_001_000, 1_000_002_000]
+    assert (block.bus.tolist(), block.fd_bus.tolist()) == ([0], [1, 0])
+    assert block.fd_frames["id_flags"].tolist() == [1, 2 | EXTENDED_FLAG]
+    assert block.fd_frames["len"].tolist() == [64, 0]
+    assert block.fd_frames["fd_flags"].tolist() == [FD_BRS | FD_ESI, FD_BRS | 4]
+    assert block.fd_frames["data"].tolist() == [[0xAB] * 64, [0] * 64]
 
 
 def test_a_cut_last_line_is_told(tmp_path: Path):
@@ -108,7 +142,15 @@ def test_a_cut_last_line_is_told(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "line", ["(1.0) can0 1234#00", "nonsense", "(1.0) can0 123#0G", "(x) c 1#"]
+    "line",
+    [
+        "(1.0) can0 1##1000",
+        "(1.0) can0 001##",
+        "(1.0) can0 1234#00",
+        "nonsense",
+        "(1.0) can0 123#0G",
+        "(x) c 1#",
+    ],
 )
 def test_a_wrong_line_is_named(line, tmp_path: Path):
     path = tmp_path / "x.log"

@@ -1,0 +1,443 @@
+"""CAN FD frames: kept exactly, on a topic of their own, from and to other tools."""
+
+import json
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from can.util import CAN_FD_DLC
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import undulog
+from capture import Session, SessionWriter, load_robot
+from capture.errors import DataError
+from capture.exchange.can_import import import_can
+from capture.exchange.can_logs import RELATIVE_EPOCH_NS
+from capture.exchange.log_export import export_log
+from capture.log.frames import (
+    DIR_RX,
+    DIR_TX,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    FD_FRAME_LAYOUT,
+    REMOTE_FLAG,
+    empty_fd_frames,
+    empty_frames,
+)
+from capture.log.session_check import check_session
+from capture.robot.description import parse_robot
+
+S = 1_000_000_000
+T0 = 1_700_000_003_250_000_000
+FIELDS = ("t_host_ns", "id_flags", "len", "dir", "fd_flags", "data")
+
+
+def every_kind(start_ns=T0, step_ns=1_000_000):
+    """Each identifier, way, length and flag that CAN FD has, one frame a step."""
+    rng = np.random.default_rng(7)
+    kinds = [
+        (identifier, way, length, flags)
+        for identifier in (0, 0x14B, 0x7FF, EXTENDED_FLAG, EXTENDED_FLAG | 0x1FFF_FFFF)
+        for way in (DIR_RX, DIR_TX)
+        for length in CAN_FD_DLC
+        for flags in (0, FD_BRS, FD_ESI, FD_BRS | FD_ESI)
+    ]
+    frames = empty_fd_frames(len(kinds))
+    for frame, (identifier, way, length, flags) in zip(frames, kinds, strict=True):
+        frame["id_flags"], frame["dir"], frame["len"] = identifier, way, length
+        frame["fd_flags"] = flags
+        frame["data"][:length] = list(rng.bytes(length))
+    frames = frames[rng.permutation(len(frames))]
+    frames["t_host_ns"] = start_ns + step_ns * np.arange(len(frames))
+    return frames
+
+
+def classic_frames(count, start_ns, step_ns):
+    frames = empty_frames(count)
+    frames["t_host_ns"] = start_ns + step_ns * np.arange(count)
+    frames["id_flags"], frames["dlc"] = np.arange(count) % 0x800, 8
+    frames["data"] = np.random.default_rng(1).integers(0, 256, (count, 8))
+    return frames
+
+
+def write_session(path, topics, batch=37):
+    """``topics``: topic to frames, classic or CAN FD by its name."""
+    with SessionWriter(path, session_id="s-1", epoch_ns=T0) as writer:
+        messages = [
+            (int(frames["t_host_ns"][start : start + batch].max()), topic, start)
+            for topic, frames in topics.items()
+            for start in range(0, len(frames), batch)
+        ]
+        channels = {
+            topic: writer.fd_frames(topic) if "_fd/" in topic else writer.frames(topic)
+            for topic in topics
+        }
+        for log_ns, topic, start in sorted(messages):
+            channels[topic].write(log_ns, topics[topic][start : start + batch])
+    return path
+
+
+def same(found, expected, fields=FIELDS):
+    for name in fields:
+        np.testing.assert_array_equal(found[name], expected[name], name)
+
+
+# -- the log -------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_what_is_written_is_read_the_same(data, tmp_path_factory):
+    sizes = data.draw(st.lists(st.integers(1, 9), min_size=1, max_size=6))
+    raw = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    frames = np.frombuffer(raw.bytes(sum(sizes) * 88), empty_fd_frames(0).dtype)
+    path = tmp_path_factory.mktemp("fd") / "x.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=T0) as writer:
+        channel = writer.fd_frames("/can_fd/can0")
+        ends = np.cumsum(sizes)
+        for k, (size, end) in enumerate(zip(sizes, ends, strict=True)):
+            channel.write(T0 + k, frames[end - size : end])
+    with Session.open(path) as session:
+        assert session.fd_frames("/can_fd/can0").tobytes() == frames.tobytes()
+        window = session.fd_frames("/can_fd/can0", start_ns=T0 + 1, stop_ns=T0 + 2)
+        assert window.tobytes() == frames[ends[0] : ends[0] + [*sizes, 0][1]].tobytes()
+
+
+def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
+    frames = every_kind()[:5]
+    path = write_session(tmp_path / "x.mcap", {"/can_fd/can0": frames})
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        ((_, channel, _, message),) = reader.iter_decoded_messages()
+    frame, record = message.layout.dim
+    assert (channel.topic, frame.label, frame.size) == ("/can_fd/can0", "frame", 5)
+    assert (record.label, record.size) == (FD_FRAME_LAYOUT, 88)
+    # The label, taken by its word, is the layout.
+    at, offsets = 0, {}
+    for part in record.label.split(","):
+        name, kind = part.split(":")
+        offsets[name] = at
+        at += int(kind[1:]) // 8 if kind.startswith("u") else int(kind)
+    assert at == 88
+    data = bytes(message.data)
+    for k, expected in enumerate(frames):
+        row = data[88 * k : 88 * (k + 1)]
+        assert int.from_bytes(row[offsets["id_flags"] :][:4], "little") == expected["id_flags"]
+        assert row[offsets["len"]] == expected["len"]
+        assert row[offsets["fd_flags"]] == expected["fd_flags"]
+        assert row[offsets["data"] :] == expected["data"].tobytes()
+
+
+def test_the_kinds_are_not_mixed_up(tmp_path: Path):
+    # 4 CAN FD frames have as many bytes as 11 classic ones: the label tells them apart.
+    topics = {"/can_fd/can0": every_kind()[:4], "/can/can0_fd": classic_frames(11, T0, 1000)}
+    path = write_session(tmp_path / "x.mcap", topics)
+    with Session.open(path) as session:
+        with pytest.raises(DataError, match="/can_fd/can0 does not hold frames of 32 bytes"):
+            session.frames("/can_fd/can0")
+        with pytest.raises(DataError, match="/can/can0_fd does not hold frames of 88 bytes"):
+            session.fd_frames("/can/can0_fd")
+        assert len(session.frames("/can/can0_fd")) == 11
+    with SessionWriter(tmp_path / "y.mcap", session_id="s", epoch_ns=T0) as writer:
+        with pytest.raises(DataError, match="frames have the layout"):
+            writer.fd_frames("/can_fd/can0").write(T0, empty_frames(1))
+        with pytest.raises(DataError, match="frames have the layout"):
+            writer.frames("/can/can0").write(T0, empty_fd_frames(1))
+
+
+def test_the_check_counts_them(tmp_path: Path, capsys):
+    # The classic frames pause for 3 s in which CAN FD frames come: the bus isn't silent.
+    classic = classic_frames(200, T0, 10_000_000)
+    classic["t_host_ns"][100:] += 3 * S
+    fd = every_kind(step_ns=10_000_000)
+    path = write_session(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
+    health = check_session(path)
+    assert {bus.topic: bus.frames for bus in health.buses} == {
+        "/can/can0": 200,
+        "/can_fd/can0": len(fd),
+    }
+    rate = {bus.topic: bus.rate_hz for bus in health.buses}
+    assert rate["/can_fd/can0"] == pytest.approx(100)
+    assert not [finding for finding in health.findings if "silent" in finding.sentence]
+    assert not [finding for finding in health.findings if "can't be read" in finding.sentence]
+    alone = write_session(tmp_path / "y.mcap", {"/can/can0": classic, "/can_fd/can1": fd})
+    sentences = [finding.sentence for finding in check_session(alone).findings]
+    (silence,) = (sentence for sentence in sentences if "silent" in sentence)
+    assert silence.startswith("/can/can0: silent for 3.01 s, at ")
+    undulog.run(["log", "check", str(path)])
+    assert f"/can_fd/can0: {len(fd)} frames, 100.0 Hz, 0 error frames" in capsys.readouterr().out
+
+
+# -- other tools ---------------------------------------------------------------------------
+
+
+def imported(trace, folder, topic="/can_fd/can0"):
+    run = folder / "back.mcap"
+    report = import_can(trace, run, load_robot("snake13"), force=True)
+    with Session.open(run) as session:
+        return report, session.fd_frames(topic)
+
+
+@pytest.fixture(scope="module")
+def session_of_every_kind(tmp_path_factory):
+    frames = every_kind()
+    folder = tmp_path_factory.mktemp("kinds")
+    return write_session(folder / "run.mcap", {"/can_fd/can0": frames}), frames
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
+def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path: Path):
+    source, frames = session_of_every_kind
+    report = export_log(source, tmp_path / f"x{suffix}")
+    assert (report.buses, report.warnings) == ({"can0": len(frames)}, [])
+    _, back = imported(tmp_path / f"x{suffix}", tmp_path)
+    expected = frames.copy()
+    if suffix == ".asc":  # without the date
+        expected["t_host_ns"] -= np.uint64(T0 // S * S - RELATIVE_EPOCH_NS)
+    same(back, expected)
+
+
+READERS = {
+    ".log": can.CanutilsLogReader,
+    ".blf": can.BLFReader,
+    ".asc": lambda path: can.ASCReader(path, relative_timestamp=False),
+}
+
+
+@pytest.mark.parametrize("suffix", READERS)
+def test_python_can_reads_them(suffix, session_of_every_kind, tmp_path: Path):
+    source, frames = session_of_every_kind
+    export_log(source, tmp_path / f"x{suffix}")
+    reader = READERS[suffix](tmp_path / f"x{suffix}")
+    messages = list(reader)
+    reader.stop()
+    assert len(messages) == len(frames)
+    for message, frame in zip(messages, frames, strict=True):
+        id_flags = int(frame["id_flags"])
+        assert message.is_fd
+        assert not message.is_error_frame
+        assert message.arbitration_id == id_flags & 0x1FFF_FFFF
+        assert message.is_extended_id == bool(id_flags & EXTENDED_FLAG)
+        assert message.is_rx == (frame["dir"] == DIR_RX)
+        assert message.bitrate_switch == bool(frame["fd_flags"] & FD_BRS)
+        assert message.error_state_indicator == bool(frame["fd_flags"] & FD_ESI)
+        assert bytes(message.data) == bytes(frame["data"][: frame["len"]])
+        assert round(message.timestamp * 1e6) == frame["t_host_ns"] // 1000
+
+
+def some_messages(channel=0):
+    """CAN FD and classic frames by turns, as python-can has them, one a millisecond."""
+    rng = np.random.default_rng(5)
+    return [
+        can.Message(
+            timestamp=T0 / S + i * 1e-3,
+            arbitration_id=0x18FEF100 + i if i % 2 else 0x100 + i,
+            is_extended_id=i % 2 == 1,
+            is_fd=i % 3 != 0,
+            bitrate_switch=i % 3 == 1,
+            error_state_indicator=i % 4 == 1 and i % 3 != 0,
+            is_rx=i % 5 != 0,
+            data=rng.bytes(CAN_FD_DLC[i % 16] if i % 3 else i % 9),
+            channel=channel,
+        )
+        for i in range(480)
+    ]
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".asc.gz"])
+def test_logs_of_python_can(suffix, tmp_path: Path):
+    messages = some_messages()
+    source = tmp_path / f"log{suffix}"
+    with can.Logger(str(source)) as writer:
+        for message in messages:
+            writer(message)
+    report, frames = imported(source, tmp_path)
+    fd = [message for message in messages if message.is_fd]
+    assert (report.frames, report.problems) == (
+        len(messages),
+        ["nothing decoded: the robot snake13 has no bus map"],
+    )
+    with Session.open(tmp_path / "back.mcap") as session:
+        assert len(session.frames("/can/can0")) == len(messages) - len(fd)
+    start_ns = T0 - RELATIVE_EPOCH_NS if ".asc" in suffix else 0
+    expected = empty_fd_frames(len(fd))
+    for frame, message in zip(expected, fd, strict=True):
+        frame["t_host_ns"] = round(message.timestamp * 1e6) * 1000 - start_ns
+        frame["id_flags"] = message.arbitration_id
+        frame["id_flags"] |= EXTENDED_FLAG if message.is_extended_id else 0
+        frame["len"], frame["dir"] = len(message.data), DIR_RX if message.is_rx else DIR_TX
+        frame["fd_flags"] |= FD_BRS if message.bitrate_switch else 0
+        frame["fd_flags"] |= FD_ESI if message.error_state_indicator else 0
+        frame["data"][: len(message.data)] = list(message.data)
+    same(frames, expected)
+
+
+TRC = """;$FILEVERSION=2.1
+;$STARTTIME=45243.9317
+;$COLUMNS=N,O,T,B,I,d,R,L,D
+      1      1059.900 DT 1     0300 Rx -  7    00 00 00 00 04 00 00
+      2      1283.231 FD 1     0300 Rx -  8    00 00 00 00 04 00 00 07
+      3      1298.945 FB 1     0400 Tx -  9    00 00 00 00 00 00 00 00 00 00 00 0C
+      4      1323.201 FE 1 18FEF100 Rx -  15   {}
+      5      1334.416 BI 1     0500 Rx -  0
+"""
+
+
+def test_a_trc_of_version_2(tmp_path: Path):
+    data = " ".join(f"{k:02X}" for k in range(64))
+    (tmp_path / "x.trc").write_text(TRC.format(data))
+    report, frames = imported(tmp_path / "x.trc", tmp_path, "/can_fd/can1")
+    assert report.frames == 5
+    assert frames["id_flags"].tolist() == [0x300, 0x400, 0x18FEF100 | EXTENDED_FLAG, 0x500]
+    assert frames["len"].tolist() == [8, 12, 64, 0]
+    assert frames["fd_flags"].tolist() == [0, FD_BRS, FD_BRS | FD_ESI, FD_ESI]
+    assert frames["dir"].tolist() == [DIR_RX, DIR_TX, DIR_RX, DIR_RX]
+    assert frames["data"][2].tolist() == list(range(64))
+    assert frames["data"][1].tolist() == [0] * 11 + [12] + [0] * 52
+
+
+def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
+    with can.Logger(str(tmp_path / "x.csv")) as writer:
+        for message in some_messages():
+            writer(message)
+    report, frames = imported(tmp_path / "x.csv", tmp_path, "/can_fd/can0")
+    long = [message for message in some_messages() if len(message.data) > 8]
+    assert report.problems[0] == (
+        f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log doesn't say so, and "
+        "shorter ones count as classic"
+    )
+    found = [bytes(frame["data"][: frame["len"]]) for frame in frames]
+    assert found == [bytes(message.data) for message in long]
+
+
+def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
+    rng = np.random.default_rng(9)
+    text = "".join(
+        f"(1717639553.{i:06d}) {'vcan1' if i % 7 == 0 else 'can0'} {i % 0x800:03X}"
+        + (f"##{i % 16:X}{rng.bytes(CAN_FD_DLC[i % 16]).hex().upper()}" if i % 3 else "#0102 "[:5])
+        + f" {'RT'[i % 2]}\n"
+        for i in range(3000)
+    )
+    (tmp_path / "x.log").write_text(text)
+    import_can(tmp_path / "x.log", tmp_path / "run.mcap", load_robot("snake13"))
+    report = export_log(tmp_path / "run.mcap", tmp_path / "back.log")
+    assert (tmp_path / "back.log").read_text() == text
+    assert report.buses == {"can0": 3000 - 429, "vcan1": 429}
+    report = export_log(tmp_path / "run.mcap", tmp_path / "one.log", bus="vcan1")
+    expected = [line for line in text.splitlines() if " vcan1 " in line]
+    assert (tmp_path / "one.log").read_text().splitlines() == expected
+
+
+def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
+    frames = every_kind()
+    topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
+    source = write_session(tmp_path / "run.mcap", topics)
+    report = export_log(source, tmp_path / "x.mcap")
+    assert report.buses == {"can0": 50}
+    left_out = f"{len(frames)} CAN FD frames left out: the format has 8 bytes a frame"
+    assert report.warnings == [left_out]
+    report = export_log(session_of_every_kind[0], tmp_path / "y.mcap")
+    assert (report.buses, report.warnings) == ({"can0": 0}, [left_out])
+
+
+def test_what_a_format_loses_is_counted(tmp_path: Path):
+    frames = every_kind(start_ns=T0 + 7)[:10]
+    frames["id_flags"][:3] |= REMOTE_FLAG  # there is no such thing in CAN FD
+    frames["t_device_ns"] = frames["t_host_ns"] + 5
+    source = write_session(tmp_path / "run.mcap", {"/can_fd/can0": frames})
+    assert export_log(source, tmp_path / "x.asc").warnings == [
+        "3 CAN FD frames lose their flags",
+        "10 CAN FD frames lose their time below 1 us",
+        "10 frames lose their device time",
+    ]
+
+
+def test_through_the_command_line(tmp_path: Path, capsys):
+    (tmp_path / "x.log").write_text(
+        "(1.000000) can0 123##1" + "AB" * 64 + " R\n(1.000001) can0 124#01 T\n"
+    )
+    run = tmp_path / "run.mcap"
+    arguments = ["import", str(tmp_path / "x.log"), "-o", str(run), "--robot", "snake13"]
+    assert undulog.run([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 2
+    undulog.run(["log", "export", str(run), "-o", str(tmp_path / "y.log")])
+    assert (tmp_path / "y.log").read_text() == (tmp_path / "x.log").read_text()
+
+
+# -- decoding ------------------------------------------------------------------------------
+
+BIG = """VERSION ""
+
+BU_: a b
+
+BO_ 256 big: 64 a
+ SG_ angle : 500|12@1- (0.1,0) [0|0] "deg" b
+ SG_ torque : 131|16@0- (0.01,0) [0|0] "N m" b
+
+BO_ 257 small: 2 a
+ SG_ target : 0|16@1- (0.01,0) [0|0] "deg" b
+"""
+
+ROBOT = """
+name = "big"
+clock = "host"
+joints = [{ name = "joint01", plane = "horizontal" }]
+
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+
+[bus]
+databases = ["big.dbc"]
+bitrate = 500_000
+signals = [
+  { message = "big", signal = "angle", direction = "rx", target = "joint01", quantity = "position", unit = "deg" },
+  { message = "big", signal = "torque", direction = "rx", target = "joint01", quantity = "effort", unit = "N m" },
+  { message = "small", signal = "target", direction = "tx", target = "joint01", quantity = "command", unit = "deg" },
+]
+"""  # noqa: E501  TOML has inline tables on one line
+
+
+def test_import_decodes_both_kinds(tmp_path: Path):
+    import cantools
+
+    database = cantools.database.load_string(BIG, "dbc")
+    lines, angles, targets = [], [], []
+    for i in range(200):
+        angle, target = (i - 100) * 1.5, i * 0.25
+        big = database.encode_message("big", {"angle": angle, "torque": i * 0.01})
+        small = database.encode_message("small", {"target": target})
+        lines.append(f"(1717639553.{1000 * i:06d}) can0 101#{small.hex()} T\n")
+        lines.append(f"(1717639553.{1000 * i + 500:06d}) can0 100##1{big.hex()} R\n")
+        angles.append(angle)
+        targets.append(target)
+    (tmp_path / "x.log").write_text("".join(lines))
+    robot = parse_robot(ROBOT, "big.toml", {"big.dbc": BIG})
+    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
+    assert report.problems == []
+    with Session.open(tmp_path / "run.mcap") as session:
+        state = session.joints("/joint_states").signal("joint01")
+        effort = session.joints("/joint_states", "effort").signal("joint01")
+        command = session.joints("/joint_commands").signal("joint01")
+    assert np.degrees(state.values) == pytest.approx(angles, abs=1e-9)
+    assert effort.values == pytest.approx(np.arange(200) * 0.01, abs=1e-12)
+    assert np.degrees(command.values) == pytest.approx(targets, abs=1e-9)
+    assert (state.t_ns - command.t_ns).tolist() == [500_000] * 200
+
+
+def test_a_frame_too_short_for_its_signal_is_told(tmp_path: Path):
+    (tmp_path / "x.log").write_text(
+        "(1.000000) can0 100##1" + "00" * 48 + " R\n(1.000100) can0 100#" + "00" * 8 + " R\n"
+    )
+    robot = parse_robot(ROBOT, "big.toml", {"big.dbc": BIG})
+    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
+    assert report.problems == [
+        "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
+    ]
