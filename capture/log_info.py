@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,12 @@ def describe(session: Session) -> dict[str, Any]:
         session: An open session.
 
     Returns:
-        ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``.
+        ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``. A
+        topic's ``read`` says whether its messages can be read: those of other encodings are only
+        listed. Without messages there is no start.
     """
     seconds = session.duration_s
+    empty = not any(channel.count for channel in session.channels.values())
     topics = [
         {
             "topic": channel.topic,
@@ -27,6 +31,9 @@ def describe(session: Session) -> dict[str, Any]:
             "messages": channel.count,
             "rate_hz": round(channel.count / seconds, 3) if seconds > 0 else None,
             "unit": channel.metadata.get("unit"),
+            "encoding": channel.encoding or None,
+            "schema": channel.schema_encoding or None,
+            "read": channel.is_ros2,
         }
         for _, channel in sorted(session.channels.items())
     ]
@@ -36,8 +43,8 @@ def describe(session: Session) -> dict[str, Any]:
             "path": str(session.path),
             "robot": session.robot.name if session.robot is not None else None,
             "joints": len(session.robot.joints) if session.robot is not None else None,
-            "start_ns": session.start_ns,
-            "start_utc": _utc(session.start_ns),
+            "start_ns": None if empty else session.start_ns,
+            "start_utc": None if empty else _utc(session.start_ns),
             "duration_s": seconds,
             "size_bytes": sum(path.stat().st_size for path in session.files),
             "files": [path.name for path in session.files],
@@ -74,25 +81,52 @@ def _print_facts(facts: dict[str, Any]) -> None:
     robot = f"{session['robot']}, {session['joints']} joints" if session["robot"] else "no robot"
     messages = sum(topic["messages"] for topic in facts["topics"])
     parts = f" in {len(session['files'])} parts" if len(session["files"]) > 1 else ""
-    print(
-        f"{session['id']}: {robot}, {session['duration_s']:.2f} s from {session['start_utc']}, "
-        f"{messages} messages, {session['size_bytes'] / 1e6:.1f} MB{parts}"
+    held = (
+        f"{session['duration_s']:.2f} s from {session['start_utc']}, {messages} messages"
+        if session["start_utc"]
+        else "no messages"
     )
+    print(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
     for warning in facts["warnings"]:
         print(f"warning: {warning}")
+    foreign = Counter(topic["encoding"] or "no encoding" for topic in _foreign(facts))
+    if foreign:
+        order = sorted(foreign.items(), key=lambda item: (-item[1], item[0]))
+        listed = ", ".join(f"{encoding} {count}" for encoding, count in order)
+        topics = "1 topic is" if foreign.total() == 1 else f"{foreign.total()} topics are"
+        print(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
+    names = [_type(topic) for topic in facts["topics"]]
     width = max([len(topic["topic"]) for topic in facts["topics"]] + [5])
-    kinds = max([len(topic["type"]) for topic in facts["topics"]] + [4])
+    kinds = max([len(name) for name in names] + [4])
     print(f"\n{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
-    for topic in facts["topics"]:
+    for topic, name in zip(facts["topics"], names, strict=True):
         rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
         print(
-            f"{topic['topic']:<{width}}  {topic['type']:<{kinds}}  {topic['messages']:>8}  "
+            f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}  "
             f"{rate}  {topic['unit'] or ''}".rstrip()
         )
     if facts["attachments"]:
         listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())
         print(f"\nattached: {', '.join(listed)}")
-    print(f"verdict: {session['verdict'] or 'none stored'}; written by {session['library']}")
+    writer = session["library"] or "an unnamed program"
+    print(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
+
+
+def _foreign(facts: dict[str, Any]) -> list[dict[str, Any]]:
+    """The topics whose messages aren't ROS 2's."""
+    return [topic for topic in facts["topics"] if not topic["read"]]
+
+
+def _type(topic: dict[str, Any]) -> str:
+    """A topic's type, with the encodings where they aren't those of ROS 2."""
+    if topic["read"]:
+        return topic["type"]
+    said = [topic["encoding"] or "no encoding", topic["schema"] or "no schema"]
+    return f"{topic['type']} ({', '.join(said)})".lstrip()
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 1e5 else f"{size_bytes / 1e3:.1f} kB"
 
 
 def _utc(t_ns: int) -> str:

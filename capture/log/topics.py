@@ -17,6 +17,7 @@ from .rosmsg import MessageType, parse_message_type
 from .storage import LogFile
 
 Window = tuple[int | None, int | None]
+_ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,21 @@ class Channel:
         type_name: E.g. ``sensor_msgs/msg/JointState``.
         count: Number of messages.
         metadata: Of the channel, e.g. ``unit``.
+        encoding: Of its messages, e.g. ``cdr``; ``json``, ``protobuf`` or ``ros1`` in other makes.
+        schema_encoding: E.g. ``ros2msg``; empty without a schema.
     """
 
     topic: str
     type_name: str
     count: int
     metadata: Mapping[str, str]
+    encoding: str
+    schema_encoding: str
+
+    @property
+    def is_ros2(self) -> bool:
+        """Whether its messages are of ROS 2, which can be read."""
+        return (self.encoding, self.schema_encoding) == (_ENCODING, _SCHEMA_ENCODING)
 
 
 class Topics:
@@ -184,7 +194,14 @@ class Topics:
                 if name == names[0]
             ]
         count = sum(self._file.counts.get(channel_id, 0) for channel_id in self._ids[topic])
-        return Channel(topic, names[0], count, MappingProxyType(dict(channels[0].metadata)))
+        return Channel(
+            topic=topic,
+            type_name=names[0],
+            count=count,
+            metadata=MappingProxyType(dict(channels[0].metadata)),
+            encoding=channels[0].message_encoding,
+            schema_encoding=types[0].encoding if types[0] is not None else "",
+        )
 
     def _channel_ids(self, topic: str) -> list[int]:
         if topic not in self._ids:
@@ -194,7 +211,11 @@ class Topics:
     def _schema(self, topic: str) -> Schema:
         channel = self._file.channels[self._channel_ids(topic)[0]]
         schema = self._file.schemas.get(channel.schema_id)
-        if schema is None or schema.encoding != "ros2msg" or channel.message_encoding != "cdr":
+        if (
+            schema is None
+            or schema.encoding != _SCHEMA_ENCODING
+            or channel.message_encoding != _ENCODING
+        ):
             found = f"{channel.message_encoding or 'no encoding'} with " + (
                 f"a {schema.encoding or 'nameless'} schema" if schema is not None else "no schema"
             )

@@ -188,7 +188,7 @@ def held_by_asc(each):
 EXPORTED = {
     # suffix: what it holds of a frame, error of its time [ns]
     ".log": (lambda each: each, 0),
-    ".blf": (held_by_blf, 620),  # 0.12 us of python-can's reader, rounded to 1 us
+    ".blf": (held_by_blf, 1000),  # of floating-point seconds in the reader, rounded to 1 us
     ".asc": (held_by_asc, 500),
 }
 FIELDS = {
