@@ -216,13 +216,14 @@ def _session_id(file: McapFile) -> str:
 
 
 def _is_part(path: Path, head: Path) -> bool:
-    """Whether a file with the name of a later part is one."""
+    """Whether a file with the name of a later part is one: it says so, or it says nothing."""
+    known = head.exists() or wal_folder(head).is_dir()
     try:
         file = McapFile(path, bare=True)
     except LogError:
-        return not path.exists() or head.exists() or wal_folder(head).is_dir()
+        return known or not path.exists()
     try:
-        return PART_RECORD in file.metadata
+        return PART_RECORD in file.metadata or (known and not file.channels)
     finally:
         file.close()
 

@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 
 import undulog
 from capture import Session
-from capture.errors import LogError, NotALogError, OutputExistsError, UsageError
+from capture.errors import LogError, NotALogError, OutputExistsError, UndulogError, UsageError
 from capture.log.cut import cut_log
 from capture.log.merge import merge_logs
 from capture.log.raw_log import RawLog
@@ -456,3 +456,59 @@ def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(tmp_path):
             assert rest == truth[:first] + truth[last + 1 :], (broken, length)
             assert set(found) <= set(truth)
             assert any("is damaged and was skipped" in text for text in warnings)
+
+
+def damage(rng, folder):
+    """Damage up to three files of a session in one of several ways each."""
+    files = [path for path in sorted(folder.rglob("*")) if path.suffix in (".mcap", ".seg")]
+    for path in rng.sample(files, rng.randint(1, 3)):
+        raw = bytearray(path.read_bytes())
+        at, length = rng.randrange(len(raw) + 1), rng.choice([1, 8, 64, 4096])
+        kind = rng.randrange(6)
+        if kind == 0:  # some bytes
+            for _ in range(rng.randint(1, 20)):
+                raw[rng.randrange(len(raw))] = rng.randrange(256)
+        elif kind == 1:
+            raw[at : at + length] = rng.choice([bytes(length), b"\xff" * length])
+        elif kind == 2:
+            del raw[at:]
+        elif kind == 3:
+            del raw[at : at + length]
+        elif kind == 4:
+            raw[at:at] = rng.randbytes(length)
+        else:
+            path.unlink()
+            continue
+        path.write_bytes(raw)
+
+
+@pytest.mark.parametrize("runs", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_told(tmp_path, runs):
+    source = tmp_path / "source"
+    source.mkdir()
+    unfinished(source / "run.mcap", 2400, splits=[900, 1800])
+    truth = set(recorder.truth(2400))
+    place = tmp_path / "damaged"
+    outcomes = {"all": 0, "some": 0, "none": 0}
+    rng = random.Random(runs)
+    for run in range(runs):
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(source, place)
+        damage(rng, place)
+        try:
+            found, warnings = read(place / "run.mcap")
+            check_session(place)
+            report = recover_log(place, tmp_path / "out.mcap", force=True)
+        except UndulogError:
+            outcomes["none"] += 1
+            continue
+        assert set(found) <= truth, run
+        assert len(set(found)) == len(found), run
+        assert sum(report.messages.values()) == len(found), run
+        # What the damaged log itself can't tell any more is not counted.
+        assert report.missing is None or report.missing <= 2400 - len(found), run
+        assert len(found) == 2400 or warnings, run
+        outcomes["all" if len(found) == 2400 else "some"] += 1
+    assert outcomes["none"] <= runs // 20
+    assert outcomes["all"] > 0
+    assert outcomes["some"] > 0
