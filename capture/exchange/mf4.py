@@ -3,7 +3,7 @@
 The frames lie in channel groups, one for each kind of frame and often one for each bus. A group has
 a channel for each field, as columns: ``CAN_DataFrame.ID``, ``.IDE``, ``.DLC``, ``.DataLength``,
 ``.DataBytes``, ``.Dir``, ``.BusChannel``; ``CAN_RemoteFrame`` and ``CAN_ErrorFrame`` have the same
-names. Source: "MDF bus logging" of https://www.asam.net/standards/detail/mdf/.
+names; CAN FD frames have ``.EDL``, ``.BRS`` and ``.ESI`` besides. Source: "MDF bus logging" of https://www.asam.net/standards/detail/mdf/.
 
 python-can reads the format too, but a frame at a time, without the length codes above 8, and with
 times as floating-point Unix seconds; the file has them from its start, good to 1 ns.
@@ -12,7 +12,7 @@ times as floating-point Unix seconds; the file has them from its start, good to 
 from __future__ import annotations
 
 import gzip
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray
+from ..arrays import BoolArray, IntArray
 from ..bus.frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock
 from ..errors import ImportFormatError, MissingExtraError
 from ..log.frames import (
@@ -31,9 +31,12 @@ from ..log.frames import (
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
     ID_MASK,
     REMOTE_FLAG,
     FrameArray,
+    empty_fd_frames,
     empty_frames,
 )
 from .mf4_faults import readable, said
@@ -42,7 +45,7 @@ from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
 _KIND_FLAGS = {"CAN_DataFrame": 0, "CAN_RemoteFrame": REMOTE_FLAG, "CAN_ErrorFrame": ERROR_FLAG}
 _NS = 1_000_000_000
 _LOCAL_TIME = 1  # bit of the header's time flags: civil time, of no zone
-_PLACES: IntArray = np.arange(8)
+_PLACES: IntArray = np.arange(64)
 _VERSION_4 = (b"MDF", b"UnFinMF")
 
 
@@ -58,11 +61,20 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Piece:
-    """Frames of one group; ``order`` never falls, not even where their times do."""
+    """Frames of one group; ``order`` never falls, not even where their times do.
+
+    Those of both kinds stand in records of CAN FD frames; ``len`` of a classic one is its length
+    code.
+    """
 
     order: IntArray
     bus: IntArray  # number of the bus, as the file has it
     frames: FrameArray
+    is_fd: BoolArray
+
+    def __getitem__(self, rows: slice | IntArray) -> _Piece:
+        """Some of its frames."""
+        return _Piece(self.order[rows], self.bus[rows], self.frames[rows], self.is_fd[rows])
 
 
 @contextmanager
@@ -172,28 +184,25 @@ class _Reader:
 
     def __init__(self, mdf: Any, start_ns: int, log: FrameLog) -> None:
         self.log = log
-        self.fd_frames = 0
         self._mdf = mdf
         self._start_ns = start_ns
 
     def pieces(self, group: _Group) -> Iterator[_Piece]:
-        """The classic frames of a group, in the order they were logged."""
+        """The frames of a group, in the order they were logged."""
         latest = np.iinfo(np.int64).min
         for first in range(0, group.count, FRAMES_PER_BLOCK):
             count = min(FRAMES_PER_BLOCK, group.count - first)
             times = self._mdf.get_master(group.index, record_offset=first, record_count=count)
             t_ns = self._start_ns + np.rint(np.asarray(times) * 1e9).astype(np.int64)
-            frames, bus, fd = self._frames(group, first, count)
+            frames, bus, is_fd = self._frames(group, first, count)
             frames["t_host_ns"] = t_ns.astype(np.uint64)
-            self.fd_frames += int(fd.sum())
             order = np.maximum(np.maximum.accumulate(t_ns), latest)
             latest = int(order[-1])
-            if not fd.all():
-                yield _Piece(order[~fd], bus[~fd], frames[~fd])
+            yield _Piece(order, bus, frames, is_fd)
 
     def _frames(
         self, group: _Group, first: int, count: int
-    ) -> tuple[FrameArray, IntArray, NDArray[np.bool_]]:
+    ) -> tuple[FrameArray, IntArray, BoolArray]:
         def column(name: str, *, converted: bool = False) -> NDArray[Any] | None:
             if name not in group.channels:
                 return None
@@ -213,7 +222,7 @@ class _Reader:
             found = column(name)
             return None if found is None else found.astype(np.int64)
 
-        frames = empty_frames(count)
+        frames = empty_fd_frames(count)
         none = np.zeros(count, dtype=np.int64)
         identifier = none if (found := numbers("ID")) is None else found
         extended = identifier & EXTENDED_FLAG != 0
@@ -228,17 +237,29 @@ class _Reader:
         dlc = numbers("DLC")
         if size is None:
             size = none if data is None or dlc is None else np.minimum(dlc, 8)
-        frames["dlc"] = size if dlc is None else dlc
+        is_fd, frames["fd_flags"] = _fd_facts(group.kind, size, numbers)
+        frames["len"] = size if dlc is None else np.where(is_fd, np.minimum(size, 64), dlc)
         if data is not None:
-            cells = np.ascontiguousarray(data).view(np.uint8).reshape(count, -1)[:, :8]
+            cells = np.ascontiguousarray(data).view(np.uint8).reshape(count, -1)[:, :64]
             cells = cells * (_PLACES[: cells.shape[1]] < size[:, None])
             frames["data"][:, : cells.shape[1]] = cells
         frames["dir"] = _ways(column("Dir", converted=True), count)
         bus = none if (found := numbers("BusChannel")) is None else found
-        fd = size > 8
-        if (longer := numbers("EDL")) is not None:
-            fd |= longer != 0
-        return frames, bus, fd
+        return frames, bus, is_fd
+
+
+def _fd_facts(
+    kind: str, size: IntArray, numbers: Callable[[str], IntArray | None]
+) -> tuple[BoolArray, NDArray[np.uint8]]:
+    """Which are CAN FD frames, and their flags; an error frame is of neither kind."""
+    is_fd, flags = size > 8, np.zeros(len(size), dtype=np.uint8)
+    if (longer := numbers("EDL")) is not None:
+        is_fd |= longer != 0
+    is_fd &= kind != "CAN_ErrorFrame"
+    for name, flag in (("BRS", FD_BRS), ("ESI", FD_ESI)):
+        if (found := numbers(name)) is not None:
+            flags[is_fd & (found != 0)] |= flag
+    return is_fd, flags
 
 
 def _ways(column: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
@@ -269,10 +290,20 @@ def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> It
                 raise ImportFormatError(path, f"has a frame at {earliest / _NS} s, before 1970")
             frames["t_host_ns"] = (t_ns + epoch_ns).astype(np.uint64)
             taken += len(frames)
-            yield LogBlock(frames, _indices(piece.bus, log.buses), taken / total)
-    if reader.fd_frames:
-        text = f"{reader.fd_frames} CAN FD frames left out: only classic frames are kept"
-        log.problems.append(text)
+            yield _block(piece, _indices(piece.bus, log.buses), taken / total)
+
+
+def _block(piece: _Piece, bus: IntArray, done: float) -> LogBlock:
+    """The two kinds apart."""
+    is_fd = piece.is_fd
+    wide = piece.frames[~is_fd]
+    frames = empty_frames(len(wide))
+    for name in ("t_host_ns", "id_flags", "dir"):
+        frames[name] = wide[name]
+    frames["dlc"], frames["data"] = wide["len"], wide["data"][:, :8]
+    if not is_fd.any():
+        return LogBlock(frames, bus, done)
+    return LogBlock(frames, bus[~is_fd], done, piece.frames[is_fd], bus[is_fd], is_fd)
 
 
 def _indices(numbers: IntArray, buses: list[str]) -> IntArray:
@@ -294,11 +325,11 @@ def _merged(streams: list[Iterator[_Piece]]) -> Iterator[_Piece]:
         parts: list[_Piece] = []
         for i, head in live:
             cut = int(np.searchsorted(head.order, until, side="right"))
-            parts.append(_Piece(head.order[:cut], head.bus[:cut], head.frames[:cut]))
-            rest = _Piece(head.order[cut:], head.bus[cut:], head.frames[cut:])
+            parts.append(head[:cut])
+            rest = head[cut:]
             heads[i] = rest if len(rest.order) else next(streams[i], None)
         order = np.concatenate([part.order for part in parts])
-        by_time = np.argsort(order, kind="stable")
         bus = np.concatenate([part.bus for part in parts])
         frames = np.concatenate([part.frames for part in parts])
-        yield _Piece(order[by_time], bus[by_time], frames[by_time])
+        is_fd = np.concatenate([part.is_fd for part in parts])
+        yield _Piece(order, bus, frames, is_fd)[np.argsort(order, kind="stable")]

@@ -265,16 +265,41 @@ def test_logs_of_python_can(suffix, tmp_path: Path):
     with Session.open(tmp_path / "back.mcap") as session:
         assert len(session.frames("/can/can0")) == len(messages) - len(fd)
     start_ns = T0 - RELATIVE_EPOCH_NS if ".asc" in suffix else 0
-    expected = empty_fd_frames(len(fd))
-    for frame, message in zip(expected, fd, strict=True):
-        frame["t_host_ns"] = round(message.timestamp * 1e6) * 1000 - start_ns
+    expected = records_of(fd)
+    expected["t_host_ns"] -= np.uint64(start_ns)
+    same(frames, expected)
+
+
+def records_of(messages):
+    frames = empty_fd_frames(len(messages))
+    for frame, message in zip(frames, messages, strict=True):
+        frame["t_host_ns"] = round(message.timestamp * 1e6) * 1000
         frame["id_flags"] = message.arbitration_id
         frame["id_flags"] |= EXTENDED_FLAG if message.is_extended_id else 0
         frame["len"], frame["dir"] = len(message.data), DIR_RX if message.is_rx else DIR_TX
         frame["fd_flags"] |= FD_BRS if message.bitrate_switch else 0
         frame["fd_flags"] |= FD_ESI if message.error_state_indicator else 0
         frame["data"][: len(message.data)] = list(message.data)
-    same(frames, expected)
+    return frames
+
+
+def test_an_mf4_of_python_can(tmp_path: Path):
+    pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
+    messages = some_messages()
+    with can.MF4Writer(tmp_path / "x.mf4") as writer:
+        for message in messages:
+            writer(message)
+    report, frames = imported(tmp_path / "x.mf4", tmp_path)
+    fd = [message for message in messages if message.is_fd]
+    assert report.frames == len(messages)
+    same(frames, records_of(fd), [name for name in FIELDS if name != "t_host_ns"])
+    truth_ns = [round(message.timestamp * 1e6) * 1000 for message in fd]
+    assert np.abs(frames["t_host_ns"].astype(np.int64) - truth_ns).max() <= 1000
+    with Session.open(tmp_path / "back.mcap") as session:
+        classic = session.frames("/can/can0")
+    others = [message for message in messages if not message.is_fd]
+    assert classic["dlc"].tolist() == [message.dlc for message in others]
+    assert [bytes(f["data"][: f["dlc"]]) for f in classic] == [bytes(m.data) for m in others]
 
 
 TRC = """;$FILEVERSION=2.1
