@@ -471,7 +471,7 @@ def test_what_is_no_log_is_refused_in_words(tmp_path: Path, content: bytes, comp
 def test_a_missing_file_and_a_folder_are_log_errors(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no such file"):
         Session.open(tmp_path / "none.mcap")
-    with pytest.raises(LogError, match="no session .* is in this folder"):
+    with pytest.raises(LogError, match=r"no session .* is in this folder"):
         Session.open(tmp_path)
 
 
