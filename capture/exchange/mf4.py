@@ -240,6 +240,8 @@ class _Reader:
         is_fd, frames["fd_flags"] = _fd_facts(group.kind, size, numbers)
         frames["len"] = size if dlc is None else np.where(is_fd, np.minimum(size, 64), dlc)
         if data is not None:
+            if data.dtype.kind != "u":  # a text would have been cut at its first zero
+                raise ValueError(f"{group.kind}.DataBytes are of type {data.dtype}, not bytes")
             cells = np.ascontiguousarray(data).view(np.uint8).reshape(count, -1)[:, :64]
             cells = cells * (_PLACES[: cells.shape[1]] < size[:, None])
             frames["data"][:, : cells.shape[1]] = cells

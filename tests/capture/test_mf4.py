@@ -3,6 +3,7 @@
 import gzip
 import math
 import random
+import struct
 import sys
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -301,3 +302,61 @@ def test_the_times_are_rounded_not_cut(tmp_path: Path):
     times = [math.nextafter(step / 1e9, 0) for step in steps]
     path = written(tmp_path / "log.mf4", data_group(times, [1] * 5, [b""] * 5))
     assert (read(path)[0]["t_host_ns"].astype(np.int64) - START_NS).tolist() == steps
+
+
+def test_a_file_that_its_logger_did_not_finish(tmp_path: Path):
+    """No counts, no lengths, as a logger leaves it that lost its power."""
+    times = np.arange(500) * 1e-3
+    frames = data_group(times, np.arange(500), [bytes([i % 256]) for i in range(500)])
+    path = written(tmp_path / "log.mf4", frames)
+    data = bytearray(path.read_bytes())
+    group_at, data_at = data.index(b"##CG"), data.index(b"##DT")
+    (links,) = struct.unpack_from("<Q", data, group_at + 16)
+    struct.pack_into("<Q", data, group_at + 24 + 8 * links + 8, 0)
+    struct.pack_into("<Q", data, data_at + 8, 24)
+    struct.pack_into("<H", data, 60, 0b101)
+    data[:8] = b"UnFinMF "
+    path.write_bytes(data)
+    found, _, log = read(path)
+    assert found["id_flags"].tolist() == list(range(500))
+    assert (found["t_host_ns"] - START_NS).tolist() == [1_000_000 * i for i in range(500)]
+    assert found["data"][:, 0].tolist() == [i % 256 for i in range(500)]
+    assert log.problems == []
+    assert path.read_bytes() == data
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_data_of_varying_length(text, tmp_path: Path):
+    """Data bytes in a list of their own, each as long as it is; as text they would lose zeros."""
+    lengths = np.arange(300) % 9
+    data = [bytes((i + k) % 256 for k in range(length)) for i, length in enumerate(lengths)]
+    columns = {
+        "": np.zeros(300, dtype="u1"),
+        ".ID": np.arange(300, dtype="<u4"),
+        ".DLC": lengths.astype("u1"),
+        ".DataLength": lengths.astype("u1"),
+        ".DataBytes": np.array(data, dtype="S8"),
+    }
+    signals = [
+        asammdf.Signal(
+            samples,
+            np.arange(300) * 1e-3,
+            name=f"CAN_DataFrame{name}",
+            encoding="latin-1" if samples.dtype.kind == "S" else None,
+        )
+        for name, samples in columns.items()
+    ]
+    path = written(tmp_path / "log.mf4", signals)
+    if not text:  # asammdf writes lists of texts alone; the type is the third byte of the channel
+        whole, at = bytearray(path.read_bytes()), 0
+        while (at := whole.find(b"##CN", at + 1)) > 0:
+            (links,) = struct.unpack_from("<Q", whole, at + 16)
+            if whole[at + 24 + 8 * links] == 1:
+                whole[at + 24 + 8 * links + 2] = 10
+        path.write_bytes(whole)
+        frames, *_ = read(path)
+        assert [bytes(row) for row in frames["data"]] == [each.ljust(8, b"\0") for each in data]
+        assert frames["dlc"].tolist() == lengths.tolist()
+    else:
+        with pytest.raises(ImportFormatError, match=r"DataBytes are of type .*, not bytes"):
+            read(path)
