@@ -7,22 +7,26 @@ the raw frames at any time. So a burst fills the queue of frames to decode and d
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from ..bus.decoded_topics import DecodedTopics, Message
 from ..bus.decoding import BusDecoder, FrameTally
-from ..log.frames import FrameArray
+from ..log.channels import FrameChannel
+from ..log.frames import (
+    FD_TOPIC_PREFIX,
+    FRAME_TOPIC_PREFIX,
+    FrameArray,
+    holds_fd,
+    in_one,
+)
 from ..log.writer import SessionWriter
 from ..robot import Robot
 from .source_clock import SourceClock
 
-FRAME_TOPIC_PREFIX = "/can/"
-"""Raw frames of source ``can0`` are on ``/can/can0``."""
-
 _FRAMES_PER_MESSAGE = 4096
-_FRAMES_PER_SLICE = 512
+_FRAMES_PER_SLICE = 1024
 
 
 class BusRecorder:
@@ -49,7 +53,9 @@ class BusRecorder:
         Raises:
             DataError: If the robot has no bus map.
         """
+        self._name, self._writer = name, writer
         self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
+        self._raw_fd: FrameChannel | None = None
         self._clock = clock
         self._decoder = BusDecoder(robot, directions=directions) if robot is not None else None
         self._topics = (
@@ -71,7 +77,8 @@ class BusRecorder:
         """Take frames; they are not written yet.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE` or, CAN FD frames, of
+                :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
         """
         self._fresh.append(frames)
 
@@ -87,12 +94,25 @@ class BusRecorder:
         if not self._fresh:
             return
         fresh, self._fresh = self._fresh, []
-        frames = fresh[0] if len(fresh) == 1 else np.concatenate(fresh)
-        for start in range(0, len(frames), _FRAMES_PER_MESSAGE):
-            batch = frames[start : start + _FRAMES_PER_MESSAGE]
+        fd = [frames for frames in fresh if holds_fd(frames)]
+        if not fd:
+            for batch in _batches(fresh):
+                self._raw.write(now_ns(), batch)
+                self._wait(batch)
+            return
+        if self._raw_fd is None:
+            self._raw_fd = self._writer.fd_frames(FD_TOPIC_PREFIX + self._name)
+        for batch in _batches([frames for frames in fresh if not holds_fd(frames)]):
             self._raw.write(now_ns(), batch)
-            self._waiting.append(batch)
-            self.backlog += len(batch)
+        for batch in _batches(fd):
+            self._raw_fd.write(now_ns(), batch)
+        # Sources hand out the kinds one after the other; on the bus they took turns.
+        both = in_one(fresh)
+        self._wait(both[np.lexsort((both["t_device_ns"], both["t_host_ns"]))])
+
+    def _wait(self, frames: FrameArray) -> None:
+        self._waiting.append(frames)
+        self.backlog += len(frames)
 
     def decode(self, now_ns: Callable[[], int], until_ns: int) -> None:
         """Decode what waits, slice by slice.
@@ -123,7 +143,7 @@ class BusRecorder:
             slices.append(batch)
             room -= len(batch)
         self.backlog -= _FRAMES_PER_SLICE - room
-        return np.concatenate(slices)
+        return in_one(slices)
 
     def decode_no_more(self) -> None:
         """Only keep the frames from here on; those that waited are safe already."""
@@ -150,3 +170,12 @@ class BusRecorder:
         messages.sort(key=lambda message: message.sampled_ns)
         for message in messages:
             message.write(now_ns())
+
+
+def _batches(fresh: list[FrameArray]) -> Iterator[FrameArray]:
+    """Frames of one kind, few enough for a message each."""
+    if not fresh:
+        return
+    frames = fresh[0] if len(fresh) == 1 else np.concatenate(fresh)
+    for start in range(0, len(frames), _FRAMES_PER_MESSAGE):
+        yield frames[start : start + _FRAMES_PER_MESSAGE]

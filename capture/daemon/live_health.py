@@ -36,6 +36,9 @@ PIECE = 1 << 17
 ROUND_NS = 1_000_000_000
 """How often all channels are looked at [ns]."""
 
+MEASURE_EVERY = 4
+"""Rounds between two looks at the same channel; what it has gathered meanwhile waits."""
+
 RECENT = 6
 """Rounds that a rate of the last seconds spans."""
 
@@ -75,6 +78,8 @@ class LiveHealth:
         self._topics: dict[int, _Topic] = {}
         self._frames: dict[str, deque[tuple[int, int]]] = {}
         self._measured: dict[int, ChannelMeasures] = {}
+        self._heard: set[int] = set()
+        self._rounds = 0
         self._pending: defaultdict[int, list[_Message]] = defaultdict(list)
         self._round: list[tuple[int, list[_Message]]] = []
         self._in_round = False
@@ -133,7 +138,10 @@ class LiveHealth:
             now_ns: The session's clock [Unix ns].
         """
         if self._round:
-            self._add(*self._round.pop())
+            key, messages = self._round.pop()
+            self._add(key, messages)
+            if key not in self._measured or key % MEASURE_EVERY == self._rounds % MEASURE_EVERY:
+                self._measured[key] = self._scan.measure(key)
         elif self._in_round:
             self._end_round(now_ns)
         elif now_ns >= self._due_ns:
@@ -151,6 +159,8 @@ class LiveHealth:
         self._begin_round()
         while self._round:
             self._add(*self._round.pop())
+        for key in self._heard:
+            self._measured[key] = self._scan.measure(key)
         self._end_round(now_ns)
 
     def _begin_round(self) -> None:
@@ -163,6 +173,7 @@ class LiveHealth:
 
     def _end_round(self, now_ns: int | None) -> None:
         self._in_round = False
+        self._rounds += 1
         latest = self._span[1] if self._span is not None else 0
         self._now_ns = max(self._now_ns, latest if now_ns is None else now_ns)
         for topic in self._topics.values():
@@ -180,7 +191,7 @@ class LiveHealth:
         heads["length"] = lengths + FIXED_SIZE
         heads["channel"], heads["sequence"], heads["log"] = key, sequence, log_ns
         self._scan.add(key, b"".join(payloads), np.cumsum(lengths) - lengths - BODY_AT, heads)
-        self._measured[key] = self._scan.measure(key)
+        self._heard.add(key)
         low, high = min(log_ns), max(log_ns)
         topic = self._topics[key]
         topic.count += len(messages)

@@ -232,6 +232,7 @@ class Recording:
         if self._snapshot is None:
             return
         self._notifier.status(plain_line(self._snapshot))
+        self._recorder.watched = self._feed.connected
         if self._show is not None:
             self._show(self._snapshot)
 

@@ -27,8 +27,11 @@ from .ticks import TickTally
 TICK_NS = 10_000_000
 """Sources are asked this often, and what they have is safe then [ns]."""
 
-DECODE_TICKS = 5
+DECODE_TICKS = 10
 """Frames are decoded every so many ticks, a backlog in every one."""
+
+WATCHED_TICKS = 4
+"""The same while somebody watches."""
 
 _PRESSED = 1000
 """After so many frames in a tick the next one follows at once, and decoding waits: the kernel's
@@ -65,6 +68,7 @@ class Recorder:
         ticks: How long the ticks took.
         overruns: Ticks that were left out because the one before took too long.
         ending: Set to end the recording, from within one of the ``each_tick`` or ``each_second``.
+        watched: Whether somebody looks at what is decoded as it comes.
     """
 
     def __init__(
@@ -94,6 +98,7 @@ class Recorder:
         self.ticks = TickTally()
         self.overruns = 0
         self.ending: Ending | None = None
+        self.watched = False
         self.clocks: dict[str, SourceClock] = {source.name: SourceClock() for source in sources}
         self.buses: dict[str, BusRecorder] = {}
         self._writer, self._clock, self._context = writer, clock, context
@@ -205,7 +210,8 @@ class Recorder:
             bus.write_raw(self._clock.now_ns)
         waits = self.backlog
         pressed = self._came >= _PRESSED and waits < _MOST_WAITING
-        if not pressed and (tick % DECODE_TICKS == 1 or waits > _BACKLOG):
+        every = WATCHED_TICKS if self.watched else DECODE_TICKS
+        if not pressed and (tick % every == 1 or waits > _BACKLOG):
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
                 self._decode(name, bus, until_ns)
@@ -219,10 +225,11 @@ class Recorder:
         self._came = 0
         for source in self._sources:
             polled = self._asked(source)
-            self._came += sum(map(len, polled.frames))
+            arrays = (*polled.frames, *polled.fd_frames)
+            self._came += sum(map(len, arrays))
             for event in polled.events:
                 self.say(event.level, source.name, event.text, event.t_ns)
-            for frames in polled.frames:
+            for frames in arrays:
                 bus = self.buses.get(source.name)
                 if bus is None:
                     bus = self.buses[source.name] = self._open_bus(source)
