@@ -162,6 +162,20 @@ def widened(frames: FrameArray) -> FrameArray:
     return wide
 
 
+def in_one(arrays: Sequence[FrameArray]) -> FrameArray:
+    """One array of frames of one or both kinds.
+
+    Args:
+        arrays: Records of :data:`FRAME_DTYPE` or :data:`FD_FRAME_DTYPE`, at least one array.
+
+    Returns:
+        A copy; records of :data:`FD_FRAME_DTYPE` where any array has them.
+    """
+    if any(holds_fd(frames) for frames in arrays):
+        arrays = [widened(frames) for frames in arrays]
+    return np.concatenate(arrays)
+
+
 def frames_from_bytes(data: bytes | memoryview[Any]) -> FrameArray:
     """Read records from a message's payload.
 

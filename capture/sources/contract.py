@@ -66,10 +66,12 @@ class Polled:
             came. ``t_host_ns`` is the arrival on the session's clock, ``t_device_ns`` the device's
             own time, on the device's own clock, or equal to ``t_host_ns`` where it gives none.
         events: What happened.
+        fd_frames: The same of CAN FD frames: records of :data:`capture.log.frames.FD_FRAME_DTYPE`.
     """
 
     frames: tuple[FrameArray, ...] = ()
     events: tuple[SourceEvent, ...] = ()
+    fd_frames: tuple[FrameArray, ...] = ()
 
 
 @dataclass

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from ..errors import SourceError
-from ..log.frames import FrameArray
+from ..log.frames import FrameArray, holds_fd
 from ..robot import ClockDomain, Robot
 from .backoff import Backoff
 from .bus_watch import BusWatch
@@ -225,7 +225,9 @@ class LinkedSource:
         for array in frames:
             self._tally.counts.frames += len(array)
             self._watch.look(array, self._tally)
-        return Polled(frames, self._tally.events.take())
+        classic = tuple(array for array in frames if not holds_fd(array))
+        fd_frames = tuple(array for array in frames if holds_fd(array))
+        return Polled(classic, self._tally.events.take(), fd_frames)
 
     def stop(self) -> None:
         """End and release everything."""

@@ -22,8 +22,11 @@ from ..log.frames import (
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
     REMOTE_FLAG,
     FrameArray,
+    empty_fd_frames,
     empty_frames,
 )
 from ..robot import ClockDomain
@@ -103,10 +106,12 @@ class PythonCanLink:
         if not count:
             return ()
         held = [self._held.popleft() for _ in range(count)]
-        classic = [(t_ns, message) for t_ns, message in held if len(message.data) <= 8]
-        if len(classic) < count:
-            self._tally.events.say("warn", "CAN FD frame left out", count - len(classic))
-        return (frames_of(classic, device_time=self._device_time),)
+        classic = [pair for pair in held if not _is_fd(pair[1])]
+        fd = [pair for pair in held if _is_fd(pair[1])] if len(classic) < count else []
+        return (
+            frames_of(classic, device_time=self._device_time),
+            fd_frames_of(fd, device_time=self._device_time),
+        )
 
     def close(self) -> None:
         """End the thread, which closes the bus."""
@@ -134,8 +139,13 @@ class PythonCanLink:
         self._error = found  # last, so that nobody who sees it has to wait for the driver
 
 
+def _is_fd(message: can.Message) -> bool:
+    """Whether it is a CAN FD frame, also from a driver that doesn't say so."""
+    return (message.is_fd or len(message.data) > 8) and not message.is_error_frame
+
+
 def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:
-    """Turn python-can's messages into frames.
+    """Turn python-can's messages of classic frames into frames.
 
     Args:
         messages: Arrival [Unix ns] and message, of at most 8 bytes.
@@ -145,6 +155,35 @@ def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool)
         The frames.
     """
     frames = empty_frames(len(messages))
+    _fill(frames, messages, device_time=device_time)
+    frames["dlc"] = [m.dlc for _, m in messages]
+    return frames
+
+
+def fd_frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:
+    """Turn python-can's messages of CAN FD frames into frames.
+
+    Args:
+        messages: Arrival [Unix ns] and message, of at most 64 bytes.
+        device_time: Whether to take the messages' times, to the microsecond, as the device's.
+
+    Returns:
+        The CAN FD frames.
+    """
+    frames = empty_fd_frames(len(messages))
+    _fill(frames, messages, device_time=device_time)
+    frames["len"] = [len(m.data) for _, m in messages]
+    frames["fd_flags"] = [
+        (FD_BRS if m.bitrate_switch else 0) | (FD_ESI if m.error_state_indicator else 0)
+        for _, m in messages
+    ]
+    return frames
+
+
+def _fill(
+    frames: FrameArray, messages: Sequence[tuple[int, can.Message]], *, device_time: bool
+) -> None:
+    """What both kinds have."""
     host = np.array([t_ns for t_ns, _ in messages], dtype=np.uint64)
     frames["t_host_ns"] = host
     frames["t_device_ns"] = host
@@ -159,11 +198,10 @@ def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool)
         | (ERROR_FLAG if m.is_error_frame else 0)
         for _, m in messages
     ]
-    frames["dlc"] = [m.dlc for _, m in messages]
     frames["dir"] = [DIR_RX if m.is_rx else DIR_TX for _, m in messages]
-    data = b"".join(bytes(m.data).ljust(8, b"\0") for _, m in messages)
-    frames["data"] = np.frombuffer(data, dtype=np.uint8).reshape(-1, 8)
-    return frames
+    cells = frames["data"]
+    data = b"".join(bytes(m.data).ljust(cells.shape[1], b"\0") for _, m in messages)
+    frames["data"] = np.frombuffer(data, dtype=np.uint8).reshape(cells.shape)
 
 
 def failure(error: Exception) -> OSError:

@@ -141,7 +141,7 @@ class SlcanLink:
             self._error = error  # first hand out what came before
         if not chunks:
             return ()
-        return (self._text.feed(b"".join(chunks), now_ns, self._tally),)
+        return self._text.feed(b"".join(chunks), now_ns, self._tally)
 
     def fileno(self) -> int:
         """The device."""

@@ -3,7 +3,9 @@
 A frame is a line ended by a carriage return: ``t`` (11-bit identifier, three digits) or ``T``
 (29-bit, eight), a length digit, two digits for each data byte, and, if the adapter stamps its
 frames, four digits of milliseconds that start again after a minute. ``r`` and ``R`` are remote
-requests. A bell character is the adapter's way to say that something went wrong.
+requests; ``d`` and ``D`` CAN FD frames, ``b`` and ``B`` such whose data have the second bit rate,
+all four with a length code up to ``F``. A bell character is the adapter's way to say that something
+went wrong.
 
 One expression finds all frames of a chunk; a chunk with anything else in it is read line by line.
 """
@@ -12,18 +14,21 @@ from __future__ import annotations
 
 import re
 
-from ..log.frames import EXTENDED_FLAG, REMOTE_FLAG, FrameArray
+from ..log.frames import EXTENDED_FLAG, FD_BRS, FRAME_DTYPE, REMOTE_FLAG, FrameArray
 from .events import Tally
-from .records import pack_record, records
+from .records import fd_records, pack_fd_record, pack_record, records
 
 STAMP_PERIOD_MS = 60_000
 """An adapter's time stamps start again after so many milliseconds."""
 
-_FRAME = r"([tr][0-9A-Fa-f]{3}|[TRx][0-9A-Fa-f]{8})([0-8])([0-9A-Fa-f]*)"  # x: CANDapter's T
+_FRAME = (  # x: CANDapter's T
+    r"([tr][0-9A-Fa-f]{3}(?=[0-8])|[TRx][0-9A-Fa-f]{8}(?=[0-8])"
+    r"|[db][0-9A-Fa-f]{3}|[DB][0-9A-Fa-f]{8})([0-9A-Fa-f])([0-9A-Fa-f]*)"
+)
 _FRAMES = re.compile(rf"(?<![^\r]){_FRAME}\r")
 _ONE = re.compile(_FRAME)
 _END = re.compile(r"[\r\a]")
-_FD = re.compile(r"(?:[db][0-9A-Fa-f]{3}|[DB][0-9A-Fa-f]{8})[0-9A-Fa-f]+")
+_FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _ANSWERS = "zZVvNF"  # acknowledged, version, serial number, status
 _LONGEST = 200  # a CAN FD frame with 64 bytes has 142
 _HIGHEST_STANDARD = 0x7FF
@@ -44,7 +49,7 @@ class SlcanText:
         self._stamps = StampClock() if stamps else None
         self._rest = b""
 
-    def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> FrameArray:
+    def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> tuple[FrameArray, FrameArray]:
         """Take what was read.
 
         Args:
@@ -53,7 +58,7 @@ class SlcanText:
             tally: Where to count what is malformed.
 
         Returns:
-            The frames whose lines have ended.
+            The frames whose lines have ended, classic ones and CAN FD ones.
         """
         whole = self._rest + chunk
         end = max(whole.rfind(b"\r"), whole.rfind(b"\a")) + 1
@@ -66,15 +71,20 @@ class SlcanText:
             found = _line_by_line(text, tally)
         packed = [record for fields in found if (record := self._record(*fields, t_ns))]
         tally.malformed("malformed line", len(found) - len(packed))
-        return records(packed)
+        size = FRAME_DTYPE.itemsize
+        fd = [record for record in packed if len(record) != size]
+        if fd:
+            packed = [record for record in packed if len(record) == size]
+        return records(packed), fd_records(fd)
 
     def _record(self, head: str, digit: str, rest: str, t_ns: int) -> bytes | None:
         """A frame's record; None if its line is malformed."""
         kind = head[0]
         flags = int(head[1:], 16)
-        length = int(digit)
+        fd = kind in "dDbB"
+        length = _FD_LENGTHS[int(digit, 16)]
         digits = 2 * length
-        if kind in "TRx":
+        if kind in "TRxDB":
             if flags > _HIGHEST_EXTENDED:
                 return None
             flags |= EXTENDED_FLAG
@@ -91,7 +101,11 @@ class SlcanText:
             device_ns = self._stamps.time_ns(rest[digits:], t_ns)
             if device_ns is None:
                 return None
-        return pack_record(device_ns, t_ns, flags, length, 0, bytes.fromhex(rest[:digits]))
+        data = bytes.fromhex(rest[:digits])
+        if fd:
+            brs = FD_BRS if kind in "bB" else 0
+            return pack_fd_record(device_ns, t_ns, flags, length, 0, brs, data)
+        return pack_record(device_ns, t_ns, flags, length, 0, data)
 
 
 class StampClock:
@@ -131,16 +145,12 @@ def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
     """The fields of the frames in a chunk that has other things in it too."""
     tally.malformed("the adapter reports an error (bell)", text.count("\a"))
     found: list[tuple[str, str, str]] = []
-    fd = malformed = 0
+    malformed = 0
     for line in _END.split(text):
         frame = _ONE.fullmatch(line)
         if frame is not None:
             found.append((frame[1], frame[2], frame[3]))
-        elif _FD.fullmatch(line):
-            fd += 1
         elif line and line[0] not in _ANSWERS:
             malformed += 1
     tally.malformed("malformed line", malformed)
-    if fd:
-        tally.events.say("warn", "CAN FD frame left out", fd)
     return found

@@ -14,9 +14,10 @@ import struct
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import SourceError
-from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
+from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
 from ..robot import ClockDomain
 from .contract import SourceAddress
 from .drained_link import DrainedLink
@@ -39,6 +40,9 @@ CANFD_MTU = 72
 
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's name for it is missing in its type hints
 _CAN_FRAME = np.dtype([("id", "=u4"), ("len", "u1"), ("pad", "V3"), ("data", "u1", (8,))])
+_CANFD_FRAME = np.dtype(
+    [("id", "=u4"), ("len", "u1"), ("flags", "u1"), ("pad", "V2"), ("data", "u1", (64,))]
+)
 _BUFFER_BYTES = 8 << 20
 _PACKETS = 256
 _MOST_BATCHES = 64
@@ -58,13 +62,42 @@ def frames_of(batch: Batch, times_ns: Sequence[int]) -> FrameArray:
     rows = [row for row, size in enumerate(batch.sizes) if size == CAN_MTU]
     raw = batch.packets[rows, :CAN_MTU].view(_CAN_FRAME)[:, 0]
     frames = empty_frames(len(rows))
+    frames["dlc"] = raw["len"]
+    _fill(frames, raw, batch, times_ns, rows)
+    return frames
+
+
+def fd_frames_of(batch: Batch, times_ns: Sequence[int]) -> FrameArray:
+    """Turn the kernel's CAN FD frames into ours.
+
+    Args:
+        batch: Packets of a raw CAN socket; those that aren't CAN FD frames are left out.
+        times_ns: Their arrival [Unix ns].
+
+    Returns:
+        The CAN FD frames; device and host time are both the arrival.
+    """
+    rows = [row for row, size in enumerate(batch.sizes) if size == CANFD_MTU]
+    raw = batch.packets[rows, :CANFD_MTU].view(_CANFD_FRAME)[:, 0]
+    frames = empty_fd_frames(len(rows))
+    frames["len"], frames["fd_flags"] = raw["len"], raw["flags"]
+    _fill(frames, raw, batch, times_ns, rows)
+    return frames
+
+
+def _fill(
+    frames: FrameArray,
+    raw: NDArray[np.void],
+    batch: Batch,
+    times_ns: Sequence[int],
+    rows: Sequence[int],
+) -> None:
+    """What both kinds have."""
     frames["t_device_ns"] = frames["t_host_ns"] = [times_ns[row] for row in rows]
     frames["id_flags"] = raw["id"]
-    frames["dlc"] = raw["len"]
     local = socket.MSG_DONTROUTE
     frames["dir"] = [DIR_TX if batch.flags[row] & local else DIR_RX for row in rows]
     frames["data"] = raw["data"]
-    return frames
 
 
 class SocketcanLink:
@@ -113,6 +146,8 @@ class SocketcanLink:
                 times = self._clock.times(batch.stamps_ns, self._floor_ns)
                 self._floor_ns = times[-1]
                 found.append(frames_of(batch, times))
+                if CANFD_MTU in batch.sizes:
+                    found.append(fd_frames_of(batch, times))
                 self._count(batch)
             else:
                 self._floor_ns = looked_ns
@@ -131,10 +166,8 @@ class SocketcanLink:
         self._socket.close()
 
     def _count(self, batch: Batch) -> None:
-        fd = batch.sizes.count(CANFD_MTU)
-        if fd:
-            self._tally.events.say("warn", "CAN FD frame left out", fd)
-        odd = len(batch.sizes) - fd - batch.sizes.count(CAN_MTU)
+        whole = batch.sizes.count(CAN_MTU) + batch.sizes.count(CANFD_MTU)
+        odd = len(batch.sizes) - whole
         self._tally.malformed("packet that is no CAN frame", odd)
         if batch.drops is not None and batch.drops != self._drops:
             lost = (batch.drops - self._drops) % 2**32

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from capture import SessionWriter
-from capture.log.frames import EXTENDED_FLAG, REMOTE_FLAG, FrameArray, empty_frames
+from capture.log.frames import (
+    EXTENDED_FLAG,
+    FD_BRS,
+    REMOTE_FLAG,
+    FrameArray,
+    empty_fd_frames,
+    empty_frames,
+)
 from capture.sources.contract import Source, SourceContext, SourceEvent
 
 PATIENCE_S = 90.0
@@ -22,10 +29,12 @@ class Heard:
     source: Source
     arrays: list[FrameArray] = field(default_factory=list)
     events: list[SourceEvent] = field(default_factory=list)
+    fd_arrays: list[FrameArray] = field(default_factory=list)
 
     def poll(self) -> None:
         polled = self.source.poll()
         self.arrays += polled.frames
+        self.fd_arrays += polled.fd_frames
         self.events += polled.events
 
     def until(self, condition: Callable[[], bool]) -> None:
@@ -48,6 +57,10 @@ class Heard:
     @property
     def frames(self) -> FrameArray:
         return np.concatenate([empty_frames(0), *self.arrays])
+
+    @property
+    def fd_frames(self) -> FrameArray:
+        return np.concatenate([empty_fd_frames(0), *self.fd_arrays])
 
     @property
     def texts(self) -> list[str]:
@@ -107,12 +120,38 @@ def traffic() -> Callable[[int], FrameArray]:
 
 
 @pytest.fixture
+def fd_traffic() -> Callable[[int], FrameArray]:
+    """Random CAN FD frames of both identifier widths, all lengths, and some with the fast rate."""
+
+    def make(count: int) -> FrameArray:
+        rng = np.random.default_rng(count)
+        frames = empty_fd_frames(count)
+        frames["id_flags"] = np.where(
+            rng.random(count) < 0.3,
+            rng.integers(0, 2**29, count) | EXTENDED_FLAG,
+            rng.integers(0, 2**11, count),
+        )
+        frames["fd_flags"] = np.where(rng.random(count) < 0.5, FD_BRS, 0)
+        lengths = [*range(9), 12, 16, 20, 24, 32, 48, 64]
+        frames["len"] = np.array(lengths)[rng.integers(0, 16, count)]
+        data = rng.integers(0, 256, (count, 64))
+        data[np.arange(64) >= frames["len"][:, None]] = 0
+        frames["data"] = data
+        return frames
+
+    return make
+
+
+@pytest.fixture
 def same() -> Callable[[FrameArray, FrameArray], bool]:
     """Whether two lots of frames agree in everything but times."""
 
     def compare(found: FrameArray, truth: FrameArray) -> bool:
+        names = ("id_flags", "len", "fd_flags", "data")
+        if truth.dtype == empty_frames(0).dtype:
+            names = ("id_flags", "dlc", "data")
         return len(found) == len(truth) and all(
-            np.array_equal(found[name], truth[name]) for name in ("id_flags", "dlc", "data")
+            np.array_equal(found[name], truth[name]) for name in names
         )
 
     return compare

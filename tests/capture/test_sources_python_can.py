@@ -5,12 +5,20 @@ import numpy as np
 import pytest
 
 from capture.errors import SourceError, UsageError
-from capture.log.frames import DIR_RX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
+from capture.log.frames import (
+    DIR_RX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    ID_MASK,
+    REMOTE_FLAG,
+)
 from capture.robot import ClockDomain
 from capture.sources.address import parse_address
 from capture.sources.can_interfaces import DEVICE_TIME, LISTEN_ONLY, NO_CONTROLLER, known_options
 from capture.sources.can_source import open_can
-from capture.sources.python_can import bus_class, failure, frames_of
+from capture.sources.python_can import bus_class, failure, fd_frames_of, frames_of
 from capture.sources.registry import open_source
 
 
@@ -75,19 +83,50 @@ def test_a_driver_without_times_gets_those_of_arrival() -> None:
     assert frames["t_device_ns"].tolist() == [123, 1_500_000_000]
 
 
-def test_error_frames_and_can_fd_frames(bus, listen) -> None:
+def test_error_frames(bus, listen) -> None:
     heard = listen(source_at())
     heard.until_event("connected")
     bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=[0] * 8))
-    bus.send(can.Message(arbitration_id=1, is_fd=True, data=[1] * 64))
     bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=[7]))
     found = heard.until_frames(2)
     assert found["id_flags"].tolist() == [ERROR_FLAG | 0x40, 0x123]
     assert heard.source.counts.error_frames == 1
     assert heard.source.counts.malformed == 0
-    heard.until_event("CAN FD frame left out")
     heard.until_event("bus-off")
     heard.until_event("back on the bus")
+
+
+def test_can_fd_frames(bus, listen, traffic, fd_traffic, same) -> None:
+    truth, fd_truth = traffic(500), fd_traffic(500)
+    fd_truth["fd_flags"][::3] |= FD_ESI
+    heard = listen(source_at())
+    heard.until_event("connected")
+    for frame, fd_frame in zip(truth, fd_truth, strict=True):
+        bus.send(message_of(frame))
+        bus.send(
+            can.Message(
+                arbitration_id=int(fd_frame["id_flags"]) & ID_MASK,
+                is_extended_id=bool(fd_frame["id_flags"] & EXTENDED_FLAG),
+                is_fd=True,
+                bitrate_switch=bool(fd_frame["fd_flags"] & FD_BRS),
+                error_state_indicator=bool(fd_frame["fd_flags"] & FD_ESI),
+                data=fd_frame["data"][: fd_frame["len"]].tolist(),
+                check=True,
+            )
+        )
+    assert same(heard.until_frames(500), truth)
+    heard.until(lambda: len(heard.fd_frames) >= 500)
+    assert same(heard.fd_frames, fd_truth)
+    assert heard.source.counts.frames == 1000
+
+
+def test_a_driver_that_does_not_say_can_fd(same) -> None:
+    """Eight bytes fit a classic frame, more don't, whatever the driver calls it."""
+    link_frames = fd_frames_of([(7, can.Message(data=range(12)))], device_time=False)
+    assert (link_frames["len"][0], link_frames["data"][0].tolist()) == (
+        12,
+        [*range(12), *[0] * 52],
+    )
 
 
 def test_a_bus_that_fails_is_opened_again(listen, context) -> None:

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from can.util import len2dlc
 
 from capture.errors import SourceError, UsageError
-from capture.log.frames import EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, empty_frames
+from capture.log.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG, empty_frames
 from capture.robot import ClockDomain
 from capture.sources.address import parse_address
 from capture.sources.events import Tally
@@ -160,19 +161,19 @@ def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
         )
         for s in true_s + 0.0
     ]
-    assert [int(f["t_device_ns"][0]) for f in found] == [round(s * 1000) * 10**6 for s in true_s]
+    assert [int(f["t_device_ns"][0]) for f, _ in found] == [round(s * 1000) * 10**6 for s in true_s]
 
 
 def test_an_adapter_that_was_asked_for_stamps_and_gives_none(traffic, same) -> None:
     truth = traffic(50)
-    frames = SlcanText(stamps=True).feed(lines(truth), 77, Tally(lambda: 0))
+    frames, _ = SlcanText(stamps=True).feed(lines(truth), 77, Tally(lambda: 0))
     assert same(frames, truth)
     assert set(frames["t_device_ns"].tolist()) == {77}
 
 
 def test_stamps_that_nobody_asked_for_are_not_data(traffic, same) -> None:
     truth = traffic(50)
-    frames = SlcanText(stamps=False).feed(lines(truth, np.arange(50)), 77, Tally(lambda: 0))
+    frames, _ = SlcanText(stamps=False).feed(lines(truth, np.arange(50)), 77, Tally(lambda: 0))
     assert same(frames, truth)
     assert set(frames["t_device_ns"].tolist()) == {77}
 
@@ -225,24 +226,58 @@ def test_noise_costs_its_own_line_only(plug, tmp_path, listen, traffic, same) ->
 def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
     truth = traffic(300)
     stream = lines(truth) + b"\xff\r" + lines(truth)
-    whole = SlcanText(stamps=False).feed(stream, 5, Tally(lambda: 0))
+    whole, _ = SlcanText(stamps=False).feed(stream, 5, Tally(lambda: 0))
     for seed in range(20):
         rng = np.random.default_rng(seed)
         cuts = np.sort(rng.integers(0, len(stream), rng.integers(1, 400)))
         text, tally = SlcanText(stamps=False), Tally(lambda: 0)
         borders = [0, *cuts.tolist(), len(stream)]
-        parts = [text.feed(stream[a:b], 5, tally) for a, b in itertools.pairwise(borders)]
+        parts = [text.feed(stream[a:b], 5, tally)[0] for a, b in itertools.pairwise(borders)]
         assert np.concatenate(parts).tobytes() == whole.tobytes()
         assert tally.counts.malformed == 1
 
 
-def test_can_fd_frames_are_left_out_and_told(traffic, same) -> None:
-    truth = traffic(3)
+def fd_lines(frames) -> list[bytes]:
+    """CAN FD frames as the protocol's extension has them."""
+    out = []
+    for frame in frames:
+        flags = int(frame["id_flags"])
+        extended = bool(flags & EXTENDED_FLAG)
+        letter = "dDbB"[extended + 2 * bool(frame["fd_flags"] & FD_BRS)]
+        identifier = f"{flags & ID_MASK:0{8 if extended else 3}X}"
+        length = int(frame["len"])
+        data = bytes(frame["data"][:length]).hex().upper()
+        out.append(f"{letter}{identifier}{len2dlc(length):X}{data}\r".encode())
+    return out
+
+
+@pytest.fixture
+def both(traffic, fd_traffic):
+    return traffic(2000), fd_traffic(2000)
+
+
+def test_can_fd_frames_among_the_others(plug, tmp_path, listen, both, same) -> None:
+    truth, fd_truth = both
+    classic = [line + b"\r" for line in lines(truth).split(b"\r")[:-1]]
+    adapter = plug()
+    heard = listen(source_at(tmp_path))
+    mixed = itertools.chain.from_iterable(zip(classic, fd_lines(fd_truth), strict=True))
+    adapter.send(b"".join(mixed) + b"d1238" + b"00" * 9 + b"\r" + b"DFFFFFFFF0\r" + b"d12\r")
+    assert same(heard.until_frames(2000), truth)
+    heard.until(lambda: len(heard.fd_frames) >= 2000 and heard.source.counts.malformed == 3)
+    assert same(heard.fd_frames, fd_truth)
+    assert heard.source.counts.frames == 4000
+
+
+def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same) -> None:
+    truth = fd_traffic(100)
+    stream = b"".join(line[:-1] + b"%04X\r" % (10 * k) for k, line in enumerate(fd_lines(truth)))
     tally = Tally(lambda: 0)
-    stream = lines(truth) + b"d123C" + b"00" * 24 + b"\rB123456789" + b"11" * 12 + b"\r"
-    assert same(SlcanText(stamps=False).feed(stream, 5, tally), truth)
-    assert [event.text for event in tally.events.take()] == ["CAN FD frame left out (2 times)"]
-    assert tally.counts.malformed == 0
+    classic, frames = SlcanText(stamps=True).feed(stream, 10**18, tally)
+    assert (len(classic), tally.counts.malformed) == (0, 0)
+    assert same(frames, truth)
+    assert frames["t_device_ns"].tolist() == [10_000_000 * k for k in range(100)]
+    assert set(frames["t_host_ns"].tolist()) == {10**18}
 
 
 def test_unplugged_and_plugged_in_again(plug, tmp_path, listen, traffic, same) -> None:

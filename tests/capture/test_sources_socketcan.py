@@ -14,7 +14,16 @@ import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
 from capture.errors import SourceError
-from capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
+from capture.log.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    ID_MASK,
+    REMOTE_FLAG,
+)
 from capture.robot import ClockDomain
 from capture.sources.address import parse_address
 from capture.sources.events import Tally
@@ -109,20 +118,39 @@ def test_arrival_is_the_kernels(pair, traffic) -> None:
     link.close()
 
 
-def test_can_fd_frames_and_what_is_no_frame(pair, traffic, same) -> None:
+def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same) -> None:
     ours, theirs = pair
-    truth = traffic(2)
+    truth, fd_truth = traffic(2), fd_traffic(40)
+    fd_truth["fd_flags"][::3] |= FD_ESI
     tally = Tally(time.time_ns)
     link = SocketcanLink(ours, tally)
     theirs.send(packed(truth[0]))
-    theirs.send(build_can_frame(can.Message(is_fd=True, data=[1] * 24)))
+    for frame in fd_truth:
+        theirs.send(
+            build_can_frame(
+                can.Message(
+                    is_fd=True,
+                    arbitration_id=int(frame["id_flags"]) & ID_MASK,
+                    is_extended_id=bool(frame["id_flags"] & EXTENDED_FLAG),
+                    bitrate_switch=bool(frame["fd_flags"] & FD_BRS),
+                    error_state_indicator=bool(frame["fd_flags"] & FD_ESI),
+                    data=frame["data"][: frame["len"]].tolist(),
+                )
+            )
+        )
     for odd in (b"", b"x" * 15, b"x" * 200):
         theirs.send(odd)
     theirs.send(packed(truth[1]))
-    (frames,) = link.read(0)
+    frames, fd_frames = link.read(0)
     assert same(frames, truth)
+    fd_frames["fd_flags"] &= FD_BRS | FD_ESI  # a third one says that it is CAN FD
+    assert same(fd_frames, fd_truth)
     assert tally.counts.malformed == 3
-    assert "CAN FD frame left out" in [event.text for event in tally.events.flush()]
+    assert tally.events.flush()[0].text.startswith("packet that is no CAN frame")
+    times = np.concatenate([frames["t_host_ns"], fd_frames["t_host_ns"]])
+    assert abs(time.time_ns() - int(times.min())) < 60_000_000_000
+    assert frames["t_host_ns"][0] <= fd_frames["t_host_ns"].min()
+    assert fd_frames["t_host_ns"].max() <= frames["t_host_ns"][1]
     link.close()
 
 
