@@ -205,7 +205,9 @@ class SessionScan:
             The measures and what they mean.
         """
         taken = measured or {}
-        found = [(key, scan) for key, scan in self._scans.items() if self.count(key)]
+        found = [
+            (key, scan) for key, scan in self._scans.items() if key in taken or self.count(key)
+        ]
         found.sort(key=lambda item: item[1].topic)
         every = [taken.get(key) or self.measure(key) for key, _ in found]
         channels = tuple(each.channel for each in every)
