@@ -1,9 +1,12 @@
 """CAN FD frames: kept exactly, on a topic of their own, from and to other tools."""
 
 import json
+import threading
+import time
 from pathlib import Path
 
 import can
+import cantools
 import numpy as np
 import pytest
 from can.util import CAN_FD_DLC
@@ -14,10 +17,13 @@ from mcap_ros2.decoder import DecoderFactory
 
 import undulog
 from capture import Session, SessionWriter, load_robot
+from capture.daemon.clock import SessionClock
+from capture.daemon.recorder import Ending, Recorder
 from capture.errors import DataError
 from capture.exchange.can_import import import_can
 from capture.exchange.can_logs import RELATIVE_EPOCH_NS
 from capture.exchange.log_export import export_log
+from capture.interruption import StopRequest
 from capture.log.frames import (
     DIR_RX,
     DIR_TX,
@@ -31,6 +37,9 @@ from capture.log.frames import (
 )
 from capture.log.session_check import check_session
 from capture.robot.description import parse_robot
+from capture.sources.address import parse_address
+from capture.sources.contract import SourceContext
+from capture.sources.registry import open_source
 
 S = 1_000_000_000
 T0 = 1_700_000_003_250_000_000
@@ -431,8 +440,6 @@ signals = [
 
 
 def test_import_decodes_both_kinds(tmp_path: Path):
-    import cantools
-
     database = cantools.database.load_string(BIG, "dbc")
     lines, angles, targets = [], [], []
     for i in range(200):
@@ -466,3 +473,76 @@ def test_a_frame_too_short_for_its_signal_is_told(tmp_path: Path):
     assert report.problems == [
         "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
     ]
+
+
+# -- recording -----------------------------------------------------------------------------
+
+
+def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
+    database = cantools.database.load_string(BIG, "dbc")
+    robot = parse_robot(ROBOT, "big.toml", {"big.dbc": BIG})
+    output, clock, count = tmp_path / "run.mcap", SessionClock(), 300
+    bus = can.Bus(interface="virtual", channel="fd", ignore_config=True, preserve_timestamps=True)
+    messages = []
+    for i in range(count):
+        angle = {"angle": i * 0.5, "torque": i * 0.01}
+        messages += [
+            can.Message(
+                timestamp=1000 + 0.01 * i,
+                arbitration_id=257,
+                is_extended_id=False,
+                is_rx=False,
+                data=database.encode_message("small", {"target": -i * 0.25}),
+            ),
+            can.Message(
+                timestamp=1000.004 + 0.01 * i,
+                arbitration_id=256,
+                is_extended_id=False,
+                is_fd=True,
+                bitrate_switch=True,
+                data=database.encode_message("big", angle),
+            ),
+        ]
+
+    def send():
+        for message in messages:
+            bus.send(message)
+            time.sleep(0.0005)
+
+    source = open_source(parse_address("front=can:virtual:fd?device_time=1&preserve_timestamps=1"))
+    with SessionWriter(output, session_id="s", epoch_ns=clock.epoch_ns, robot=robot) as writer:
+        recorder = Recorder(
+            writer=writer,
+            clock=clock,
+            sources=[source],
+            context=SourceContext(clock.now_ns, writer),
+            robot=robot,
+            decoded="front",
+            each_tick=[
+                lambda: setattr(
+                    recorder,
+                    "ending",
+                    Ending("all came") if source.counts.frames >= 2 * count else None,
+                )
+            ],
+        )
+        sender = threading.Thread(target=send)
+        recorder.on_event(lambda *said: "connected" in said[3] and sender.start())
+        recorder.run(StopRequest(), 60.0)
+        sender.join()
+    bus.shutdown()
+    assert source.counts.frames == 2 * count
+    with Session.open(output) as session:
+        classic, frames = session.frames("/can/front"), session.fd_frames("/can_fd/front")
+        state = session.joints("/joint_states").signal("joint01")
+        command = session.joints("/joint_commands").signal("joint01")
+        clock_facts = session.metadata.get("undulog.clock", {})
+    assert len(classic) == count
+    truth = records_of([message for message in messages if message.is_fd])
+    same(frames, truth, ("id_flags", "len", "dir", "fd_flags", "data"))
+    assert frames["t_device_ns"].tolist() == truth["t_host_ns"].tolist()
+    assert np.degrees(state.values) == pytest.approx(np.arange(count) * 0.5, abs=1e-9)
+    assert np.degrees(command.values) == pytest.approx(np.arange(count) * -0.25, abs=1e-9)
+    # One clock for both kinds: it was never taken for one that was set.
+    assert clock_facts.get("front.resets", "0") == "0"
+    assert recorder.clocks["front"].result().resets == 0
