@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mcap.records import Attachment, Channel, Metadata, Schema
 
+from ..log.frames import FRAME_TOPIC_PREFIXES
 from ..log.sink import Description
 from .live_wire import LiveMessage, pack_description, pack_message
 
@@ -20,8 +21,6 @@ _STREAMS = {
 
 _STATES = {"std_msgs/msg/String"}
 """Types whose last message holds until the next: told to a relay that comes later."""
-
-_RAW = "/can/"
 
 Queued = tuple[int, int, int, int, int, bytes]
 """The fields of a :class:`capture.daemon.live_wire.LiveMessage`."""
@@ -71,7 +70,7 @@ class LiveWords:
         if isinstance(record, Schema):
             self._schemas[record.id] = record.name
         elif isinstance(record, Channel) and (
-            self._raw_frames or not record.topic.startswith(_RAW)
+            self._raw_frames or not record.topic.startswith(FRAME_TOPIC_PREFIXES)
         ):
             kind = self._schemas.get(record.schema_id)
             self.periods[record.id] = self._period_ns if kind in _STREAMS else 0
