@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from .console import emit_json
+from .errors import DataError
+from .log.frames import FD_TOPIC_PREFIX
 from .log.session import Session
+from .log.topics import Channel
+
+_MESSAGES_PER_LOOK = 1000
 
 
 def describe(session: Session) -> dict[str, Any]:
@@ -20,7 +26,8 @@ def describe(session: Session) -> dict[str, Any]:
     Returns:
         ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``. A
         topic's ``read`` says whether its messages can be read: those of other encodings are only
-        listed. Without messages there is no start.
+        listed; ``frames`` is the number of CAN FD frames of their topics, None for others. Without
+        messages there is no start.
     """
     seconds = session.duration_s
     empty = not any(channel.count for channel in session.channels.values())
@@ -34,6 +41,7 @@ def describe(session: Session) -> dict[str, Any]:
             "encoding": channel.encoding or None,
             "schema": channel.schema_encoding or None,
             "read": channel.is_ros2,
+            "frames": _fd_frames(session, channel),
         }
         for _, channel in sorted(session.channels.items())
     ]
@@ -57,6 +65,22 @@ def describe(session: Session) -> dict[str, Any]:
         "attachments": {name: len(data) for name, data in session.attachments.items()},
         "warnings": session.warnings,
     }
+
+
+def _fd_frames(session: Session, channel: Channel) -> int | None:
+    """Number of CAN FD frames of a topic, never all in memory; None for any other topic."""
+    if not channel.topic.startswith(FD_TOPIC_PREFIX) or not channel.is_ros2:
+        return None
+    windows = max(1, channel.count // _MESSAGES_PER_LOOK)
+    span_ns = session.end_ns - session.start_ns
+    edges = [session.start_ns + span_ns * k // windows for k in range(windows)]
+    try:
+        return sum(
+            len(session.fd_frames(channel.topic, start_ns=start_ns, stop_ns=stop_ns))
+            for start_ns, stop_ns in pairwise([*edges, None])
+        )
+    except DataError:  # somebody else's topic of that name
+        return None
 
 
 def log_info(file: Path, /, *, json: bool = False) -> None:
@@ -101,9 +125,10 @@ def _print_facts(facts: dict[str, Any]) -> None:
     print(f"\n{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
     for topic, name in zip(facts["topics"], names, strict=True):
         rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
+        held = f"{topic['frames']} frames" if topic["frames"] is not None else topic["unit"] or ""
         print(
             f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}  "
-            f"{rate}  {topic['unit'] or ''}".rstrip()
+            f"{rate}  {held}".rstrip()
         )
     if facts["attachments"]:
         listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())

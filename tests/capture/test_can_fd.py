@@ -178,6 +178,8 @@ def test_the_check_counts_them(tmp_path: Path, capsys):
     sentences = [finding.sentence for finding in check_session(alone).findings]
     (silence,) = (sentence for sentence in sentences if "silent" in sentence)
     assert silence.startswith("/can/can0: silent for 3.01 s, at ")
+    undulog.run(["log", "info", str(path)])
+    assert f"  {len(fd)} frames\n" in capsys.readouterr().out
     undulog.run(["log", "check", str(path)])
     assert f"/can_fd/can0: {len(fd)} frames, 100.0 Hz, 0 error frames" in capsys.readouterr().out
 
