@@ -60,6 +60,11 @@ format: $(READY)  ## mend what lint and format can mend
 bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/read_jointstate.py
 	$(BIN)/python bench/wal.py
+	$(BIN)/python bench/durable.py
+	$(BIN)/python bench/sources.py
+	$(BIN)/python bench/record_buses.py
+	$(BIN)/python bench/live_view.py
+	$(BIN)/python bench/one_hour.py
 	$(BIN)/python bench/twin_step.py
 	$(BIN)/python bench/replay_convert.py 5
 

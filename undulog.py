@@ -14,6 +14,7 @@ from importlib.metadata import version
 
 from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
 
+from capture.deferred import defer
 from capture.errors import MissingExtraError, UndulogError
 
 VERBS: dict[str, tuple[str, str]] = {
@@ -141,6 +142,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
+    defer()
     try:
         code = run(sys.argv[1:])
         sys.stdout.flush()

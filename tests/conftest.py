@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-REQUIRE = "UNDULOG_REQUIRE_DISPLAY_TESTS"
+REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     "--headless=new",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, IntArray
 from ..bus.frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock
+from ..deferred import undefer
 from ..errors import ImportFormatError, MissingExtraError
 from ..log.frames import (
     DIR_RX,
@@ -94,6 +95,7 @@ def open_mf4(path: Path) -> Generator[FrameLog]:
         MissingExtraError: If asammdf is not installed.
     """
     try:
+        undefer("asammdf")
         from asammdf import MDF
     except ImportError as error:
         raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf") from error

@@ -316,7 +316,7 @@ def test_a_full_disk_ends_the_recording_in_good_order(floor, small_disk, tmp_pat
 @pytest.mark.slow
 def test_a_wall_clock_that_is_set_changes_no_order_and_no_duration(tmp_path):
     if not FAKETIME.exists():
-        assert not os.environ.get("UNDULOG_REQUIRE_DISPLAY_TESTS"), "faketime is not installed"
+        assert not os.environ.get("UNDULOG_REQUIRE_ALL_TESTS"), "faketime is not installed"
         pytest.skip(f"{FAKETIME} is not installed")
     wall = tmp_path / "wall"
     wall.write_text("+0\n")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import undulog
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("verb", sorted(undulog.VERBS))
@@ -69,3 +72,22 @@ def test_a_closed_pipe_is_no_traceback() -> None:
     command = f"{sys.executable} -m undulog info --json | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
+
+
+def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path: Path) -> None:
+    pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
+    trace, session = tmp_path / "trace.mf4", tmp_path / "trace.mcap"
+    script = (
+        "import can\n"
+        f"with can.MF4Writer({str(trace)!r}) as writer:\n"
+        "    for k in range(5):\n"
+        "        writer.on_message_received(can.Message(timestamp=1.7e9 + k, arbitration_id=0x14B,"
+        " is_extended_id=False, data=[k], channel=0))\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "undulog", "import", trace, "-o", session, "-r", "arcsnake-joint"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "5 CAN frames" in done.stdout

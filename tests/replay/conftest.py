@@ -26,7 +26,7 @@ from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane
 
 EPOCH_NS = 1_735_689_600_000_000_000
-REQUIRE = "UNDULOG_REQUIRE_DISPLAY_TESTS"
+REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
 
 
 @pytest.fixture(scope="session")
