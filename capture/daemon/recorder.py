@@ -21,6 +21,7 @@ from ..robot import Robot
 from ..sources.contract import Polled, Source, SourceContext
 from .bus_recorder import BusRecorder
 from .clock import SessionClock
+from .each_second import EachSecond
 from .source_clock import SourceClock
 from .ticks import TickTally
 
@@ -43,7 +44,6 @@ _MOST_WAITING = 2_000_000
 
 _DECODE_BUDGET_NS = 4_000_000
 _BACKLOG = 16_384
-_SECOND_TICKS = 1_000_000_000 // TICK_NS
 _NS = 1_000_000_000
 _LONGEST_NS = 2**31 * _NS  # what a TimeReference can hold
 
@@ -105,16 +105,14 @@ class Recorder:
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
         self._each_tick = tuple(each_tick)
-        self._second: dict[int, Callable[[], object]] = {}
-        tasks = (self._write_clocks, _tidy, *each_second)
-        for k, task in enumerate(tasks):
-            self._second[(k + 1) * _SECOND_TICKS // (len(tasks) + 1)] = task
+        tasks = (self._write_clocks, self._tell_odd_frames, _tidy, *each_second)
+        self._each_second = EachSecond(tasks, time.monotonic_ns())
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
         self._came = 0  # frames in the last poll
         self._failed: set[str] = set()
         self._odd_clocks: set[str] = set()
-        self._unknown: dict[str, set[str]] = {source.name: set() for source in self._sources}
+        self._told: dict[str, set[str]] = {source.name: set() for source in self._sources}
         self._on_event: Callable[[int, str, str, str], None] | None = None
 
     def on_event(self, listener: Callable[[int, str, str, str], None]) -> None:
@@ -187,7 +185,7 @@ class Recorder:
         tick = 0
         while self.ending is None:
             now_ns = time.monotonic_ns()
-            self._tick(tick)
+            self._tick(tick, now_ns)
             if stop.signal is not None:
                 self.ending = Ending(f"{stop.signal.name} was received")
             elif end_ns is not None and now_ns >= end_ns:
@@ -204,7 +202,7 @@ class Recorder:
                 self.overruns += (after_ns - due_ns) // TICK_NS
                 due_ns = after_ns
 
-    def _tick(self, tick: int) -> None:
+    def _tick(self, tick: int, now_ns: int) -> None:
         self._poll()
         for bus in self.buses.values():
             bus.write_raw(self._clock.now_ns)
@@ -215,9 +213,7 @@ class Recorder:
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
                 self._decode(name, bus, until_ns)
-        task = self._second.get(tick % _SECOND_TICKS)
-        if task is not None:
-            task()
+        self._each_second.run(now_ns)
         for each in self._each_tick:
             each()
 
@@ -286,21 +282,26 @@ class Recorder:
                 self._odd_clocks.add(name)
                 text = f"the device's time, {device_ns} ns, doesn't fit /clock/{name}"
                 self.say("warn", name, text)
-        self._tell_unknown()
 
     def _tell_clock(self, name: str) -> None:
         for text in self.clocks[name].take_events():
             self.say("warn", name, text)
 
-    def _tell_unknown(self) -> None:
-        """Say of each identifier once that nobody knows it; the counts come at the end."""
+    def _tell_odd_frames(self) -> None:
+        """Say once what nobody knows and what is too short; the counts come at the end."""
         for name, bus in self.buses.items():
-            fresh = set(bus.tally.unknown) - self._unknown[name]
-            if fresh and bus.decodes:
-                self._unknown[name] |= fresh
-                listed = ", ".join(sorted(fresh)[:8])
-                more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
-                self.say("info", name, f"identifiers that no database knows: {listed}{more}")
+            if not bus.decodes:
+                continue
+            for level, what, found in (
+                ("info", "identifiers that no database knows", bus.tally.unknown),
+                ("warn", "frames too short for", bus.tally.short),
+            ):
+                fresh = set(found) - self._told[name]
+                if fresh:
+                    self._told[name] |= fresh
+                    listed = ", ".join(sorted(fresh)[:8])
+                    more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
+                    self.say(level, name, f"{what}: {listed}{more}")
 
     def _finish(self) -> None:
         """Take what is still there, and say what became of the frames."""
@@ -314,6 +315,7 @@ class Recorder:
                 for text in bus.tally.notes():
                     self.say("info", name, text)
         self._write_clocks()
+        self._tell_odd_frames()
         ending = self.ending
         assert ending is not None  # noqa: S101 - set by the loop
         self.say("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
