@@ -9,6 +9,7 @@ import time
 import tty
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from can.util import len2dlc
@@ -379,3 +380,31 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, 
     heard.until_event("connected")
     adapter.send(lines(truth))
     assert same(heard.until_frames(1000), frames)
+
+
+def test_can_fd_frames_as_python_cans_own_client_writes_them(
+    plug, tmp_path, fd_traffic, same
+) -> None:
+    pytest.importorskip("serial")
+    from can.interfaces.slcan import slcanBus
+
+    truth = fd_traffic(500)
+    adapter = plug(answers=False)
+    bus = slcanBus(str(tmp_path / "ttyACM0"), bitrate=500_000, sleep_after_open=0)
+    for frame in truth:
+        message = can.Message(
+            is_fd=True,
+            arbitration_id=int(frame["id_flags"]) & ID_MASK,
+            is_extended_id=bool(frame["id_flags"] & EXTENDED_FLAG),
+            bitrate_switch=bool(frame["fd_flags"] & FD_BRS),
+            data=frame["data"][: frame["len"]].tolist(),
+        )
+        bus.send(message)
+    bus.shutdown()
+    while len(sent := [line for line in adapter.commands if line[:1] in b"dDbB"]) < len(truth):
+        time.sleep(0.01)
+    tally = Tally(lambda: 0)
+    _, found = SlcanText(stamps=False).feed(b"\r".join(sent) + b"\r", 5, tally)
+    assert tally.counts.malformed == 0
+    assert same(found, truth)
+    assert same(found, SlcanText(stamps=False).feed(b"".join(fd_lines(truth)), 5, tally)[1])
