@@ -56,6 +56,7 @@ def test_integers_of_every_layout(rng):
             assert BitField.of(signal).values(data).tolist() == reference(signal, data), signal
 
 
+@settings(max_examples=400, deadline=None)
 @given(
     position=st.integers(0, 511),
     length=st.integers(1, 64),
