@@ -14,7 +14,14 @@ from __future__ import annotations
 
 import re
 
-from ..log.frames import EXTENDED_FLAG, FD_BRS, FRAME_DTYPE, REMOTE_FLAG, FrameArray
+from ..log.frames import (
+    EXTENDED_FLAG,
+    FD_BRS,
+    FRAME_DTYPE,
+    REMOTE_FLAG,
+    FrameArray,
+    empty_fd_frames,
+)
 from .events import Tally
 from .records import fd_records, pack_fd_record, pack_record, records
 
@@ -48,6 +55,7 @@ class SlcanText:
         """
         self._stamps = StampClock() if stamps else None
         self._rest = b""
+        self._has_fd = False
 
     def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> tuple[FrameArray, FrameArray]:
         """Take what was read.
@@ -71,17 +79,16 @@ class SlcanText:
             found = _line_by_line(text, tally)
         packed = [record for fields in found if (record := self._record(*fields, t_ns))]
         tally.malformed("malformed line", len(found) - len(packed))
+        if not self._has_fd:  # the usual case: nothing to pick
+            return records(packed), empty_fd_frames(0)
         size = FRAME_DTYPE.itemsize
         fd = [record for record in packed if len(record) != size]
-        if fd:
-            packed = [record for record in packed if len(record) == size]
-        return records(packed), fd_records(fd)
+        return records(record for record in packed if len(record) == size), fd_records(fd)
 
     def _record(self, head: str, digit: str, rest: str, t_ns: int) -> bytes | None:
         """A frame's record; None if its line is malformed."""
         kind = head[0]
         flags = int(head[1:], 16)
-        fd = kind in "dDbB"
         length = _FD_LENGTHS[int(digit, 16)]
         digits = 2 * length
         if kind in "TRxDB":
@@ -102,7 +109,8 @@ class SlcanText:
             if device_ns is None:
                 return None
         data = bytes.fromhex(rest[:digits])
-        if fd:
+        if kind in "dDbB":
+            self._has_fd = True
             brs = FD_BRS if kind in "bB" else 0
             return pack_fd_record(device_ns, t_ns, flags, length, 0, brs, data)
         return pack_record(device_ns, t_ns, flags, length, 0, data)
