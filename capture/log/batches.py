@@ -14,12 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..errors import LogError
 from .chunk import PREFIX_SIZE, Block, Buffer
-from .message_heads import BODY_AT, FIXED_SIZE, HEAD, gather
+from .message_heads import BODY_AT, FIXED_SIZE, HEAD, Places, gather
 from .storage import LogFile
 
 _ARENA_SIZE = 8 << 20
@@ -27,6 +26,9 @@ _START = struct.Struct("<BQ")  # of a record: opcode, length
 _START_KIND = np.dtype(f"V{_START.size}")
 _LOG_TIME_AT = 15
 _LOG_TIME_KIND = np.dtype("<i8")
+_LARGEST_COPIED = 2048
+"""Records up to this many bytes are copied whole, before anything of them is looked at: then they
+lie side by side in the cache."""
 
 Window = tuple[int | None, int | None]
 
@@ -51,14 +53,16 @@ class Records:
     """Message records of one topic in a buffer, in file order; all whole.
 
     Attributes:
-        offsets: Where they start, shape (n,).
+        offsets: Where they start in the buffer, shape (n,).
         log_ns: Their log times [Unix ns], shape (n,).
         length: Bytes of each message, if all have as many; otherwise None.
+        bodies: Where the messages start, in the buffer or in a copy.
     """
 
     offsets: IntArray
     log_ns: IntArray
     length: int | None
+    bodies: Places
 
 
 def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
@@ -156,35 +160,38 @@ def _records(
         LogError: If an index is damaged or points to something that is no message.
     """
     offsets, limits, stops = _offsets(log_file, placed, wanted)
-    if not len(offsets):
-        return [Records(offsets, offsets, None) for _ in wanted]
-    starts = gather(data, offsets, _START_KIND)
-    log_ns = gather(data, offsets, _LOG_TIME_KIND, _LOG_TIME_AT)
     found: list[Records] = []
     for a, b, lasts in zip(limits[:-1], limits[1:], stops, strict=True):
-        length = None
-        if b > a:
-            length = _one_length(starts[a:b], offsets[a:b], lasts)
-            if length is None:
-                _check_each(log_file, data, offsets[a:b], lasts)
-        found.append(Records(offsets[a:b], log_ns[a:b], length))
+        at = offsets[a:b]
+        records = _alike(data, at, lasts) if b > a else Records(at, at, None, Places(data, at))
+        if records is None:
+            _check_each(log_file, data, at, lasts)
+            log_ns = gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT)
+            records = Records(at, log_ns, None, Places(data, at + BODY_AT))
+        found.append(records)
     return found
 
 
-def _one_length(
-    starts: NDArray[np.void], offsets: IntArray, stops: tuple[IntArray, IntArray]
-) -> int | None:
-    """The length of whole messages that start alike; None where something doesn't fit."""
-    first = starts[:1].tobytes()
-    if starts.tobytes() != first * len(starts):
-        return None
-    opcode, length = _START.unpack(first)
-    rows, ends = stops
+def _alike(data: Buffer, offsets: IntArray, stops: tuple[IntArray, IntArray]) -> Records | None:
+    """Records that are whole messages of one length; None where something doesn't fit."""
+    first = int(offsets[0])
+    start = bytes(data[first : first + _START.size])
+    opcode, length = _START.unpack(start)
+    lasts, ends = stops
     # In file order the last record of a block reaches furthest.
-    room = (ends - offsets[rows]).min()
+    room = int((ends - offsets[lasts]).min())
     if opcode != Opcode.MESSAGE or not FIXED_SIZE <= length <= room - PREFIX_SIZE:
         return None
-    return length - FIXED_SIZE
+    size = PREFIX_SIZE + length
+    places = Places(data, offsets)
+    if size <= _LARGEST_COPIED:
+        copied = gather(data, offsets, f"V{size}").view(np.uint8)
+        places = Places(copied, np.arange(0, len(copied), size, dtype=np.int64), size)
+    if places.field(_START_KIND, 0).tobytes() != start * len(offsets):
+        return None
+    log_ns = places.field(_LOG_TIME_KIND, _LOG_TIME_AT)
+    bodies = Places(places.data, places.at + BODY_AT, places.step)
+    return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
 
 
 def _check_each(

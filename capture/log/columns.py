@@ -21,7 +21,7 @@ from ..errors import DataError
 from .batches import Records, Window, blocks_in, record_batches
 from .cdr import Layout, Leaf, layout_of
 from .chunk import Block, Buffer
-from .message_heads import BODY_AT, FIXED_SIZE, gather
+from .message_heads import BODY_AT, FIXED_SIZE, Places
 from .rosmsg import MessageType
 from .storage import LogFile
 from .stores import ColumnStore, TimeStore
@@ -33,7 +33,6 @@ _EXPANSION = 64
 
 _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 _NS = 1_000_000_000
-_PAIR = np.dtype("<i8")
 
 Matrix = NDArray[np.uint8]
 
@@ -71,7 +70,7 @@ class Group:
             if leaf not in (self._stamp or ()) and (paths is None or path in paths)
         }
         self._parts = [
-            (leaves[path].offset, _run(leaves[path]), np.dtype(leaves[path].dtype), store)
+            (np.dtype(leaves[path].dtype), leaves[path].count, leaves[path].offset, store)
             for path, store in self._columns.items()
         ]
         self._hull = [(start, np.dtype(f"V{stop - start}")) for start, stop in layout.hull]
@@ -112,40 +111,38 @@ class Group:
             return np.empty((len(self), 0), dtype=np.float64)
         return self._columns[path].values()
 
-    def holds(self, data: Buffer, at: IntArray) -> bool:
+    def holds(self, places: Places) -> bool:
         """Whether messages have this layout: the quick check, for messages of its length.
 
         Args:
-            data: A payload.
-            at: Where messages start, shape (n,).
+            places: Where they start.
 
         Returns:
             True if all do; False if some don't, or differ in padding.
         """
         for k, (start, run) in enumerate(self._hull):
             width = run.itemsize
-            if len(self._tiles[k]) < width * len(at):
-                self._tiles[k] = self.layout.example[start : start + width] * (2 * len(at))
-            if not self._tiles[k].startswith(gather(data, at, run, start).tobytes()):
+            if len(self._tiles[k]) < width * len(places):
+                self._tiles[k] = self.layout.example[start : start + width] * (2 * len(places))
+            if not self._tiles[k].startswith(places.field(run, start).tobytes()):
                 return False
         return True
 
-    def take(self, data: Buffer, at: IntArray, log_ns: IntArray, order: IntArray | range) -> None:
+    def take(self, places: Places, log_ns: IntArray, order: IntArray | range) -> None:
         """Copy messages of this layout.
 
         Args:
-            data: A payload.
-            at: Where they start, shape (n,).
+            places: Where they start, n of them.
             log_ns: Their log times [Unix ns], shape (n,).
             order: Their places in the topic, n of them.
         """
         self._order.append(order)
         stamp_ns = None
         if self._stamp:
-            stamp_ns = _stamp_ns(data, at, *self._stamp)
+            stamp_ns = _stamp_ns(places, *self._stamp)
         self._times.append(log_ns, stamp_ns)
-        for start, run, kind, store in self._parts:
-            store.append(gather(data, at, run, start).view(kind))
+        for kind, count, start, store in self._parts:
+            store.append(places.rows(kind, count, start))
 
 
 @dataclass
@@ -212,10 +209,10 @@ def read_messages(
     blocks = blocks_in(log_file, window_ns)
     readers = [_GroupReader(request, *_expected(log_file, request, blocks)) for request in requests]
     wanted = [request.channel_ids for request in requests]
-    for data, found in record_batches(log_file, wanted, blocks, warn):
+    for _, found in record_batches(log_file, wanted, blocks, warn):
         for reader, records in zip(readers, found, strict=True):
             if len(records.offsets):
-                reader.add(data, records, window_ns)
+                reader.add(records, window_ns)
     return [Messages(reader.groups, reader.unread) for reader in readers]
 
 
@@ -277,56 +274,57 @@ class _GroupReader:
         self.groups: list[Group] = []
         self.unread: list[Unread] = []
 
-    def add(self, data: Buffer, records: Records, window_ns: Window) -> None:
-        at, log_ns, length = records.offsets + BODY_AT, records.log_ns, records.length
+    def add(self, records: Records, window_ns: Window) -> None:
+        places, log_ns, length = records.bodies, records.log_ns, records.length
         start, stop = window_ns
         if (start is not None and (log_ns < start).any()) or (
             stop is not None and (log_ns >= stop).any()
         ):
-            keep = np.ones(len(at), dtype=bool)
+            keep = np.ones(len(places), dtype=bool)
             keep &= True if start is None else log_ns >= start
             keep &= True if stop is None else log_ns < stop
-            at, log_ns = at[keep], log_ns[keep]
-        if not len(at):
+            places, log_ns = places.take(keep), log_ns[keep]
+        if not len(places):
             return
         first = self._count
-        self._count += len(at)
+        self._count += len(places)
         if length is not None:
             known = self._by_length.get(length)
-            if known and known[0].holds(data, at):  # the usual case
-                known[0].take(data, at, log_ns, range(first, self._count))
+            if known and known[0].holds(places):  # the usual case
+                known[0].take(places, log_ns, range(first, self._count))
             else:
-                self._sort_in(data, length, at, log_ns, np.arange(first, self._count))
+                self._sort_in(length, places, log_ns, np.arange(first, self._count))
             return
-        lengths = gather(data, at - BODY_AT + _LENGTH_AT, "<i8") - FIXED_SIZE
+        heads = Places(places.data, places.at - BODY_AT)
+        lengths = heads.field("<i8", _LENGTH_AT) - FIXED_SIZE
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)
-            self._sort_in(data, length, at[rows], log_ns[rows], first + rows)
+            self._sort_in(length, places.take(rows), log_ns[rows], first + rows)
 
-    def _sort_in(
-        self, data: Buffer, length: int, at: IntArray, log_ns: IntArray, order: IntArray
-    ) -> None:
+    def _sort_in(self, length: int, places: Places, log_ns: IntArray, order: IntArray) -> None:
         """Take messages of one length, whatever their layouts."""
-        matrix = _matrix(data, at, length)
+        matrix = _matrix(places, length)
         known = self._by_length.setdefault(length, [])
         for group in known:
             fits = fits_layout(matrix, group.layout)
             if fits.any():
-                group.take(data, at[fits], log_ns[fits], order[fits])
+                group.take(places.take(fits), log_ns[fits], order[fits])
                 rest = ~fits
-                matrix, at, log_ns, order = matrix[rest], at[rest], log_ns[rest], order[rest]
-            if not len(at):
+                matrix, places = matrix[rest], places.take(rest)
+                log_ns, order = log_ns[rest], order[rest]
+            if not len(places):
                 return
-        while len(at):
+        while len(places):
             example = matrix[0].tobytes()
             try:
                 layout = layout_of(self._type, example)
             except DataError as error:
                 self.unread.append(Unread(int(log_ns[0]), example, str(error)))
-                matrix, at, log_ns, order = matrix[1:], at[1:], log_ns[1:], order[1:]
+                matrix, places = matrix[1:], places.take(slice(1, None))
+                log_ns, order = log_ns[1:], order[1:]
                 continue
             # Text topics have a layout a message: don't hold every later message against each.
-            fits = np.zeros(len(at), dtype=bool)
+            fits = np.zeros(len(places), dtype=bool)
             fits[0] = True
             if len(known) < _MAX_LAYOUTS:
                 fits = fits_layout(matrix, layout)
@@ -335,9 +333,10 @@ class _GroupReader:
             else:
                 group = Group(layout, self._paths, 1)
             self.groups.append(group)
-            group.take(data, at[fits], log_ns[fits], order[fits])
+            group.take(places.take(fits), log_ns[fits], order[fits])
             rest = ~fits
-            matrix, at, log_ns, order = matrix[rest], at[rest], log_ns[rest], order[rest]
+            matrix, places = matrix[rest], places.take(rest)
+            log_ns, order = log_ns[rest], order[rest]
 
     def _capacity(self, length: int, seen: int) -> int:
         """Room for a group: all that is expected for the first, and what a file of its size has."""
@@ -346,29 +345,17 @@ class _GroupReader:
         return max(seen, min(self._expected, self._reserve // max(length, 1)))
 
 
-def _run(leaf: Leaf) -> np.dtype[Any]:
-    """All numbers of a leaf as one item: it is copied as a whole."""
-    kind = np.dtype(leaf.dtype)
-    return kind if leaf.count == 1 else np.dtype(f"V{leaf.count * kind.itemsize}")
-
-
-def _stamp_ns(data: Buffer, at: IntArray, seconds: Leaf, rest: Leaf) -> IntArray:
+def _stamp_ns(places: Places, seconds: Leaf, rest: Leaf) -> IntArray:
     """Stamps of messages [ns], shape (n,)."""
-    if (seconds.dtype, rest.dtype, rest.offset - seconds.offset) == ("<i4", "<u4", 4):
-        pairs = gather(data, at, _PAIR, seconds.offset)  # one look for both
-        stamps = pairs.view("<i4")[::2].astype(np.int64)
-        stamps *= _NS
-        stamps += pairs.view("<u4")[1::2]
-        return stamps
-    parts = [gather(data, at, leaf.dtype, leaf.offset).astype(np.int64) for leaf in (seconds, rest)]
-    return parts[0] * _NS + parts[1]
+    stamps = places.field(seconds.dtype, seconds.offset).astype(np.int64)
+    stamps *= _NS
+    stamps += places.field(rest.dtype, rest.offset).astype(np.int64)
+    return stamps
 
 
-def _matrix(data: Buffer, at: IntArray, length: int) -> Matrix:
+def _matrix(places: Places, length: int) -> Matrix:
     """Messages of one length as rows of bytes."""
-    if not length:
-        return np.empty((len(at), 0), dtype=np.uint8)
-    return gather(data, at, f"V{length}").view(np.uint8).reshape(len(at), length)
+    return places.rows(np.dtype(np.uint8), length, 0)
 
 
 def fits_layout(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:

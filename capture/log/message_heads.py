@@ -5,6 +5,7 @@ Format: https://mcap.dev/spec#message-op0x05.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,9 @@ def read_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] |
     return heads if whole.all() else None
 
 
-def gather(data: Buffer, at: IntArray, kind: np.dtype[Any] | str, shift: int = 0) -> NDArray[Any]:
+def gather(
+    data: Buffer | NDArray[np.uint8], at: IntArray, kind: np.dtype[Any] | str, shift: int = 0
+) -> NDArray[Any]:
     """Records of one type at any offsets: an overlapping view with a stride of one byte.
 
     Args:
@@ -62,3 +65,68 @@ def gather(data: Buffer, at: IntArray, kind: np.dtype[Any] | str, shift: int = 0
     record = np.dtype(kind)
     size = max(len(data) - shift - record.itemsize + 1, 0)
     return np.ndarray((size,), record, data, shift, (1,))[at]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where messages start in a buffer.
+
+    Attributes:
+        data: The buffer.
+        at: Offsets, shape (n,).
+        step: From each to the next, if they are evenly spaced and whole; otherwise None.
+    """
+
+    data: Buffer | NDArray[np.uint8]
+    at: IntArray
+    step: int | None = None
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.at)
+
+    def take(self, rows: NDArray[Any] | slice) -> Places:
+        """Some of them.
+
+        Args:
+            rows: Which, as numpy chooses.
+
+        Returns:
+            Their places, taken as unevenly spaced.
+        """
+        return Places(self.data, self.at[rows])
+
+    def field(self, kind: np.dtype[Any] | str, shift: int) -> NDArray[Any]:
+        """What lies at the same place in each.
+
+        Args:
+            kind: Its type.
+            shift: Offset from the message's start, not negative.
+
+        Returns:
+            Shape (n,): a view where they are evenly spaced, otherwise a copy.
+        """
+        if self.step is None:
+            return gather(self.data, self.at, kind, shift)
+        first = int(self.at[0]) + shift if len(self.at) else 0
+        return np.ndarray((len(self.at),), kind, self.data, first, (self.step,))
+
+    def rows(self, kind: np.dtype[Any], count: int, shift: int) -> NDArray[Any]:
+        """Runs of numbers that lie at the same place in each.
+
+        Args:
+            kind: Type of a number.
+            count: Numbers in a run.
+            shift: Offset from the message's start.
+
+        Returns:
+            Shape (n, count): a view where they are evenly spaced, otherwise a copy.
+        """
+        if not count:
+            return np.empty((len(self.at), 0), kind)
+        if self.step is None:
+            run = kind if count == 1 else f"V{count * kind.itemsize}"
+            return gather(self.data, self.at, run, shift).view(kind).reshape(len(self.at), count)
+        first = int(self.at[0]) + shift if len(self.at) else 0
+        steps = (self.step, kind.itemsize)
+        return np.ndarray((len(self.at), count), kind, self.data, first, steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import sys
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,10 @@ from ..arrays import IntArray
 
 _SHORT_NS = 2**31
 _LARGE = 4 << 20
+_STEPS = 16
+"""Pages of a large column are asked for in so many steps: a fault for each costs twice as much."""
+_POPULATE_WRITE = 23
+"""Linux's MADV_POPULATE_WRITE (5.14), which Python has no name for."""
 
 
 class ColumnStore:
@@ -21,7 +26,7 @@ class ColumnStore:
     """
 
     def __init__(self, dtype: str, width: int, capacity: int) -> None:
-        """Reserve memory; none of it is used before rows come.
+        """Reserve memory; little of it is used before rows come.
 
         Args:
             dtype: numpy type string of a number.
@@ -32,6 +37,8 @@ class ColumnStore:
         self._by_row = self._dtype.itemsize == 1
         self._width = width
         self._capacity = max(capacity, 1)
+        self._memory: mmap.mmap | None = None
+        self._ready = 0
         self._data = self._new(self._capacity)
         self._count = 0
 
@@ -43,19 +50,21 @@ class ColumnStore:
         """Add rows.
 
         Args:
-            rows: Numbers row by row, shape (n * width,).
+            rows: Shape (n, width), or (n,) of one number each.
         """
-        count = len(rows) // self._width
+        count = len(rows)
         stop = self._count + count
         if stop > self._capacity:
             self._capacity = max(2 * self._capacity, stop)
             old = self.values()
             self._data = self._new(self._capacity)
             self._part(0, self._count)[...] = old
-        if self._width == 1 and not self._by_row:
-            self._data[0, self._count : stop] = rows
+        if self._memory is not None and stop > self._ready:
+            self._make_ready(stop)
+        if rows.ndim == 1:
+            self._part(self._count, stop)[:, 0] = rows
         else:
-            self._part(self._count, stop)[...] = rows.reshape(count, self._width)
+            self._part(self._count, stop)[...] = rows
         self._count = stop
 
     def values(self) -> NDArray[Any]:
@@ -69,6 +78,7 @@ class ColumnStore:
     def _new(self, capacity: int) -> NDArray[Any]:
         shape = (capacity, self._width) if self._by_row else (self._width, capacity)
         size = capacity * self._width * self._dtype.itemsize
+        self._memory, self._ready = None, 0
         if size < _LARGE:
             return np.empty(shape, dtype=self._dtype)
         # numpy would ask for huge pages, and in a virtual machine a new one costs milliseconds.
@@ -76,7 +86,27 @@ class ColumnStore:
             memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         except OSError as error:
             raise MemoryError(f"{size} bytes for a column") from error
+        if sys.platform == "linux":
+            self._memory = memory
         return np.frombuffer(memory, dtype=self._dtype).reshape(shape)
+
+    def _make_ready(self, stop: int) -> None:
+        """Ask for the pages of the next rows, ``stop`` of them and some more."""
+        memory = self._memory
+        if memory is None:
+            return
+        first, self._ready = self._ready, min(self._capacity, stop + self._capacity // _STEPS)
+        size, runs = self._dtype.itemsize, self._width
+        if self._by_row:
+            size, runs = size * self._width, 1
+        for run in range(runs):
+            start, end = ((run * self._capacity + row) * size for row in (first, self._ready))
+            start -= start % mmap.PAGESIZE
+            try:
+                memory.madvise(_POPULATE_WRITE, start, end - start)
+            except OSError:  # an older kernel: then they come one by one, when they are used
+                self._memory = None
+                return
 
     def _part(self, start: int, stop: int) -> NDArray[Any]:
         return self._data[start:stop] if self._by_row else self._data[:, start:stop].T

@@ -119,7 +119,7 @@ def test_stores_grow_and_keep_far_log_times():
     store = ColumnStore("<f8", 3, 1)
     rows = np.random.default_rng(6).normal(size=(1000, 3))
     for part in np.array_split(rows, 37):
-        store.append(part.reshape(-1))
+        store.append(part)
     np.testing.assert_array_equal(store.values(), rows)
     times = TimeStore(1, stamped=True)
     stamps = EPOCH_NS + np.arange(5)
