@@ -123,7 +123,8 @@ def _filled(
 ) -> Iterator[tuple[Buffer, list[Placed]]]:
     """Buffers full of payloads; one that can't share a buffer comes alone."""
     ids = {channel_id for channel_ids in wanted for channel_id in channel_ids}
-    arena = bytearray()
+    arena = log_file.take_scratch()
+    size = min(_ARENA_SIZE, sum(block.size for block in blocks))
     placed: list[Placed] = []
     at = 0
     for block in blocks:
@@ -134,12 +135,11 @@ def _filled(
                 data, base, stop = log_file.payload_once(block)
                 yield data, [Placed(block, base, stop)]
                 continue
+            if len(arena) < size:
+                arena = bytearray(size)
             if at + block.size > len(arena):
-                if placed:
-                    yield arena, placed
+                yield arena, placed
                 placed, at = [], 0
-            if not arena:
-                arena = bytearray(min(_ARENA_SIZE, sum(each.size for each in blocks)))
             with memoryview(arena) as whole, whole[at : at + block.size] as room:
                 log_file.inflate_into(block, room)
         except LogError as error:
@@ -149,6 +149,8 @@ def _filled(
         at += block.size
     if placed:
         yield arena, placed
+    if len(blocks) < len(log_file.blocks):  # after a window there is often another
+        log_file.keep_scratch(arena)
 
 
 def _records(

@@ -28,6 +28,7 @@ from .stores import ColumnStore, TimeStore
 
 _LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
 _MAX_LAYOUTS = 64
+_MAX_SHARED = 8
 _EXPANSION = 64
 """No more memory is reserved than this many times the bytes in the file; more may be used."""
 
@@ -44,15 +45,23 @@ class Group:
         layout: The layout.
         is_stamped: Whether they have a stamp.
         strings: The strings that are wanted, by path.
+        kept_times: Stamps and log times.
     """
 
-    def __init__(self, layout: Layout, paths: frozenset[str] | None, capacity: int) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        paths: frozenset[str] | None,
+        capacity: int,
+        others: Sequence[TimeStore] = (),
+    ) -> None:
         """Start empty.
 
         Args:
             layout: The layout.
             paths: Leaf paths to keep; None for all. A stamp is kept as a time, not as a leaf.
             capacity: Messages to expect.
+            others: Times of other topics, which may be the same.
         """
         self.layout = layout
         leaves = layout.leaves
@@ -62,7 +71,7 @@ class Group:
         self.strings = {
             path: text for path, text in layout.strings.items() if paths is None or path in paths
         }
-        self._times = TimeStore(capacity, stamped=self.is_stamped)
+        self.kept_times = TimeStore(capacity, stamped=self.is_stamped, others=others)
         self._order: list[IntArray | range] = []
         self._columns = {
             path: ColumnStore(leaf.dtype, leaf.count, capacity)
@@ -78,7 +87,7 @@ class Group:
 
     def __len__(self) -> int:
         """Number of messages."""
-        return len(self._times)
+        return len(self.kept_times)
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -87,11 +96,11 @@ class Group:
 
     def times(self) -> IntArray:
         """Log times of all its messages [Unix ns], shape (n,)."""
-        return self._times.log()
+        return self.kept_times.log()
 
     def stamps(self) -> IntArray:
         """Stamps of all its messages [ns], shape (n,), or log times where they have none."""
-        return self._times.stamps()
+        return self.kept_times.stamps()
 
     def order(self) -> IntArray:
         """Place of each message among all of the topic, in file order, shape (n,)."""
@@ -140,7 +149,7 @@ class Group:
         stamp_ns = None
         if self._stamp:
             stamp_ns = _stamp_ns(places, *self._stamp)
-        self._times.append(log_ns, stamp_ns)
+        self.kept_times.append(log_ns, stamp_ns)
         for kind, count, start, store in self._parts:
             store.append(places.rows(kind, count, start))
 
@@ -207,7 +216,10 @@ def read_messages(
         The messages, one entry a request.
     """
     blocks = blocks_in(log_file, window_ns)
-    readers = [_GroupReader(request, *_expected(log_file, request, blocks)) for request in requests]
+    shared: list[TimeStore] = []
+    readers = [
+        _GroupReader(request, *_expected(log_file, request, blocks), shared) for request in requests
+    ]
     wanted = [request.channel_ids for request in requests]
     for _, found in record_batches(log_file, wanted, blocks, warn):
         for reader, records in zip(readers, found, strict=True):
@@ -265,10 +277,13 @@ def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
 class _GroupReader:
     """Sorts messages into groups by layout."""
 
-    def __init__(self, request: Request, expected: int, reserve: int) -> None:
+    def __init__(
+        self, request: Request, expected: int, reserve: int, shared: list[TimeStore]
+    ) -> None:
         self._type = request.message_type
         self._paths = None if request.paths is None else frozenset(request.paths)
         self._expected, self._reserve = expected, reserve
+        self._shared = shared
         self._by_length: dict[int, list[Group]] = {}
         self._count = 0
         self.groups: list[Group] = []
@@ -328,7 +343,7 @@ class _GroupReader:
             fits[0] = True
             if len(known) < _MAX_LAYOUTS:
                 fits = fits_layout(matrix, layout)
-                group = Group(layout, self._paths, self._capacity(length, int(fits.sum())))
+                group = self._group(layout, self._capacity(length, int(fits.sum())))
                 known.append(group)
             else:
                 group = Group(layout, self._paths, 1)
@@ -337,6 +352,15 @@ class _GroupReader:
             rest = ~fits
             matrix, places = matrix[rest], places.take(rest)
             log_ns, order = log_ns[rest], order[rest]
+
+    def _group(self, layout: Layout, capacity: int) -> Group:
+        """A group; the first of a topic may have the times of another topic's first."""
+        if self.groups:
+            return Group(layout, self._paths, capacity)
+        group = Group(layout, self._paths, capacity, tuple(self._shared))
+        if len(self._shared) < _MAX_SHARED:
+            self._shared.append(group.kept_times)
+        return group
 
     def _capacity(self, length: int, seen: int) -> int:
         """Room for a group: all that is expected for the first, and what a file of its size has."""

@@ -63,6 +63,7 @@ class LogFile:
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
         self._sources: list[_Part] = []
+        self._scratch = bytearray()
         first = first_part(path)
         wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
@@ -84,7 +85,26 @@ class LogFile:
 
     def close(self) -> None:
         """Release everything."""
+        self._scratch = bytearray()
         self.parts.close()
+
+    def take_scratch(self) -> bytearray:
+        """Memory for payloads that was used before, and costs no page faults; may be empty.
+
+        Returns:
+            The caller's alone until :meth:`keep_scratch` gives it back.
+        """
+        scratch, self._scratch = self._scratch, bytearray()
+        return scratch
+
+    def keep_scratch(self, scratch: bytearray) -> None:
+        """Keep memory for who reads next; the larger piece if there are two.
+
+        Args:
+            scratch: Nobody may look at it any more.
+        """
+        if len(scratch) > len(self._scratch):
+            self._scratch = scratch
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """The uncompressed bytes of a block, and where in them the message offsets count from.

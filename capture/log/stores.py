@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,75 @@ class ColumnStore:
         return self._data[start:stop] if self._by_row else self._data[:, start:stop].T
 
 
+class EchoColumn:
+    """A column that takes no memory as long as it repeats another one, row by row.
+
+    All topics that one tick of a recorder writes have the same stamps, and an hour of a topic's
+    stamps takes 3 MB.
+    """
+
+    def __init__(self, dtype: str, capacity: int, others: Sequence[EchoColumn] = ()) -> None:
+        """Start empty.
+
+        Args:
+            dtype: numpy type string of a number.
+            capacity: Rows to expect.
+            others: What it may repeat, if they have the same rows before it gets them.
+        """
+        self._dtype = dtype
+        self._capacity = capacity
+        self._others = others
+        self._leader: EchoColumn | None = None
+        self._own: ColumnStore | None = None
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return self._count
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add rows.
+
+        Args:
+            rows: Shape (n,).
+        """
+        start, stop = self._count, self._count + len(rows)
+        if self._own is None and not start:
+            leads = (other for other in self._others if other.has(rows, 0))
+            self._leader, self._others = next(leads, None), ()
+        elif self._leader is not None and not self._leader.has(rows, start):
+            self._own = self._copied(stop)
+            self._leader = None
+        if self._leader is None:
+            self._own = self._copied(stop) if self._own is None else self._own
+            self._own.append(rows)
+        self._count = stop
+
+    def has(self, rows: NDArray[Any], start: int) -> bool:
+        """Whether some of its rows are these.
+
+        Args:
+            rows: Shape (n,).
+            start: Where they would start.
+
+        Returns:
+            False where it has fewer rows, too.
+        """
+        stop = start + len(rows)
+        return self._count >= stop and np.array_equal(self.column()[start:stop], rows)
+
+    def column(self) -> NDArray[Any]:
+        """All rows, shape (n,): a view, perhaps of the leader's."""
+        if self._leader is not None:
+            return self._leader.column()[: self._count]
+        return np.empty(0, self._dtype) if self._own is None else self._own.column()
+
+    def _copied(self, capacity: int) -> ColumnStore:
+        own = ColumnStore(self._dtype, 1, max(self._capacity, capacity))
+        own.append(self.column())
+        return own
+
+
 class TimeStore:
     """Stamps and log times of messages.
 
@@ -119,16 +189,28 @@ class TimeStore:
     long as it is below 2 s.
     """
 
-    def __init__(self, capacity: int, *, stamped: bool) -> None:
+    def __init__(self, capacity: int, *, stamped: bool, others: Sequence[TimeStore] = ()) -> None:
         """Start empty.
 
         Args:
             capacity: Messages to expect.
             stamped: Whether the messages have stamps; without, the log times stand for them.
+            others: Times of other topics, which may be the same.
         """
-        self._stamps = ColumnStore("<i8", 1, capacity)
-        self._behind = ColumnStore("<i4", 1, capacity) if stamped else None
+        self.is_stamped = stamped
+        self._stamps = EchoColumn("<i8", capacity, [other.stamp_column for other in others])
+        self._behind = EchoColumn("<i4", capacity, [other.behind_column for other in others])
         self._is_short = True
+
+    @property
+    def stamp_column(self) -> EchoColumn:
+        """Where the stamps are."""
+        return self._stamps
+
+    @property
+    def behind_column(self) -> EchoColumn:
+        """Where log times minus stamps are; empty without stamps."""
+        return self._behind
 
     def append(self, log_ns: IntArray, stamp_ns: IntArray | None) -> None:
         """Add messages.
@@ -137,13 +219,13 @@ class TimeStore:
             log_ns: Log times [Unix ns], shape (n,).
             stamp_ns: Stamps [ns], shape (n,); None where they have none.
         """
-        if self._behind is None or stamp_ns is None:
+        if not self.is_stamped or stamp_ns is None:
             self._stamps.append(log_ns)
             return
         behind = log_ns - stamp_ns
         far = len(behind) and (behind.min() < -_SHORT_NS or behind.max() >= _SHORT_NS)
         if far and self._is_short:
-            wide = ColumnStore("<i8", 1, len(self._behind) + len(behind))
+            wide = EchoColumn("<i8", len(self._behind) + len(behind))
             wide.append(self._behind.column())
             self._behind, self._is_short = wide, False
         self._stamps.append(stamp_ns)
@@ -159,6 +241,6 @@ class TimeStore:
 
     def log(self) -> IntArray:
         """Log times [Unix ns], shape (n,)."""
-        if self._behind is None:
+        if not self.is_stamped:
             return self._stamps.column()
         return self._stamps.column() + self._behind.column()

@@ -8,7 +8,7 @@ from capture import Session, SessionWriter
 from capture.errors import DataError
 from capture.log.frames import empty_frames
 from capture.log.own_times import Series, own_times
-from capture.log.stores import ColumnStore, TimeStore
+from capture.log.stores import ColumnStore, EchoColumn, TimeStore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 6)]
@@ -126,6 +126,23 @@ def test_stores_grow_and_keep_far_log_times():
     for behind in (10, 2**31, -(2**40)):
         times.append(stamps + behind, stamps)
     assert (times.log() - times.stamps()).tolist() == [10] * 5 + [2**31] * 5 + [-(2**40)] * 5
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_echoes_keep_their_own_rows_whatever_the_others_get(seed):
+    rng = np.random.default_rng(seed)
+    columns: list[EchoColumn] = []
+    for _ in range(4):
+        columns.append(EchoColumn("<i8", 3, tuple(columns)))
+    truth: list[list[int]] = [[] for _ in columns]
+    for _ in range(30):
+        rows = rng.integers(0, 9, rng.integers(0, 5))
+        for column, kept in zip(columns, truth, strict=True):
+            mine = rows if rng.random() < 0.97 else rng.integers(0, 9, rng.integers(0, 5))
+            column.append(mine)
+            kept.extend(mine.tolist())
+    assert [column.column().tolist() for column in columns] == truth
+    assert [len(column) for column in columns] == [len(kept) for kept in truth]
 
 
 def test_a_damaged_frame_is_found_by_its_own_checksum(tmp_path):
