@@ -21,7 +21,7 @@ from .chunk import PREFIX_SIZE, Block, Buffer
 from .message_heads import BODY_AT, FIXED_SIZE, HEAD, Places, gather
 from .storage import LogFile
 
-_ARENA_SIZE = 8 << 20
+_ARENA_SIZE = 16 << 20
 _START = struct.Struct("<BQ")  # of a record: opcode, length
 _START_KIND = np.dtype(f"V{_START.size}")
 _LOG_TIME_AT = 15
