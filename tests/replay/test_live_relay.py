@@ -515,7 +515,8 @@ def test_relay_of_a_frozen_viewer_can_be_ended(stage, server):
     out, err = relay.process.communicate(timeout=WAIT_S)
     assert relay.process.returncode == 1
     assert "messages shown, 0 dropped" in out
-    assert "the viewer did not take the last of it" in err
+    # Whether it hangs in a send or in the last flush is a matter of when it froze.
+    assert re.search("the viewer (did not take the last of it|takes no data)", err)
 
 
 @pytest.mark.slow
