@@ -264,6 +264,7 @@ def test_what_is_in_neither_is_counted(tmp_path):
     segments = sorted((tmp_path / "run.mcap.wal").glob("0*.seg"))
     assert len(segments) > 3
     segments[1].unlink()
+    os.truncate(path, 0)  # or it may have them by now: that is the disk's affair
     found, warnings = read(path)
     lost = 6000 - len(found)
     assert lost > 0
