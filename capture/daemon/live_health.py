@@ -79,6 +79,9 @@ class LiveHealth:
         self._frames: dict[str, deque[tuple[int, int]]] = {}
         self._measured: dict[int, ChannelMeasures] = {}
         self._heard: set[int] = set()
+        self._unmeasured: dict[int, int] = {}  # log time up to which a channel's measure goes
+        self._round_end_ns = 0
+        self._round_keys = frozenset[int]()
         self._rounds = 0
         self._pending: defaultdict[int, list[_Message]] = defaultdict(list)
         self._round: list[tuple[int, list[_Message]]] = []
@@ -142,6 +145,9 @@ class LiveHealth:
             self._add(key, messages)
             if key not in self._measured or key % MEASURE_EVERY == self._rounds % MEASURE_EVERY:
                 self._measured[key] = self._scan.measure(key)
+                self._unmeasured.pop(key, None)
+            else:
+                self._unmeasured.setdefault(key, self._round_end_ns)
         elif self._in_round:
             self._end_round(now_ns)
         elif now_ns >= self._due_ns:
@@ -161,6 +167,7 @@ class LiveHealth:
             self._add(*self._round.pop())
         for key in self._heard:
             self._measured[key] = self._scan.measure(key)
+        self._unmeasured.clear()
         self._end_round(now_ns)
 
     def _begin_round(self) -> None:
@@ -168,13 +175,17 @@ class LiveHealth:
             (key, part) for key, messages in self._pending.items() for part in _pieces(messages)
         ]
         self._round.reverse()  # they are taken from the end
+        self._round_keys = frozenset(self._pending)
         self._pending = defaultdict(list)
         self._in_round = True
 
     def _end_round(self, now_ns: int | None) -> None:
         self._in_round = False
         self._rounds += 1
-        latest = self._span[1] if self._span is not None else 0
+        for key in [key for key in self._unmeasured if key not in self._round_keys]:
+            self._measured[key] = self._scan.measure(key)  # it has fallen silent
+            del self._unmeasured[key]
+        latest = self._round_end_ns = self._span[1] if self._span is not None else 0
         self._now_ns = max(self._now_ns, latest if now_ns is None else now_ns)
         for topic in self._topics.values():
             topic.recent.append((self._now_ns, topic.count))
@@ -202,6 +213,8 @@ class LiveHealth:
         """The verdict on what was looked at so far, with its reasons and all measures."""
         if self._latest is None:
             start_ns, end_ns = self._span or (0, 0)
+            # A channel that was not measured lately is not a channel that ended early.
+            end_ns = min(self._unmeasured.values(), default=end_ns)
             self._latest = self._scan.result(start_ns, end_ns, measured=self._measured)
         return self._latest
 

@@ -350,3 +350,24 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path: Path) -> None:
             if second in (1799, 10_799):
                 sizes.append(kept())
     assert sizes[1] < sizes[0] + 65_536
+
+
+def test_the_verdict_meanwhile_is_that_of_a_good_recording(tmp_path: Path) -> None:
+    """Channels are measured in turn; none of them seems to end before the others for that."""
+    health = LiveHealth(ROBOT)
+    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
+    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+        topics = ["/joint_commands", "/joint_states", "/joint_current", "/joint_voltage", "/gait"]
+        channels = [writer.joint_state(topic, NAMES, unit="rad") for topic in topics]
+        said = set[tuple[str, tuple[str, ...]]]()
+        for tick in range(2000):  # a silence is told after some seconds
+            t_ns = EPOCH_NS + tick * NS // 100
+            for channel in channels[: 4 if tick > 1000 else 5]:
+                channel.write(t_ns, 0.3 * np.sin(0.05 * tick + np.arange(25)))
+            health.step(t_ns)
+            if tick == 1000:
+                assert said == {("good", ())}
+            if tick > 100:
+                said.add((health.result().verdict, health.result().reasons))
+    assert any("/gait: ends" in reason for _, reasons in said for reason in reasons)
+    assert not any("/joint" in reason for _, reasons in said for reason in reasons)
