@@ -37,6 +37,8 @@ from .tapped_sink import TappedSink
 
 _NS = 1_000_000_000
 _EVENTS_SHOWN = 8
+_VIEW, _HEALTH = "live view", "live health"
+_NOT_JUDGED = "the recorder could not judge all of it: 'undulog log check' does"
 _RATE_UPDATES = 10
 
 
@@ -117,6 +119,11 @@ class Recording:
             log = OperatorLog(self._writer, self._recorder.say, self._clock.now_ns)
             self._control.serve(request_handler(self, log))
             opened.pop_all()
+        # What a recording can do without; each is given up where it fails.
+        self._asides: dict[str, Callable[[], None]] = {
+            _VIEW: self._feed.pump,
+            _HEALTH: lambda: self._health.step(self._clock.now_ns()),
+        }
 
     @property
     def live_socket(self) -> Path:
@@ -210,8 +217,15 @@ class Recording:
 
     def _each_tick(self) -> None:
         self._control.poll()
-        self._feed.pump()
-        self._health.step(self._clock.now_ns())
+        for name in tuple(self._asides):
+            try:
+                self._asides[name]()
+            except LogWriteError:
+                raise
+            except Exception as error:  # noqa: BLE001 - the recording goes on without it
+                del self._asides[name]
+                text = f"the {name} is given up: it failed with {error!r}"
+                self._recorder.say("error", "recorder", text)
         self._notifier.alive()
 
     def _look(self) -> RecorderSnapshot:
@@ -268,8 +282,11 @@ class Recording:
             self._writer.note_at_end("undulog.clock", self._clock_facts())
             self._writer.note_at_end("undulog.recorder", self._recorder_facts(ending))
             self._diagnose_last(ending)
-            verdict = self._health.final()
-            self._writer.set_verdict(verdict.verdict, verdict.reasons)
+            if _HEALTH in self._asides:
+                verdict = self._health.final()
+                self._writer.set_verdict(verdict.verdict, verdict.reasons)
+            else:
+                self._writer.set_verdict("degraded", [_NOT_JUDGED])
         finally:
             try:
                 self._writer.close()

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,10 @@ import numpy as np
 import pytest
 
 from capture import Session, load_robot
+from capture.daemon.live_health import LiveHealth
+from capture.daemon.record import Recording
+from capture.daemon.settings import resolve
+from capture.interruption import StopRequest
 from capture.log.frames import DIR_TX, empty_frames
 from capture.log.session_check import check_session
 
@@ -216,6 +221,36 @@ def test_a_signal_leaves_a_whole_file(number, tmp_path):
     assert report["ended"] == f"{number.name} was received"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap"]
     assert check_session(output).file.indexed
+
+
+def test_a_mistake_in_what_looks_on_does_not_end_the_recording(tmp_path, monkeypatch):
+    def fails(self, now_ns):
+        raise ZeroDivisionError(f"at {now_ns}")
+
+    monkeypatch.setattr(LiveHealth, "step", fails)
+    bus = tmp_path / "bus.sock"
+    settings = resolve(
+        {
+            "sources": (f"can0=unix:{bus}",),
+            "output": tmp_path / "run.mcap",
+            "robot": "snake25",
+            "duration": 2.5,
+            "floor": 0,
+            "socket": tmp_path / "control.sock",
+        },
+        {},
+    )
+    frames, _ = polling(100)
+    sender = threading.Thread(target=send, args=(bus, frames))
+    sender.start()
+    report = Recording(settings, StopRequest()).run()
+    sender.join()
+    assert not report.ending.failed
+    with Session.open(tmp_path / "run.mcap") as session:
+        assert len(session.frames("/can/can0")) == len(frames)
+        assert len(session.joints("/joint_states").t_ns[0]) == 100
+        assert session.verdict == "degraded"
+    assert any("live health is given up" in text for _, text in events(tmp_path / "run.mcap"))
 
 
 def test_an_existing_file_is_not_replaced(tmp_path):
