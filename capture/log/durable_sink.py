@@ -9,9 +9,7 @@ log goes; when it is left, ``Session`` and ``undulog log recover`` put the two t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
 
 from mcap.records import Header, Metadata
 
@@ -31,9 +29,6 @@ and indexed on the recorder's own thread."""
 
 _NEVER_NS = 1 << 63
 
-Tap: TypeAlias = Callable[[int, int, int, int, bytes], None]
-"""Told of each message accepted: channel, log time, publish time, sequence, payload."""
-
 
 class DurableSink:
     """Keeps what was accepted through kills, full disks and lost power.
@@ -52,7 +47,6 @@ class DurableSink:
         flush_interval_s: float = 10.0,
         sync_interval_s: float = 1.0,
         ballast: int = 8 << 20,
-        tap: Tap | None = None,
     ) -> None:
         """Create the first part and the write-ahead log.
 
@@ -67,7 +61,6 @@ class DurableSink:
                 file lags behind by that, while the write-ahead log has everything.
             sync_interval_s: What power loss costs at most, about [s].
             ballast: Bytes kept in reserve for finalising on a full disk.
-            tap: Told of each message accepted.
 
         Raises:
             OutputExistsError: If a file or a write-ahead log is there and ``force`` is not given.
@@ -79,7 +72,6 @@ class DurableSink:
         if min(limits, default=1) < 1 or not flush_interval_s > 0 or ballast < 0:
             raise DataError("sizes and times of a recording are positive")
         self.path = Path(path)
-        self.tap = tap
         self._force = force
         self._split_size = split_size
         self._split_ns = split_ns
@@ -213,8 +205,6 @@ class DurableSink:
             self._chunk_done()
         elif time.monotonic() >= self._due:
             self._flush()
-        if self.tap is not None:
-            self.tap(channel_id, log_time_ns, publish_time_ns, sequence, payload)
 
     def tick(self) -> None:
         """Look at the clock, for sessions in which nothing may come for long; about once a second.
