@@ -18,6 +18,7 @@ import pybullet
 
 from capture.robot import Plane, Robot
 from sim.gait import SerpentineGait
+from sim.readings import Readings
 from sim.scenario import CONTROL_RATE_HZ, Scenario
 from sim.scenario_file import load_scenario
 from sim.twin import Twin
@@ -39,13 +40,14 @@ def step_builtin(scenario: Scenario) -> float:
     try:
         body = built_in_body(scenario.robot, client)
         gait = SerpentineGait(scenario.gait, scenario.robot)
+        nothing = Readings.nothing(scenario.robot)
         joints = list(range(len(scenario.robot.joints)))
         forces = [joint.servo.stall_torque for joint in scenario.robot.joints]
         steps = scenario.physics_rate_hz // CONTROL_RATE_HZ
         ticks = round(scenario.duration_s * CONTROL_RATE_HZ)
         start = time.process_time()
         for tick in range(ticks):
-            command = gait.step(tick / CONTROL_RATE_HZ).command.tolist()
+            command = gait.step(tick / CONTROL_RATE_HZ, nothing).command.tolist()
             pybullet.setJointMotorControlArray(
                 body,
                 joints,

@@ -3,10 +3,11 @@
 This package imports light; :mod:`sim.twin` and :mod:`sim.record` bring the physics engine.
 """
 
-from .contact import FrictionLaw, Ground
 from .gait import Gait, GaitTick, PlaneGait, Serpentine, SerpentineGait, Wave
-from .scenario import Noise, Scenario, World
+from .readings import Readings
+from .scenario import Noise, Scenario
 from .scenario_file import load_scenario, parse_scenario, scenario_names
+from .world import FrictionLaw, Ground, World
 
 __all__ = [
     "FrictionLaw",
@@ -15,6 +16,7 @@ __all__ = [
     "Ground",
     "Noise",
     "PlaneGait",
+    "Readings",
     "Scenario",
     "Serpentine",
     "SerpentineGait",

@@ -11,7 +11,7 @@ from capture.interruption import StopRequest
 from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain
 
-from .ledger import TERMS
+from .physics.ledger import TERMS
 from .scenario import Scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin

@@ -14,32 +14,15 @@ from typing import Any
 from capture.errors import UsageError
 from capture.robot import Robot
 
-from .contact import Ground
 from .gait import Serpentine
 from .toml_text import toml_text
+from .world import World
 
 CONTROL_RATE_HZ = 100
 """Rate of control and log."""
 
 LONGEST_S = 86400.0
 """Longest run."""
-
-
-@dataclass(frozen=True)
-class World:
-    """Where the robot is.
-
-    Attributes:
-        gravity: Acceleration of gravity [m/s^2]; the ground is the plane z = 0.
-        heading: Direction of the head at the start, about z [rad].
-        velocity: Of the whole robot at the start, in the world [m/s].
-        ground: The ground, or None: then nothing touches the robot.
-    """
-
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    heading: float = 0.0
-    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ground: Ground | None = field(default_factory=Ground)
 
 
 @dataclass(frozen=True)

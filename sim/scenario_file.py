@@ -65,9 +65,9 @@ from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
-from .contact import FrictionLaw, Ground
 from .gait import PlaneGait, Serpentine, Wave
-from .scenario import CONTROL_RATE_HZ, LONGEST_S, Noise, Scenario, World
+from .scenario import CONTROL_RATE_HZ, LONGEST_S, Noise, Scenario
+from .world import FrictionLaw, Ground, World
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
 _SHELF = Shelf("scenario", "sim", "scenarios", ScenarioError)

@@ -18,7 +18,7 @@ import numpy as np
 from capture.log.writer import SessionWriter
 from capture.robot.kinematics import rotation_from_quaternion
 
-from .ledger import TERMS
+from .physics.ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario
 from .stability import warnings
 from .twin import Sample, Twin

@@ -19,12 +19,13 @@ import numpy as np
 from capture.arrays import FloatArray
 from capture.errors import SimulationError
 
-from .body import Body
-from .contact import contact_law
-from .gait import GaitTick, SerpentineGait
-from .ledger import Ledger, Step
+from .gait import Gait, GaitTick, SerpentineGait
+from .physics.bullet import BulletEngine
+from .physics.contact import contact_law
+from .physics.ledger import Ledger, Step
+from .physics.servo import Drive, Rotors, Servos
+from .readings import Readings
 from .scenario import CONTROL_RATE_HZ, Scenario
-from .servo import Drive, Rotors, Servos
 from .stability import likely_cause
 
 MAX_SPEED = 10.0
@@ -39,7 +40,7 @@ class Sample(NamedTuple):
         gait: What the gait commands from here on.
         step: Body, ground, rotors and servos at this instant.
         drive: Means over the control period around this instant (half a one at start and end).
-        energy: The ledger up to here [J], as :data:`sim.ledger.TERMS`, shape (19,).
+        energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (19,).
     """
 
     tick: int
@@ -63,25 +64,26 @@ class Twin:
         servos: Its servos.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, gait: Gait | None = None) -> None:
         """Set the robot on the ground, straight, its servos at rest, in vertical balance.
 
         Args:
             scenario: What to run.
+            gait: Who commands the joints; the scenario's own gait if None.
 
         Raises:
             UsageError: If the engine cannot hold the robot.
         """
         robot, world = scenario.robot, scenario.world
         self.scenario = scenario
-        self.gait = SerpentineGait(scenario.gait, robot)
+        self.gait: Gait = gait or SerpentineGait(scenario.gait, robot)
         self.servos = Servos([joint.servo for joint in robot.joints])
         radius = np.array([link.radius for link in robot.links])
         self._below = np.zeros((3, len(radius)))
         self._below[2] = -radius
         self._ground_law = contact_law(world.ground, radius)
         self._dt = 1.0 / scenario.physics_rate_hz
-        self._body = Body(
+        self._body = BulletEngine(
             robot,
             gravity=world.gravity,
             height=_resting_height(scenario),
@@ -135,7 +137,7 @@ class Twin:
                 behind = self._advance(behind, half, time_s - self._dt * half)
                 self._ledger.book(behind)
                 self._step = behind[-1]
-            gait = self.gait.step(time_s)
+            gait = self.gait.step(time_s, Readings.nothing(self.scenario.robot))
             self._reference = gait.command
             step = self._step = self._step._replace(drive=self._drive(self._step))
             energy = self._ledger.read(step)

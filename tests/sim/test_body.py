@@ -11,7 +11,7 @@ import pytest
 from capture.errors import UsageError
 from capture.robot import Link
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
-from sim.body import Body
+from sim.physics.bullet import BulletEngine
 from sim.twin import Twin
 from sim.urdf import frame_origins, urdf
 
@@ -33,7 +33,7 @@ def writhe(uneven):
 
     def swing(rate_hz=1000):
         dt = 1.0 / rate_hz
-        body = Body(
+        body = BulletEngine(
             uneven, gravity=(0, 0, 0), height=0.3, heading=0.7, velocity=(0.2, 0.1, 0.0), dt=dt
         )
         states = []
@@ -90,7 +90,8 @@ def test_joints_cannot_change_the_momentum(uneven, writhe):
 
 def test_a_thrown_body_flies_a_parabola(make_robot):
     robot = make_robot(4)
-    body = Body(robot, gravity=(0, 0, -9.81), height=1.0, heading=0.3, velocity=(1, 0, 2), dt=1e-3)
+    start = {"height": 1.0, "heading": 0.3, "velocity": (1, 0, 2)}
+    body = BulletEngine(robot, gravity=(0, 0, -9.81), dt=1e-3, **start)
     for _ in range(500):
         body.step(np.zeros(3))
     state = body.read()
@@ -101,8 +102,9 @@ def test_a_thrown_body_flies_a_parabola(make_robot):
 
 
 def test_the_engine_cannot_hold_every_robot(make_robot):
+    start = {"height": 1, "heading": 0, "velocity": (0, 0, 0)}
     with pytest.raises(UsageError, match="has 128 joints; the twin takes at most 127"):
-        Body(make_robot(129), gravity=(0, 0, 0), height=1, heading=0, velocity=(0, 0, 0), dt=1e-3)
+        BulletEngine(make_robot(129), gravity=(0, 0, 0), dt=1e-3, **start)
 
 
 def test_the_urdf_describes_the_same_body(uneven, tmp_path):

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capture.robot.kinematics import rotation_from_quaternion
-from sim.contact import FrictionLaw, Ground, contact_law, friction_force, normal_force, tangents
+from sim import FrictionLaw, Ground
+from sim.physics.contact import contact_law, friction_force, normal_force, tangents
 
 MU = np.array([[0.05], [0.5]])
 EPS = 0.01

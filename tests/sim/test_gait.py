@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from capture.robot import Plane
-from sim import PlaneGait, Serpentine, SerpentineGait, Wave
-from sim.gait import smoothstep, within_limits
+from sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
+from sim.gait.limits import smoothstep, within_limits
+
+NOTHING = Readings(np.empty(0), np.empty(0))
 
 
 def run(gait, seconds, rate_hz=100):
-    ticks = [gait.step(k / rate_hz) for k in range(round(seconds * rate_hz) + 1)]
+    ticks = [gait.step(k / rate_hz, NOTHING) for k in range(round(seconds * rate_hz) + 1)]
     return np.array([t.command for t in ticks]), np.array([t.values for t in ticks]), ticks
 
 
@@ -79,7 +81,7 @@ def test_the_start_is_smooth(make_robot):
 def test_the_phase_is_integrated_not_multiplied(make_robot):
     gait = SerpentineGait(Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, 1.0)}), make_robot())
     times = np.cumsum(np.random.default_rng(1).uniform(0, 0.05, 100))
-    phases = [gait.step(t).values[4] for t in times]
+    phases = [gait.step(t, NOTHING).values[4] for t in times]
     np.testing.assert_allclose(phases, math.pi * times, atol=1e-12)
 
 

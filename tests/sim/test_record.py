@@ -16,7 +16,7 @@ from capture.errors import OutputExistsError, SimulationError
 from capture.interruption import StopRequest
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 from sim import Ground, Noise, World, load_scenario, parse_scenario
-from sim.ledger import TERMS
+from sim.physics.ledger import TERMS
 from sim.record import record
 from sim.twin import Twin
 from sim.urdf import urdf

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capture.robot import Servo
-from sim.servo import Rotors, Servos
+from sim.physics.servo import Rotors, Servos
 
 
 def rotors(*speeds):

@@ -8,7 +8,7 @@ import pytest
 from capture.errors import SimulationError
 from capture.robot import Plane
 from sim import FrictionLaw, Ground, PlaneGait, Serpentine, Wave, World
-from sim.ledger import TERMS
+from sim.physics.ledger import TERMS
 from sim.twin import Twin
 
 G = 9.81

@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 from capture.arrays import FloatArray
 from capture.robot import Robot
 
-from .body import BodyState
 from .contact import Contact, into_link_axes
+from .engine import BodyState
 from .servo import Drive, Rotors, Servos
 
 JOINT_TERMS = (

@@ -1,6 +1,6 @@
 """The articulated body: PyBullet steps it, and nothing else.
 
-Contact and servos are this package's own (:mod:`sim.contact`, :mod:`sim.servo`), because the
+Contact (:mod:`sim.physics.contact`) and servos (:mod:`sim.physics.servo`) are ours, because the
 engine's anisotropic friction depends on the heading and its position motors have no electrical or
 elastic side. So the body has no collision shapes here and its motors are off; forces and torques
 come in from outside, once a step. It has no mechanical end stops: commands are kept within the
@@ -17,13 +17,14 @@ import os
 import struct
 import sys
 from collections.abc import Generator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from capture.arrays import FloatArray
 from capture.errors import UsageError
 from capture.robot import Plane, Robot
+
+from .engine import BodyState
 
 MAX_JOINTS = 127
 """Links beside the base that the engine can hold."""
@@ -55,27 +56,7 @@ _pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular
 _pack_joint = struct.Struct("2d").pack  # angle, rate
 
 
-class BodyState(NamedTuple):
-    """Where the body is and how it moves, in the world; the component comes first.
-
-    Attributes:
-        position: Centres of the n links [m], shape (3, n).
-        quaternion: Their orientations x, y, z, w, shape (4, n).
-        velocity: Velocities of the centres [m/s], shape (3, n).
-        spin: Angular velocities [rad/s], shape (3, n).
-        angle: Joint angles [rad], shape (m,).
-        rate: Joint rates [rad/s], shape (m,).
-    """
-
-    position: FloatArray
-    quaternion: FloatArray
-    velocity: FloatArray
-    spin: FloatArray
-    angle: FloatArray
-    rate: FloatArray
-
-
-class Body:
+class BulletEngine:
     """A robot's links and joints in a physics world of their own; :meth:`close` it after use."""
 
     def __init__(

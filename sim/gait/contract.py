@@ -1,0 +1,97 @@
+"""What every gait generator offers, and what a controller may change of it.
+
+A gait is asked once a control tick, in order of time, with the readings that the robot's computer
+has by then; it answers with the joint commands and with what it meant by them. Each plane's phase
+is *integrated*, Phi' = omega, and never computed as omega t: the two differ as soon as omega
+changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from capture.arrays import FloatArray, frozen
+
+from ..readings import Readings
+
+WALK = "walk"
+"""The mode of a gait that only goes on."""
+
+
+class GaitTick(NamedTuple):
+    """What a gait says at one control tick.
+
+    Attributes:
+        command: Joint angles to be reached [rad], shape (m,).
+        values: What the gait meant, in the order of :attr:`Gait.names`, shape (k,).
+        mode: One word for what the gait is about.
+        clamped: Names of values that were cut to the joint limits.
+    """
+
+    command: FloatArray
+    values: FloatArray
+    mode: str
+    clamped: tuple[str, ...]
+
+
+class Gait(Protocol):
+    """What the twin and the bus loop run: an open-loop generator, or one under a controller."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values, e.g. ``horizontal.A``."""
+        ...
+
+    def step(self, time_s: float, readings: Readings) -> GaitTick:
+        """Advance to a time and say what to do from then on.
+
+        Args:
+            time_s: Time since the start [s], never less than in the call before.
+            readings: What the robot has told by then; an open-loop gait does not look.
+
+        Returns:
+            Commands and values.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Modulation:
+    """What a controller changes of a generator from one tick on; it may jump, the phase does not.
+
+    Attributes:
+        amplitude_factor: Multiplies each joint's amplitude, shape (m,).
+        offset: Added to each joint's offset Y [rad], shape (m,).
+        frequency_factor: Multiplies omega of all planes.
+    """
+
+    amplitude_factor: FloatArray
+    offset: FloatArray
+    frequency_factor: float = 1.0
+
+    @classmethod
+    def none(cls, joint_count: int) -> Modulation:
+        """No change.
+
+        Args:
+            joint_count: m.
+
+        Returns:
+            Factors 1, offsets 0.
+        """
+        return cls(frozen(np.ones(joint_count)), frozen(np.zeros(joint_count)))
+
+
+class Generator(Gait, Protocol):
+    """A gait whose amplitude, offset and frequency a controller may change at any time."""
+
+    def modulate(self, modulation: Modulation) -> None:
+        """Change the generator from the next :meth:`Gait.step` on.
+
+        Args:
+            modulation: What to change, until the next call.
+        """
+        ...

@@ -1,0 +1,1 @@
+"""The twin's physics: engines, ground contact, servos and the energy ledger."""

@@ -1,0 +1,1 @@
+"""The robot's sensors: what they measure, when, and how wrongly."""
