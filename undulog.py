@@ -55,6 +55,8 @@ _GROUPS = {
 
 _EXTRAS = {
     "pybullet": "sim",
+    "mujoco": "mujoco",
+    "numba": "numba",
     "rerun": "replay",
     "jinja2": "report",
     "markupsafe": "report",

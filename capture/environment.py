@@ -10,6 +10,8 @@ from .console import emit_json
 _BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
 _EXTRAS: dict[str, tuple[str, ...]] = {
     "sim": ("pybullet",),
+    "mujoco": ("mujoco",),
+    "numba": ("numba",),
     "replay": ("rerun-sdk",),
     "report": ("jinja2", "matplotlib"),
     "parquet": ("pyarrow",),
