@@ -15,6 +15,7 @@ from capture.errors import UsageError
 from capture.robot import Robot
 
 from .gait import Serpentine
+from .physics.engine import EngineKind
 from .toml_text import toml_text
 from .world import World
 
@@ -59,6 +60,7 @@ class Scenario:
         seed: Of the noise.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
+        engine: Who solves the body's dynamics.
     """
 
     name: str
@@ -77,6 +79,7 @@ class Scenario:
     seed: int = 1
     epoch_s: int = 1_735_689_600  # 2025-01-01T00:00:00Z: near zero, viewers misread stamps
     physics_rate_hz: int = 1000
+    engine: EngineKind = EngineKind.BULLET
 
     @property
     def epoch_ns(self) -> int:
@@ -143,6 +146,7 @@ class Scenario:
             "seed": self.seed,
             "epoch_s": self.epoch_s,
             "physics_rate_hz": self.physics_rate_hz,
+            "engine": self.engine,
             "gait": gait,
             "world": world,
             "noise": dataclasses.asdict(self.noise),

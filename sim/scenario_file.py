@@ -9,6 +9,7 @@ A scenario::
     seed = 1                        # of the noise
     epoch_s = 1735689600            # Unix time at which the session starts
     physics_rate_hz = 1000
+    engine = "bullet"               # or "mujoco": who solves the body's dynamics
 
     [gait]
     ramp_s = 2.0                    # amplitude and offset grow from nothing over this time
@@ -66,6 +67,7 @@ from capture.shipped import Shelf
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
 from .gait import PlaneGait, Serpentine, Wave
+from .physics.engine import EngineKind
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Noise, Scenario
 from .world import FrictionLaw, Ground, World
 
@@ -138,6 +140,8 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         "servo": servo,
         "servo_of": _servos_of(top, robot),
         "seed": top.integer("seed", at_least=0) if "seed" in top else Scenario.seed,
+        "engine": (top.choice("engine", EngineKind) if "engine" in top else None)
+        or Scenario.engine,
         **_times(top),
     }
     top.close()

@@ -45,7 +45,8 @@ def session_facts(scenario: Scenario) -> Mapping[str, str]:
         "physics_rate_hz": str(scenario.physics_rate_hz),
         "joint_sampling": "all joints at the stamp; effort, current and voltage are means over "
         "one control period around it",
-        "pybullet": version("pybullet"),
+        "engine": scenario.engine,
+        scenario.engine.package: version(scenario.engine.package),
         "numpy": version("numpy"),
         "python": platform.python_version(),
     }

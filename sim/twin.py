@@ -20,8 +20,8 @@ from capture.arrays import FloatArray
 from capture.errors import SimulationError
 
 from .gait import Gait, GaitTick, SerpentineGait
-from .physics.bullet import BulletEngine
 from .physics.contact import contact_law
+from .physics.engine import engine_type
 from .physics.ledger import Ledger, Step
 from .physics.servo import Drive, Rotors, Servos
 from .readings import Readings
@@ -83,7 +83,7 @@ class Twin:
         self._below[2] = -radius
         self._ground_law = contact_law(world.ground, radius)
         self._dt = 1.0 / scenario.physics_rate_hz
-        self._body = BulletEngine(
+        self._body = engine_type(scenario.engine)(
             robot,
             gravity=world.gravity,
             height=_resting_height(scenario),

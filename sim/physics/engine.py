@@ -6,9 +6,25 @@ laws and their results can be held against each other.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from enum import StrEnum
+from importlib import import_module
+from typing import NamedTuple, Protocol, cast
 
 from capture.arrays import FloatArray
+from capture.robot import Robot
+
+
+class EngineKind(StrEnum):
+    """The engines there are, each named after its package."""
+
+    BULLET = "bullet"
+    MUJOCO = "mujoco"
+
+    @property
+    def package(self) -> str:
+        """Name of its package in the package index."""
+        return {EngineKind.BULLET: "pybullet", EngineKind.MUJOCO: "mujoco"}[self]
 
 
 class BodyState(NamedTuple):
@@ -62,3 +78,57 @@ class Engine(Protocol):
     def close(self) -> None:
         """Free the physics world; safe to call twice."""
         ...
+
+
+class EngineType(Protocol):
+    """How an engine is made."""
+
+    def __call__(
+        self,
+        robot: Robot,
+        *,
+        gravity: Sequence[float],
+        height: float,
+        heading: float,
+        velocity: Sequence[float],
+        dt: float,
+    ) -> Engine:
+        """Build the body, straight, its head above the origin.
+
+        Args:
+            robot: The robot.
+            gravity: Acceleration of gravity in the world [m/s^2], length 3.
+            height: Height of the links' centres [m].
+            heading: Direction of the head's x axis, about z [rad].
+            velocity: Of the whole body [m/s], length 3.
+            dt: Step [s].
+
+        Returns:
+            The engine.
+
+        Raises:
+            UsageError: If the engine cannot hold the robot.
+        """
+        ...
+
+
+_TYPES = {
+    EngineKind.BULLET: ("sim.physics.bullet", "BulletEngine"),
+    EngineKind.MUJOCO: ("sim.physics.mujoco", "MujocoEngine"),
+}
+
+
+def engine_type(kind: EngineKind) -> EngineType:
+    """Import an engine.
+
+    Args:
+        kind: Which one.
+
+    Returns:
+        What builds it.
+
+    Raises:
+        ImportError: If its package is not installed; the front door says which extra brings it.
+    """
+    module, name = _TYPES[kind]
+    return cast(EngineType, getattr(import_module(module), name))

@@ -27,6 +27,7 @@ settle_s = 1.5
 seed = 7
 epoch_s = 1700000000
 physics_rate_hz = 2000
+engine = "mujoco"
 [gait]
 ramp_s = 1.0
 [gait.horizontal]
