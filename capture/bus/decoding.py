@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..errors import DataError
 from ..log.frames import (
     DIR_RX,
     DIR_TX,
@@ -26,13 +25,8 @@ from ..log.frames import (
     FrameArray,
 )
 from ..robot import BusSignal, Direction, Quantity, Robot
-from ..robot.bus_map import database_messages
-from ..strict_table import Faults
-from ..units import SESSION_UNIT, Unit, unit_for
-from .bit_field import BitField
-
-if TYPE_CHECKING:
-    from cantools.database.can import Message
+from ..units import SESSION_UNIT
+from .map_entry import MapEntry, bus_messages, compile_entry, frame_id
 
 _WAY = {Direction.RX: DIR_RX, Direction.TX: DIR_TX}
 _TX_BIT = 1 << 32  # above the 32 bits of id_flags
@@ -158,24 +152,6 @@ def identifier_text(id_flags: int) -> str:
 
 
 @dataclass(frozen=True)
-class _Entry:
-    """Where a map entry lies in its frame and what its bits mean, compiled."""
-
-    quantity: Quantity
-    axis: str | None
-    bits: BitField
-    unit: Unit
-    scale: float
-    offset: float
-    conditions: tuple[tuple[BitField, tuple[int, ...]], ...]  # multiplexers that select it
-    size: int  # data bytes needed, multiplexers included
-
-    @property
-    def selection(self) -> tuple[tuple[int, ...], ...]:
-        return tuple(identifiers for _, identifiers in self.conditions)
-
-
-@dataclass(frozen=True)
 class _Family:
     """Kinds of frame with the same entries, of different targets: decoded in one go.
 
@@ -186,7 +162,7 @@ class _Family:
         names: Identifier of each member.
     """
 
-    entries: tuple[_Entry, ...]
+    entries: tuple[MapEntry, ...]
     signals: tuple[tuple[BusSignal, ...], ...]
     labels: tuple[tuple[str, ...], ...]
     names: tuple[str, ...]
@@ -209,17 +185,13 @@ class BusDecoder:
         Raises:
             DataError: If the robot has no bus, or not the databases that its map needs.
         """
-        if robot.bus is None:
-            raise DataError(f"the robot {robot.name} has no bus map; frames can't be decoded")
-        messages = database_messages(dict(robot.databases), Faults()) or {}
-        if missing := {signal.message for signal in robot.bus.signals} - set(messages):
-            raise DataError(f"no database of {robot.name} has {', '.join(sorted(missing))}")
-        self._carried: dict[int, list[tuple[BusSignal, _Entry]]] = {}
-        for signal in robot.bus.signals:
+        bus, messages = bus_messages(robot)
+        self._carried: dict[int, list[tuple[BusSignal, MapEntry]]] = {}
+        for signal in bus.signals:
             message = messages[signal.message]
-            key = _key(message) | (_TX_BIT if signal.direction is Direction.TX else 0)
-            self._carried.setdefault(key, []).append((signal, _compile(message, signal)))
-        known = {_key(message) for message in messages.values()}
+            key = frame_id(message) | (_TX_BIT if signal.direction is Direction.TX else 0)
+            self._carried.setdefault(key, []).append((signal, compile_entry(message, signal)))
+        known = {frame_id(message) for message in messages.values()}
         undirected: set[int] = set()
         if not directions:
             for identifier in known:
@@ -295,10 +267,10 @@ class BusDecoder:
 
 
 def _families(
-    carried: dict[int, list[tuple[BusSignal, _Entry]]],
+    carried: dict[int, list[tuple[BusSignal, MapEntry]]],
 ) -> tuple[list[_Family], dict[int, tuple[int, int]]]:
     """Frames with equal entries together; and the family and member number of each key."""
-    members: dict[tuple[_Entry, ...], list[int]] = {}
+    members: dict[tuple[MapEntry, ...], list[int]] = {}
     for key, pairs in carried.items():
         members.setdefault(tuple(entry for _, entry in pairs), []).append(key)
     families: list[_Family] = []
@@ -328,7 +300,7 @@ def _decode(
         unit = SESSION_UNIT[entry.quantity]
         if not entry.conditions and shortest >= entry.size:  # nearly always
             carries[:] = mentioned[:] = True
-            values = _values(entry, data)
+            values = entry.values(data)
             samples.append(DecodedSignals(signals, unit, rows, member, t_ns, values))
             continue
         selected = _selected(data, size, entry)
@@ -338,7 +310,7 @@ def _decode(
         short = selected & ~whole
         tally.short.update(labels[k] for k in _numbers(member[short]))
         if whole.any():
-            values = _values(entry, data[whole])
+            values = entry.values(data[whole])
             samples.append(
                 DecodedSignals(signals, unit, rows[whole], member[whole], t_ns[whole], values)
             )
@@ -351,11 +323,7 @@ def _numbers(member: IntArray) -> list[int]:
     return member.tolist()
 
 
-def _values(entry: _Entry, data: NDArray[np.uint8]) -> FloatArray:
-    return entry.unit.convert(entry.scale * entry.bits.values(data) + entry.offset)
-
-
-def _selected(data: NDArray[np.uint8], size: NDArray[np.uint8], entry: _Entry) -> BoolArray:
+def _selected(data: NDArray[np.uint8], size: NDArray[np.uint8], entry: MapEntry) -> BoolArray:
     """Frames that are meant to carry the entry: every multiplexer above it selects it.
 
     A frame too short for a multiplexer counts as selected, hence as too short.
@@ -371,31 +339,3 @@ def _selected(data: NDArray[np.uint8], size: NDArray[np.uint8], entry: _Entry) -
 
 def _name(key: int) -> str:
     return identifier_text(key & ~_TX_BIT)
-
-
-def _key(message: Message) -> int:
-    return message.frame_id | (EXTENDED_FLAG if message.is_extended_frame else 0)
-
-
-def _compile(message: Message, signal: BusSignal) -> _Entry:
-    by_name = {each.name: each for each in message.signals}
-    wanted = by_name[signal.signal]
-    bits = BitField.of(wanted)
-    size = bits.size
-    conditions: list[tuple[BitField, tuple[int, ...]]] = []
-    while wanted.multiplexer_signal is not None:
-        identifiers = tuple(wanted.multiplexer_ids or ())
-        wanted = by_name[wanted.multiplexer_signal]
-        multiplexer = BitField.of(wanted)
-        conditions.append((multiplexer, identifiers))
-        size = max(size, multiplexer.size)
-    return _Entry(
-        quantity=signal.quantity,
-        axis=signal.axis,
-        bits=bits,
-        unit=unit_for(signal.unit, signal.quantity),
-        scale=signal.scale,
-        offset=signal.offset,
-        conditions=tuple(conditions),
-        size=size,
-    )

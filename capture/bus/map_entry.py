@@ -1,0 +1,141 @@
+"""One entry of a bus map, compiled: where a quantity lies in its frame and what its bits mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray
+from ..errors import DataError
+from ..log.frames import EXTENDED_FLAG
+from ..robot import Bus, BusSignal, Quantity, Robot
+from ..robot.bus_map import database_messages
+from ..strict_table import Faults
+from ..units import Unit, unit_for
+from .bit_field import BitField
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+
+@dataclass(frozen=True)
+class MapEntry:
+    """Where a map entry lies in its frame and what its bits mean.
+
+    Attributes:
+        quantity: What it is of its target.
+        axis: Axis of a vector quantity, else empty.
+        bits: The signal.
+        unit: Unit of the decoded value.
+        scale: Applied to the decoded value.
+        offset: Added after ``scale``.
+        conditions: The multiplexers that select it, each with the values that do.
+        size: Data bytes needed, multiplexers included.
+    """
+
+    quantity: Quantity
+    axis: str
+    bits: BitField
+    unit: Unit
+    scale: float
+    offset: float
+    conditions: tuple[tuple[BitField, tuple[int, ...]], ...]
+    size: int
+
+    @property
+    def selection(self) -> tuple[tuple[int, ...], ...]:
+        """The multiplexer values that select it."""
+        return tuple(identifiers for _, identifiers in self.conditions)
+
+    def values(self, data: NDArray[np.uint8]) -> FloatArray:
+        """Values in the session's unit.
+
+        Args:
+            data: Data bytes, shape (n, k) with k of 8 or more, C-contiguous.
+
+        Returns:
+            Shape (n,).
+        """
+        return self.unit.convert(self.scale * self.bits.values(data) + self.offset)
+
+    def physical(self, value: float) -> float:
+        """The DBC's physical value of a value: the inverse of what :meth:`values` does with it.
+
+        Args:
+            value: In the session's unit.
+
+        Returns:
+            The value that the DBC's own scale and offset apply to.
+        """
+        return ((value - self.unit.offset) / self.unit.factor - self.offset) / self.scale
+
+
+def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
+    """A robot's bus map and the messages of its databases.
+
+    Args:
+        robot: The robot; its databases have been checked when it was read.
+
+    Returns:
+        The map, and message name to message.
+
+    Raises:
+        DataError: If the robot has no bus, or not the databases that its map needs.
+    """
+    if robot.bus is None:
+        raise DataError(
+            f"the robot {robot.name} has no bus map; frames can't be encoded or decoded"
+        )
+    messages = database_messages(dict(robot.databases), Faults()) or {}
+    if missing := {signal.message for signal in robot.bus.signals} - set(messages):
+        raise DataError(f"no database of {robot.name} has {', '.join(sorted(missing))}")
+    return robot.bus, messages
+
+
+def frame_id(message: Message) -> int:
+    """A message's identifier with the flags of :mod:`capture.log.frames`.
+
+    Args:
+        message: The message.
+
+    Returns:
+        The identifier.
+    """
+    return message.frame_id | (EXTENDED_FLAG if message.is_extended_frame else 0)
+
+
+def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
+    """Compile one entry.
+
+    Args:
+        message: The message that carries it.
+        signal: The entry.
+
+    Returns:
+        The entry, compiled.
+    """
+    by_name = {each.name: each for each in message.signals}
+    wanted = by_name[signal.signal]
+    bits = BitField.of(wanted)
+    size = bits.size
+    conditions: list[tuple[BitField, tuple[int, ...]]] = []
+    while wanted.multiplexer_signal is not None:
+        identifiers = tuple(wanted.multiplexer_ids or ())
+        wanted = by_name[wanted.multiplexer_signal]
+        multiplexer = BitField.of(wanted)
+        conditions.append((multiplexer, identifiers))
+        size = max(size, multiplexer.size)
+    return MapEntry(
+        quantity=signal.quantity,
+        axis=signal.axis,
+        bits=bits,
+        unit=unit_for(signal.unit, signal.quantity),
+        scale=signal.scale,
+        offset=signal.offset,
+        conditions=tuple(conditions),
+        size=size,
+    )
