@@ -27,6 +27,7 @@ from capture.robot import Robot
 from .contact import Contact, into_link_axes
 from .engine import BodyState
 from .servo import Drive, Rotors, Servos
+from .vectors import cross
 
 JOINT_TERMS = (
     "mechanical_net",
@@ -223,12 +224,5 @@ def _pressed(depth: ArrayLike) -> FloatArray:
 def _into_link_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     """World vectors in the links' own frames, component first: v - 2w (u x v) + 2 u x (u x v)."""
     u, w = quaternion[:3], quaternion[3]
-    turned = _cross(u, vector)
-    return vector - 2.0 * w * turned + 2.0 * _cross(u, turned)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return a[_NEXT] * b[_LAST] - a[_LAST] * b[_NEXT]
-
-
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+    turned = cross(u, vector)
+    return vector - 2.0 * w * turned + 2.0 * cross(u, turned)

@@ -1,0 +1,145 @@
+"""The articulated body, stepped by MuJoCo: the twin's second opinion.
+
+It stands under the same contract and the same force laws as :mod:`sim.physics.bullet`, so for one
+scenario the two must agree up to rounding. Both have the head's pose and the joint angles as their
+coordinates and follow the semi-implicit Euler rule. One keeps the head's angular velocity in the
+world, the other in the head's frame; as the head turns by exp(dt w) about the new w itself, both
+keep the same vector.
+
+Three things differ from MuJoCo's usual use: forces act at points of the links, so they are applied
+at the centres with their moment; nothing damps, stops or touches, so no constraint is solved; and
+the stages of a step are called one by one, because ``mj_step`` answers an impossible state by
+starting over and by writing a file into the working directory. The twin has a check of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.errors import UsageError
+from capture.robot import Plane, Robot
+
+from .engine import BodyState
+from .vectors import cross
+
+_AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
+_SCALAR_LAST = [1, 2, 3, 0]
+"""From MuJoCo's order w, x, y, z."""
+
+
+class MujocoEngine:
+    """A robot's links and joints in a physics world of their own."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        gravity: Sequence[float],
+        height: float,
+        heading: float,
+        velocity: Sequence[float],
+        dt: float,
+    ) -> None:
+        """Build the body, straight, its head above the origin.
+
+        Args:
+            robot: The robot.
+            gravity: Acceleration of gravity in the world [m/s^2], length 3.
+            height: Height of the links' centres [m].
+            heading: Direction of the head's x axis, about z [rad].
+            velocity: Of the whole body [m/s], length 3.
+            dt: Step [s].
+
+        Raises:
+            UsageError: If the engine cannot hold the robot.
+        """
+        self._model = _model(robot, gravity, dt)
+        self._data = mujoco.MjData(self._model)
+        self._data.qpos[:3] = (0.0, 0.0, height)
+        self._data.qpos[3:7] = (math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2))
+        self._data.qvel[:3] = velocity
+        self._derive()
+
+    def close(self) -> None:
+        """Nothing to do: the physics world is freed with this object."""
+
+    def read(self) -> BodyState:
+        """The present state.
+
+        Returns:
+            Positions and velocities of links and joints, in arrays of their own.
+        """
+        data = self._data  # its first body is the world
+        position = data.xipos[1:].T.copy()
+        turn = data.xquat[1:, _SCALAR_LAST].T.copy()
+        spin = data.cvel[1:, :3].T.copy()
+        # The velocity that each link, carried on, would have at the robot's centre of mass.
+        carried = data.cvel[1:, 3:].T
+        arm = position - data.subtree_com[1, :, np.newaxis]
+        velocity = carried + cross(spin, arm)
+        return BodyState(position, turn, velocity, spin, data.qpos[7:].copy(), data.qvel[6:].copy())
+
+    def push(self, force: FloatArray, point: FloatArray) -> None:
+        """Apply forces to the links during the next step; calls add up.
+
+        Args:
+            force: In the world [N], shape (3, n).
+            point: Points of action in the world [m], shape (3, n).
+        """
+        data = self._data
+        data.xfrc_applied[1:, :3] += force.T
+        data.xfrc_applied[1:, 3:] += cross(point - data.xipos[1:].T, force).T
+
+    def step(self, torque: FloatArray) -> None:
+        """Advance by one step, semi-implicit Euler.
+
+        Args:
+            torque: Of the joints [N m], shape (m,).
+        """
+        model, data = self._model, self._data
+        data.qfrc_applied[6:] = torque
+        mujoco.mj_fwdAcceleration(model, data)
+        mujoco.mj_fwdConstraint(model, data)  # without constraints: the accelerations as they are
+        mujoco.mj_Euler(model, data)
+        data.xfrc_applied[:] = 0.0
+        self._derive()
+
+    def _derive(self) -> None:
+        """What follows from coordinates and velocities: poses, inertias, bias forces."""
+        mujoco.mj_fwdPosition(self._model, self._data)
+        mujoco.mj_fwdVelocity(self._model, self._data)
+
+
+def _model(robot: Robot, gravity: Sequence[float], dt: float) -> mujoco.MjModel:
+    """The chain of links: masses, inertias and hinges, nothing else."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = dt
+    spec.option.gravity = gravity
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    before, behind = spec.worldbody, 0.0  # the body in front, and where it ends
+    for i, link in enumerate(robot.links):
+        half = link.length / 2
+        body = before.add_body(
+            pos=(behind - half if i else 0.0, 0.0, 0.0),
+            mass=link.mass,
+            inertia=link.inertia,
+            ipos=(0.0, 0.0, 0.0),
+            explicitinertial=True,
+        )
+        if i == 0:
+            body.add_freejoint()
+        else:
+            axis = _AXES[robot.joints[i - 1].plane]
+            body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, pos=(half, 0.0, 0.0), axis=axis)
+        before, behind = body, -half
+    try:
+        return spec.compile()
+    except ValueError as error:  # e.g. moments of inertia that no body can have
+        reason = str(error).splitlines()[0]
+        raise UsageError(f"the engine cannot hold robot {robot.name}: {reason}") from error
