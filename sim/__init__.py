@@ -5,8 +5,9 @@ This package imports light; :mod:`sim.twin` and :mod:`sim.record` bring the phys
 
 from .gait import Gait, GaitTick, PlaneGait, Serpentine, SerpentineGait, Wave
 from .readings import Readings
-from .scenario import Noise, Scenario
+from .scenario import Scenario
 from .scenario_file import load_scenario, parse_scenario, scenario_names
+from .sensing import Noise, SensorModels, ServoPolling
 from .world import FrictionLaw, Ground, World
 
 __all__ = [
@@ -18,8 +19,10 @@ __all__ = [
     "PlaneGait",
     "Readings",
     "Scenario",
+    "SensorModels",
     "Serpentine",
     "SerpentineGait",
+    "ServoPolling",
     "Wave",
     "World",
     "load_scenario",

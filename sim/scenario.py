@@ -16,6 +16,7 @@ from capture.robot import Robot
 
 from .gait import Serpentine
 from .physics.engine import EngineKind
+from .sensing import Noise, SensorModels
 from .toml_text import toml_text
 from .world import World
 
@@ -24,21 +25,6 @@ CONTROL_RATE_HZ = 100
 
 LONGEST_S = 86400.0
 """Longest run."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """White noise of what the servos report, as standard deviations.
-
-    Attributes:
-        position: [rad].
-        velocity: [rad/s].
-        effort: [N m].
-    """
-
-    position: float = 0.0
-    velocity: float = 0.0
-    effort: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +40,8 @@ class Scenario:
         duration_s: Length of the run.
         settle_s: The first part of it that is not fit for steady-state analysis.
         world: Where it is.
-        noise: What the encoders add.
+        noise: What the servos' readings carry.
+        sensing: How its sensors measure.
         servo: Servo parameters of all joints that differ from the robot's own.
         servo_of: The same of single joints, by joint name.
         seed: Of the noise.
@@ -72,6 +59,7 @@ class Scenario:
     settle_s: float = 0.0
     world: World = field(default_factory=World)
     noise: Noise = field(default_factory=Noise)
+    sensing: SensorModels = field(default_factory=SensorModels)
     servo: Mapping[str, float] = field(default_factory=dict[str, float])
     servo_of: Mapping[str, Mapping[str, float]] = field(
         default_factory=dict[str, Mapping[str, float]]
@@ -150,6 +138,7 @@ class Scenario:
             "gait": gait,
             "world": world,
             "noise": dataclasses.asdict(self.noise),
+            "sensing": dataclasses.asdict(self.sensing),
         }
         if self.servo:
             values["servo"] = dict(self.servo)

@@ -47,6 +47,12 @@ A scenario::
     velocity = 0.0                  # rad/s
     effort = 0.0                    # N m
 
+    [sensing.servo]                 # how the servos are polled
+    slot_s = 0.0                    # s, from one servo's turn to the next; 0: all at once
+    resolution = 0.0                # rad, of the encoders
+    dead_band = 0.0                 # rad, of the encoders
+    command_resolution = 0.0        # rad, step in which the servos take commands
+
 Required are ``description``, ``robot``, ``duration_s`` and one plane of the gait with amplitude,
 frequency and lag.
 """
@@ -68,7 +74,8 @@ from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
 from .gait import PlaneGait, Serpentine, Wave
 from .physics.engine import EngineKind
-from .scenario import CONTROL_RATE_HZ, LONGEST_S, Noise, Scenario
+from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from .sensing.toml import read_noise, read_sensing
 from .world import FrictionLaw, Ground, World
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
@@ -136,7 +143,8 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         "robot_name": robot_name,
         "gait": _gait(top.table("gait"), robot),
         "world": _world(top.table("world")),
-        "noise": _noise(top.table("noise")),
+        "noise": read_noise(top.table("noise")),
+        "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "servo": servo,
         "servo_of": _servos_of(top, robot),
         "seed": top.integer("seed", at_least=0) if "seed" in top else Scenario.seed,
@@ -232,13 +240,6 @@ def _world(table: Table) -> World:
     part.close()
     table.close()
     return World(gravity, heading, velocity, None if surface is _Surface.NONE else ground)
-
-
-def _noise(table: Table) -> Noise:
-    names = [item.name for item in dataclasses.fields(Noise)]
-    noise = Noise(**{name: table.number(name, default=0.0, at_least=0.0) for name in names})
-    table.close()
-    return noise
 
 
 def _servo_fields(table: Table) -> dict[str, float]:
