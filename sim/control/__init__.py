@@ -1,0 +1,1 @@
+"""Adaptive control: how distances and the compass change a gait."""
