@@ -8,6 +8,7 @@ and on to the next.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -136,3 +137,49 @@ class BitField:
         """
         with np.errstate(invalid="ignore"):  # a NaN in the frame is a NaN in the log
             return self.raw(data).astype(np.float64) * self.scale + self.offset
+
+    def raw_bits(self, value: float, lower: float = -math.inf, upper: float = math.inf) -> int:
+        """The bits of a physical value, the inverse of :meth:`values`.
+
+        Args:
+            value: Not NaN; what the field can't hold becomes the nearest that it can.
+            lower: Least physical value that is allowed.
+            upper: Greatest one.
+
+        Returns:
+            ``length`` bits, two's complement or IEEE 754.
+        """
+        if self.is_float:
+            cut = (min(max(value, lower), upper) - self.offset) / self.scale
+            with np.errstate(over="ignore"):  # beyond a narrow float's range is infinite
+                number = np.array(cut, dtype=_FLOATS[self.length])
+            return int(number.view(_UNSIGNED[self.length]))
+        least = -(1 << (self.length - 1)) if self.signed else 0
+        greatest = least + (1 << self.length) - 1
+        bounds = sorted((bound - self.offset) / self.scale for bound in (lower, upper))
+        if math.isfinite(bounds[0]):
+            least = max(least, round(bounds[0]))
+        if math.isfinite(bounds[1]):
+            greatest = min(greatest, round(bounds[1]))
+        raw = (value - self.offset) / self.scale
+        if math.isfinite(raw):
+            raw = min(max(round(raw), least), greatest)
+        else:
+            raw = greatest if raw > 0 else least
+        return raw & ((1 << self.length) - 1)
+
+    def placed(self, bits: int, size: int) -> int:
+        """Bits at their place in a frame's data.
+
+        Args:
+            bits: Of this field, ``length`` of them.
+            size: Number of data bytes.
+
+        Returns:
+            The data as one little-endian number, zero elsewhere: those of several fields are
+            joined by "or".
+        """
+        if self.little_endian:
+            return bits << self.start
+        number = bits << (8 * size - self._from_top - self.length)
+        return int.from_bytes(number.to_bytes(size, "big"), "little")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,11 @@ from .bit_field import BitField
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
+    from cantools.database.can.signal import Signal
+
+
+Conditions: TypeAlias = tuple[tuple[BitField, tuple[int, ...]], ...]
+"""The multiplexers that select a signal, each with the values that do."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class MapEntry:
     unit: Unit
     scale: float
     offset: float
-    conditions: tuple[tuple[BitField, tuple[int, ...]], ...]
+    conditions: Conditions
     size: int
 
     @property
@@ -108,6 +113,24 @@ def frame_id(message: Message) -> int:
     return message.frame_id | (EXTENDED_FLAG if message.is_extended_frame else 0)
 
 
+def conditions_of(signal: Signal, by_name: Mapping[str, Signal]) -> Conditions:
+    """What selects a signal.
+
+    Args:
+        signal: The signal.
+        by_name: All signals of its message.
+
+    Returns:
+        The multiplexers above it, the nearest first.
+    """
+    conditions: list[tuple[BitField, tuple[int, ...]]] = []
+    while signal.multiplexer_signal is not None:
+        identifiers = tuple(signal.multiplexer_ids or ())
+        signal = by_name[signal.multiplexer_signal]
+        conditions.append((BitField.of(signal), identifiers))
+    return tuple(conditions)
+
+
 def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
     """Compile one entry.
 
@@ -121,14 +144,7 @@ def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
     by_name = {each.name: each for each in message.signals}
     wanted = by_name[signal.signal]
     bits = BitField.of(wanted)
-    size = bits.size
-    conditions: list[tuple[BitField, tuple[int, ...]]] = []
-    while wanted.multiplexer_signal is not None:
-        identifiers = tuple(wanted.multiplexer_ids or ())
-        wanted = by_name[wanted.multiplexer_signal]
-        multiplexer = BitField.of(wanted)
-        conditions.append((multiplexer, identifiers))
-        size = max(size, multiplexer.size)
+    conditions = conditions_of(wanted, by_name)
     return MapEntry(
         quantity=signal.quantity,
         axis=signal.axis,
@@ -136,6 +152,6 @@ def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
         unit=unit_for(signal.unit, signal.quantity),
         scale=signal.scale,
         offset=signal.offset,
-        conditions=tuple(conditions),
-        size=size,
+        conditions=conditions,
+        size=max([bits.size, *(multiplexer.size for multiplexer, _ in conditions)]),
     )

@@ -1,0 +1,187 @@
+"""From the quantities of joints and sensors to raw CAN frames: the inverse of the decoder.
+
+A :class:`BusEncoder` is compiled once from a robot's databases and bus map. A controller encodes
+commands with it (direction tx), a virtual robot what its servos and sensors report (rx).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from ..errors import DataError
+from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
+from ..robot import BusSignal, Direction, Quantity, Robot
+from .bit_field import BitField
+from .map_entry import Conditions, MapEntry, bus_messages, compile_entry, conditions_of, frame_id
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+    from cantools.database.can.signal import Signal
+
+BusValue: TypeAlias = tuple[str, Quantity, str]
+"""What a value is: name of a joint or sensor, quantity, and axis of a vector quantity, else ""."""
+
+_MOST_BYTES = 8
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """A value's place in a frame, and what the DBC allows it to be."""
+
+    entry: MapEntry
+    lower: float
+    upper: float
+
+    def placed(self, value: float, size: int) -> int:
+        physical = self.entry.physical(value)
+        bits = self.entry.bits.raw_bits(physical, self.lower, self.upper)
+        return self.entry.bits.placed(bits, size)
+
+
+@dataclass
+class _Frame:
+    """One kind of frame in the making.
+
+    Attributes:
+        id_flags: Identifier with flags.
+        size: Number of data bytes.
+        fixed: Multiplexers and initial values of what the map doesn't name, at their places.
+        slots: The values that it carries.
+        last: The last of each, at its place.
+    """
+
+    id_flags: int
+    size: int
+    fixed: int
+    slots: dict[BusValue, _Slot]
+    last: dict[BusValue, int] = field(default_factory=dict[BusValue, int])
+
+    def data(self, values: Mapping[BusValue, float]) -> bytes | None:
+        """Its bytes, None if no value is of this frame."""
+        given = False
+        word = self.fixed
+        for key, slot in self.slots.items():
+            value = values.get(key, math.nan)
+            if not math.isnan(value):
+                self.last[key] = slot.placed(value, self.size)
+                given = True
+            word |= self.last[key]
+        return word.to_bytes(self.size, "little") if given else None
+
+
+class BusEncoder:
+    """The frames of one direction of a robot's bus."""
+
+    def __init__(self, robot: Robot, direction: Direction) -> None:
+        """Compile.
+
+        Args:
+            robot: The robot; its databases have been checked when it was read.
+            direction: Which frames, seen from the computer on the robot.
+
+        Raises:
+            DataError: If the robot has no bus, or a message that is no classic CAN frame.
+        """
+        bus, messages = bus_messages(robot)
+        self._way = DIR_TX if direction is Direction.TX else DIR_RX
+        carried: dict[str, list[BusSignal]] = {}
+        for signal in bus.signals:
+            if signal.direction is direction:
+                carried.setdefault(signal.message, []).append(signal)
+        self._frames: list[_Frame] = []
+        for name, signals in carried.items():
+            if messages[name].length > _MOST_BYTES:
+                raise DataError(f"{name} of {robot.name} is a CAN FD frame; only classic are sent")
+            self._frames += _frames_of(messages[name], signals)
+
+    @property
+    def values(self) -> frozenset[BusValue]:
+        """All values that the frames carry."""
+        return frozenset(key for frame in self._frames for key in frame.slots)
+
+    def encode(self, values: Mapping[BusValue, float], t_ns: int = 0) -> FrameArray:
+        """Encode values.
+
+        Each is rounded to the nearest that its field can hold; one beyond the field's range, or
+        beyond the DBC's minimum and maximum, becomes the nearest end of it (+inf: the greatest).
+
+        Args:
+            values: In the session's units (SI); NaN counts as not given. What no frame carries is
+                left out.
+            t_ns: Time of the frames, as host and as device time [ns].
+
+        Returns:
+            Records of :data:`capture.log.frames.FRAME_DTYPE`, in the order of the map: every frame
+            of which a value is given. Its other fields are as they were sent last, at first the
+            DBC's initial value, or zero.
+        """
+        ready = [(frame, data) for frame in self._frames if (data := frame.data(values))]
+        frames = empty_frames(len(ready))
+        frames["t_device_ns"] = frames["t_host_ns"] = t_ns
+        frames["id_flags"] = [frame.id_flags for frame, _ in ready]
+        frames["dlc"] = [frame.size for frame, _ in ready]
+        frames["dir"] = self._way
+        padded = b"".join(data.ljust(_MOST_BYTES, b"\0") for _, data in ready)
+        frames["data"] = np.frombuffer(padded, np.uint8).reshape(-1, _MOST_BYTES)
+        return frames
+
+
+def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
+    """One frame for each combination of multiplexer values that the entries need."""
+    dbc = {each.name: each for each in message.signals}
+    entries = {signal: compile_entry(message, signal) for signal in signals}
+    selections: dict[tuple[tuple[BitField, int], ...], None] = {}
+    for entry in entries.values():
+        selections[_selection(entry)] = None
+    if len(selections) > 1:
+        selections.pop((), None)  # what is in every frame needs none of its own
+    frames: list[_Frame] = []
+    for selection in selections:
+        chosen = dict(selection)
+        own = {s: entry for s, entry in entries.items() if _selected(entry.conditions, chosen)}
+        filled = {signal.signal for signal in own} | {s.multiplexer_signal for s in dbc.values()}
+        fixed = 0
+        for bits, identifier in selection:
+            fixed |= bits.placed(identifier, message.length)
+        for each in message.signals:
+            if each.name not in filled and _selected(conditions_of(each, dbc), chosen):
+                fixed |= _initial(each, message.length)
+        slots = {
+            (signal.target, signal.quantity, signal.axis): _slot(entry, dbc[signal.signal])
+            for signal, entry in own.items()
+        }
+        last = {
+            key: _initial(dbc[signal.signal], message.length)
+            for key, signal in zip(slots, own, strict=True)
+        }
+        frames.append(_Frame(frame_id(message), message.length, fixed, slots, last))
+    return frames
+
+
+def _selection(entry: MapEntry) -> tuple[tuple[BitField, int], ...]:
+    """The multiplexers above an entry, each with the least value that selects it."""
+    return tuple((bits, min(identifiers)) for bits, identifiers in entry.conditions)
+
+
+def _selected(conditions: Conditions, chosen: Mapping[BitField, int]) -> bool:
+    """Whether the multiplexers' values select a signal."""
+    return all(chosen.get(bits) in valid for bits, valid in conditions)
+
+
+def _slot(entry: MapEntry, signal: Signal) -> _Slot:
+    lower = -math.inf if signal.minimum is None else float(signal.minimum)
+    upper = math.inf if signal.maximum is None else float(signal.maximum)
+    return _Slot(entry, lower, upper)
+
+
+def _initial(signal: Signal, size: int) -> int:
+    """A signal's initial value at its place; zero where the DBC gives none."""
+    bits = BitField.of(signal)
+    if signal.initial is None or not isinstance(signal.initial, int | float):
+        return 0
+    return bits.placed(bits.raw_bits(float(signal.initial)), size)
