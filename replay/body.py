@@ -1,7 +1,8 @@
-"""The body in space: capsules where the links were, and a wireframe where they should have been.
+"""The body in space: where the links were, and a wireframe where they should have been.
 
-Capsules are Rerun's: a cylinder along z from the entity's origin, with a half ball on each end.
-Positions and quaternions are rounded to 2^-11 (0.5 mm, 0.06 degrees), which halves the file.
+Links are capsules, or meshes where they have one. Capsules are Rerun's: a cylinder along z from the
+entity's origin, with a half ball on each end. Their positions and quaternions are rounded to 2^-11
+(0.5 mm, 0.06 degrees), which halves the file.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from capture.robot.kinematics import quaternion_from_rotation
 
 from .colors import power_colors, power_limit
 from .joints import GREY
+from .meshes import log_poses, log_shapes, meshed
 from .motion import Motion
 from .sampling import decimate
 from .timeline import Clock
@@ -87,6 +89,7 @@ def capsule_columns(
     robot: Robot,
     poses: tuple[NDArray[np.float32], NDArray[np.float32]],
     colors: NDArray[np.uint8],
+    drawn: NDArray[np.bool_] | bool = True,
 ) -> rr.ComponentColumnList:
     """Rows of capsules, without those whose pose isn't known.
 
@@ -94,12 +97,13 @@ def capsule_columns(
         robot: The robot, m joints.
         poses: As :func:`capsule_poses` gives them, n rows.
         colors: Shape (n, m + 1, 4) or one that broadcasts to it.
+        drawn: Which links are drawn as capsules, shape (m + 1,).
 
     Returns:
         Columns of n rows with at most m + 1 capsules each.
     """
     origin, quaternion = poses
-    known = np.isfinite(np.concatenate([origin, quaternion], axis=-1)).all(axis=-1)
+    known = np.isfinite(np.concatenate([origin, quaternion], axis=-1)).all(axis=-1) & drawn
     length, radius = capsule_shape(robot)
     return rr.Capsules3D.columns(
         lengths=np.broadcast_to(length, known.shape)[known],
@@ -128,13 +132,17 @@ def log_body(
     power = None if motion.power_w is None else segment_power(motion.power_w)
     limit = None if power is None else limit_w or power_limit(power)
     rec.log(MEASURED, rr.Capsules3D.from_fields(fill_mode=FillMode.Solid), static=True)
+    solid = meshed(motion.robot)
+    log_shapes(rec, motion.robot)
     for rows, times in clock.rows(motion.t_ns):
         if power is None or limit is None:
             colors = joint_colors(len(motion.robot.links))
         else:
             colors = power_colors(power[rows], limit)
-        poses = capsule_poses(motion.robot, *motion.links(rows))
-        rec.send_columns(MEASURED, times, capsule_columns(motion.robot, poses, colors))
+        links = motion.links(rows)
+        poses = capsule_poses(motion.robot, *links)
+        rec.send_columns(MEASURED, times, capsule_columns(motion.robot, poses, colors, ~solid))
+        log_poses(rec, motion.robot, times, links, colors)
     return limit
 
 

@@ -267,16 +267,12 @@ class LiveScene:
     def _draw_ranges(self, motion: Motion) -> None:
         known = self._window.ranges
         sensors = tuple(
-            sensor
-            for sensor in ranges.range_sensors(motion.robot)
-            if ranges.sensor_topic(sensor) in known
+            sensor for sensor in ranges.range_sensors(motion.robot) if sensor.topic in known
         )
         if not sensors:
             return
         chosen = np.arange(motion.t_ns.size)
-        reading = np.stack(
-            [hold(*known[ranges.sensor_topic(sensor)], motion.t_ns) for sensor in sensors], axis=1
-        )
+        reading = np.stack([hold(*known[sensor.topic], motion.t_ns) for sensor in sensors], axis=1)
         ranges.log_rays(self._rec, self._clock, motion, chosen, sensors=sensors, reading=reading)
 
     def _draw_trail(self, motion: Motion) -> None:

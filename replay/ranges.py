@@ -19,20 +19,6 @@ RANGES_RATE_HZ = 25.0
 _COLOR = (232, 214, 130, 255)
 
 
-def sensor_topic(sensor: Sensor) -> str:
-    """Where a range sensor is logged.
-
-    Args:
-        sensor: An IR sensor, e.g. ``ir01``, or a sonar.
-
-    Returns:
-        E.g. ``/ir/01`` or ``/sonar``.
-    """
-    if sensor.kind is SensorKind.IR:
-        return f"/ir/{sensor.name.removeprefix('ir')}"
-    return f"/{sensor.name}"
-
-
 def rays(
     robot: Robot,
     sensors: tuple[Sensor, ...],
@@ -76,7 +62,7 @@ def log_ranges(rec: rr.RecordingStream, clock: Clock, session: Session, motion: 
         motion: What moved.
     """
     sensors = tuple(
-        sensor for sensor in range_sensors(motion.robot) if sensor_topic(sensor) in session.channels
+        sensor for sensor in range_sensors(motion.robot) if sensor.topic in session.channels
     )
     if not sensors:
         return
@@ -131,7 +117,7 @@ def log_rays(
 
 
 def _readings(session: Session, sensor: Sensor, at_ns: IntArray) -> FloatArray:
-    table = session.table(sensor_topic(sensor))
+    table = session.table(sensor.topic)
     t_ns, distance = ordered(
         table.index.to_numpy(dtype=np.int64), table["range"].to_numpy(dtype=np.float64)
     )

@@ -1,7 +1,8 @@
 """The robot as URDF, for viewers and simulators that know no robot TOML.
 
 URDF puts the frame of a link that hangs on a joint *at that joint*; the head's frame is at its
-centre. So rear links have their centre at x = -length/2 of their URDF frame. Each link looks like a
+centre. So rear links have their centre at x = -length/2 of their URDF frame. A link looks like its
+mesh, where it has one (the file lies beside the URDF among the session's attachments), else like a
 capsule: a cylinder from joint to joint with a ball at either end (URDF viewers know cylinders and
 spheres, few know capsules).
 """
@@ -66,6 +67,13 @@ def _add_link(root: ET.Element, link: Link, centre: float) -> None:
     ET.SubElement(inertial, "mass", value=repr(link.mass))
     ixx, iyy, izz = (repr(moment) for moment in link.inertia)
     ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
+    if link.mesh:
+        visual = ET.SubElement(element, "visual")
+        ET.SubElement(visual, "origin", xyz=f"{centre!r} 0 0", rpy="0 0 0")
+        scale = " ".join([repr(link.mesh_scale)] * 3)
+        shape = {"filename": link.mesh, "scale": scale}
+        ET.SubElement(ET.SubElement(visual, "geometry"), "mesh", shape)
+        return
     half, radius = link.length / 2, repr(link.radius)
     tube = {"radius": radius, "length": repr(link.length)}
     for shape, at, size in (

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import DataError, LogError, RobotFileError
 from ..robot import Robot
-from ..robot.description import parse_robot
+from ..robot.description import robot_in_session
 from .chunk import Block
 from .container_check import Container, check_chunk, check_container
 from .health import judge_file
@@ -216,18 +216,10 @@ class _Check:
         return chunk is not None and bool(chunk.crc)
 
     def _read_robot(self) -> Robot | None:
-        stored = self._file.attachments
-        if "robot.toml" not in stored:
-            return None
-        databases = {
-            name: item.data.decode("utf-8", "replace")
-            for name, item in stored.items()
-            if name.endswith(".dbc")
-        }
+        stored = {name: item.data for name, item in self._file.attachments.items()}
         try:
-            text = stored["robot.toml"].data.decode()
-            return parse_robot(text, source=f"{self._file.path}:robot.toml", databases=databases)
-        except (RobotFileError, UnicodeDecodeError) as error:
+            return robot_in_session(stored, self._file.path)
+        except RobotFileError as error:
             self._notes.append(f"the attached robot description can't be used: {error}")
             return None
 

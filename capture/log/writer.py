@@ -17,6 +17,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from ..errors import DataError, LogWriteError
 from ..robot import Robot
+from ..robot.mesh import mesh_type
 from .channels import Send
 from .mcap_sink import McapSink
 from .openers import ChannelOpeners
@@ -81,6 +82,8 @@ class SessionWriter(ChannelOpeners):
             self.attach("robot.toml", "application/toml", robot.toml.encode())
             for name, text in robot.databases:
                 self.attach(name, "text/plain", text.encode())
+            for name, data in robot.meshes:
+                self.attach(name, mesh_type(name) or "application/octet-stream", data)
 
     def __enter__(self) -> Self:
         """Nothing to do: the session is open."""

@@ -105,6 +105,9 @@ class Link:
         radius: [m].
         mass: [kg].
         inertia: Principal moments about the centre, along x, y, z [kg m^2].
+        mesh: File of its shape for the picture, in the link's frame; empty: it is drawn as the
+            capsule that it is to the physics.
+        mesh_scale: Metres in one unit of that file.
     """
 
     name: str
@@ -112,6 +115,8 @@ class Link:
     radius: float
     mass: float
     inertia: tuple[float, float, float]
+    mesh: str = ""
+    mesh_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -235,6 +240,7 @@ class Robot:
         bus: The bus map, or None.
         toml: The text it was read from; stored in every session.
         databases: DBC file name to text, for the session's attachments.
+        meshes: Mesh file name to bytes, likewise.
         assumed: Parts of the description (``links``, ``servo``, ``bus``, ...) that were assumed
             rather than known.
     """
@@ -248,6 +254,7 @@ class Robot:
     bus: Bus | None = None
     toml: str = ""
     databases: tuple[tuple[str, str], ...] = ()
+    meshes: tuple[tuple[str, bytes], ...] = field(default=(), repr=False)
     assumed: tuple[str, ...] = ()
 
     @property

@@ -8,7 +8,7 @@ import pytest
 
 from capture import load_robot, robot_names
 from capture.errors import RobotFileError, UsageError
-from capture.robot import ClockDomain, Direction, Plane, Quantity, SensorKind, Servo
+from capture.robot import ClockDomain, Direction, Plane, Quantity, Sensor, SensorKind, Servo
 from capture.robot.description import parse_robot
 
 MINIMAL = """
@@ -73,6 +73,13 @@ def test_snake25_is_the_robot_of_the_paper():
         "/compass",
     ]
     assert robot.assumed == ("links", "servo", "bus")
+
+
+def test_topics_are_those_of_the_log_contract():
+    place = {"link": "link01", "position": (0, 0, 0), "rpy": (0, 0, 0)}
+    assert Sensor("ir07", SensorKind.IR, **place).topic == "/ir/07"
+    assert Sensor("sonar", SensorKind.SONAR, **place).topic == "/sonar"
+    assert Sensor("rear", SensorKind.SONAR, **place).topic == "/sonar/rear"
 
 
 def test_snake25_has_one_command_and_one_state_frame_a_servo():
@@ -198,7 +205,7 @@ assumed = ["postion"]
         "  joints and sensors: found 2 times joint01; valid: every name once",
         (
             "  clok: found an unknown key; valid: defaults, name, description, clock, assumed, "
-            "joints, links, sensors, bus (did you mean clock?)"
+            "chain, joints, links, sensors, bus (did you mean clock?)"
         ),
     ]
 

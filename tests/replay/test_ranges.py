@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from capture.robot import Sensor, SensorKind
 from capture.robot.kinematics import link_poses
-from replay.ranges import rays, sensor_topic
+from replay.ranges import rays
 
 
 def ir(name="ir01", link="link01", position=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), limit=1.5):
@@ -37,10 +37,3 @@ def test_nothing_seen_draws_nothing(snake25, reading):
     centre, rotation = straight(snake25, Rotation.identity())
     _, vector = rays(snake25, (ir(),), centre, rotation, np.array([[reading]]))
     assert np.isnan(vector).all()
-
-
-def test_topics_are_those_of_the_log_contract():
-    assert sensor_topic(ir("ir07")) == "/ir/07"
-    assert (
-        sensor_topic(Sensor("sonar", SensorKind.SONAR, "link01", (0, 0, 0), (0, 0, 0))) == "/sonar"
-    )
