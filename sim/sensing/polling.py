@@ -116,7 +116,7 @@ class JointPolling:
         self._next += 1
         start = n * (cycle - self._first)  # in steps from the first period kept
         end = n * len(self._kept)
-        offset = np.minimum(self._offset_s / self._dt, end - start)
+        offset: FloatArray = np.minimum(self._offset_s / self._dt, float(end - start))
         at = start + offset
         motion = np.concatenate(
             [self._kept[0].motion[:1], *(period.motion[1:] for period in self._kept)]
