@@ -161,16 +161,16 @@ class BulletEngine:
         return BodyState(fields[:3], fields[3:7], fields[7:10], fields[10:], angle, rate)
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
-        """Apply forces to the links during the next step.
+        """Apply forces to the links during the next step; calls add up.
 
         Args:
-            force: In the world [N], shape (3, n); links without vertical force are left out.
+            force: In the world [N], shape (3, n).
             point: Points of action in the world [m], shape (3, n).
         """
         apply, world = pybullet.applyExternalForce, pybullet.WORLD_FRAME
         body, client = self._body, self._client
         for i, (vector, at) in enumerate(zip(force.T.tolist(), point.T.tolist(), strict=True), -1):
-            if vector[2] > 0.0:
+            if any(vector):
                 apply(body, i, vector, at, world, client)
 
     def step(self, torque: FloatArray) -> None:

@@ -1,0 +1,120 @@
+"""Two engines under one force law: PyBullet and MuJoCo must tell the same story to rounding."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from capture.errors import SimulationError, UsageError
+from capture.robot import Link, Plane
+from sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
+from sim.physics.engine import EngineKind, engine_type
+from sim.twin import Twin
+
+pytest.importorskip("mujoco")
+
+LATERAL = {Plane.HORIZONTAL: PlaneGait(0.4, 0.5, math.pi / 3)}
+SIDEWINDING = {
+    Plane.HORIZONTAL: PlaneGait(0.4, 0.5, math.pi / 6),
+    Plane.VERTICAL: PlaneGait(0.15, 0.5, math.pi / 6, phase=math.pi / 2),
+}
+ROLLING = {
+    Plane.HORIZONTAL: PlaneGait(0.3, 0.5, 0.0),
+    Plane.VERTICAL: PlaneGait(0.3, 0.5, 0.0, phase=math.pi / 2),
+}
+
+
+def run(scenario, engine):
+    with Twin(dataclasses.replace(scenario, engine=engine)) as twin:
+        return list(twin.samples())
+
+
+def both(scenario):
+    return (run(scenario, engine) for engine in EngineKind)
+
+
+def apart(ones, others):
+    """Greatest distance between the links of two runs [m]."""
+    pairs = zip(ones, others, strict=True)
+    return max(np.abs(a.step.body.position - b.step.body.position).max() for a, b in pairs)
+
+
+@pytest.mark.parametrize("law", FrictionLaw)
+@pytest.mark.parametrize(
+    "gait",
+    [
+        pytest.param(LATERAL, id="lateral"),
+        pytest.param(SIDEWINDING, id="sidewinding", marks=pytest.mark.slow),
+    ],
+)
+def test_engines_agree_after_six_seconds_on_the_ground(make_scenario, make_robot, law, gait):
+    robot = make_robot(stall_torque=0.25)
+    world = World(heading=0.3, ground=Ground(law=law))
+    scenario = make_scenario(robot, gait=Serpentine(gait, 2.0), world=world, duration_s=6.0)
+    bullet, mujoco = both(scenario)
+    way = bullet[-1].step.body.position - bullet[0].step.body.position
+    assert np.abs(way).max() > 0.05
+    assert apart(bullet, mujoco) < 1e-10
+    np.testing.assert_allclose(mujoco[-1].energy, bullet[-1].energy, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_engines_agree_on_a_body_that_rolls_over(make_scenario, make_robot):
+    gait = Serpentine(ROLLING, 2.0)
+    bullet, mujoco = both(make_scenario(make_robot(), gait=gait, duration_s=6.0))
+    x, y = np.array([sample.step.body.quaternion[:2, 0] for sample in bullet]).T
+    upright = 1 - 2 * (x * x + y * y)  # the head's z axis on the world's
+    assert upright.min() < -0.9  # it has stood on its back
+    assert apart(bullet, mujoco) < 1e-10
+
+
+@pytest.fixture
+def uneven(make_robot):
+    """Links that differ in every respect, so that no mix-up goes unseen."""
+    robot = make_robot(6)
+    links = tuple(
+        Link(f"link{i}", 0.05 + 0.01 * i, 0.02, 0.1 + 0.02 * i, (3e-5 + i * 1e-6, 5e-5, 6e-5))
+        for i in range(6)
+    )
+    return dataclasses.replace(robot, links=links)
+
+
+def test_engines_agree_on_an_uneven_body_that_tumbles(uneven):
+    # No force law of ours: forces and torques of chance, anywhere on the links, in two portions.
+    start = {"gravity": (0.3, -0.2, -1.0), "height": 1.0, "heading": 0.7, "velocity": (0.2, 0.1, 0)}
+    states = []
+    for kind in EngineKind:
+        random = np.random.default_rng(5)
+        body = engine_type(kind)(uneven, **start, dt=1e-3)
+        for _ in range(1000):
+            state = body.read()
+            for _ in range(2):
+                force, arm = random.normal(size=(2, 3, 6)) * [[[0.5]], [[0.03]]]
+                body.push(force, state.position + arm)
+            body.step(0.02 * random.normal(size=5) - 2e-3 * state.rate)
+        states.append(body.read())
+        body.close()
+    bullet, mujoco = states
+    assert np.abs(bullet.spin).max() > 1.0
+    for a, b in zip(bullet, mujoco, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)
+
+
+def test_an_impossible_state_is_an_error_and_leaves_no_file(
+    make_scenario, make_robot, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    world = World(ground=Ground(stiffness=1e7))
+    scenario = make_scenario(make_robot(5), ramp_s=0.0, duration_s=2.0, world=world)
+    with pytest.raises(SimulationError, match="the twin failed at 0"):
+        run(scenario, EngineKind.MUJOCO)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_body_that_cannot_be_is_refused(uneven):
+    # A thin rod about x, but with two moments that no rod has: A + B >= C for every body.
+    links = (dataclasses.replace(uneven.links[0], inertia=(1e-5, 1e-5, 9e-5)), *uneven.links[1:])
+    start = {"gravity": (0, 0, -9.81), "height": 1.0, "heading": 0.0, "velocity": (0, 0, 0)}
+    with pytest.raises(UsageError, match=r"cannot hold robot chain: .*A \+ B >= C"):
+        engine_type(EngineKind.MUJOCO)(dataclasses.replace(uneven, links=links), **start, dt=1e-3)
