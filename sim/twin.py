@@ -24,8 +24,9 @@ from .physics.contact import contact_law
 from .physics.engine import engine_type
 from .physics.ledger import Ledger, Step
 from .physics.servo import Drive, Rotors, Servos
-from .readings import Readings
 from .scenario import CONTROL_RATE_HZ, Scenario
+from .sensing.contract import SensorSample
+from .sensing.senses import Senses
 from .stability import likely_cause
 
 MAX_SPEED = 10.0
@@ -39,6 +40,8 @@ class Sample(NamedTuple):
         tick: Number of the control period, from 0.
         gait: What the gait commands from here on.
         step: Body, ground, rotors and servos at this instant.
+        sensed: The sensors' samples that have arrived since the tick before; the newest ones
+            arrive after the run, by :meth:`Twin.flush`.
         drive: Means over the control period around this instant (half a one at start and end).
         energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (19,).
     """
@@ -46,6 +49,7 @@ class Sample(NamedTuple):
     tick: int
     gait: GaitTick
     step: Step
+    sensed: list[SensorSample]
     drive: Drive
     energy: FloatArray
 
@@ -82,6 +86,7 @@ class Twin:
         self._below = np.zeros((3, len(radius)))
         self._below[2] = -radius
         self._ground_law = contact_law(world.ground, radius)
+        self._sensing = Senses(scenario)
         self._dt = 1.0 / scenario.physics_rate_hz
         self._body = engine_type(scenario.engine)(
             robot,
@@ -133,19 +138,29 @@ class Twin:
         behind: list[Step] = []  # the control period that ends at the tick
         for tick in range(self.scenario.tick_count):
             time_s = tick / CONTROL_RATE_HZ
+            sensed: list[SensorSample] = []
             if tick:
                 behind = self._advance(behind, half, time_s - self._dt * half)
                 self._ledger.book(behind)
                 self._step = behind[-1]
-            gait = self.gait.step(time_s, Readings.nothing(self.scenario.robot))
+                sensed = self._sensing.observe(behind)
+            gait = self.gait.step(time_s, self._sensing.readings)
             self._reference = gait.command
             step = self._step = self._step._replace(drive=self._drive(self._step))
             energy = self._ledger.read(step)
             last = tick == self.scenario.tick_count - 1
             ahead = [step] if last else self._advance([step], half, time_s)
             around = [part.drive for part in (*behind[-1 - half : -1], *ahead[:half])]
-            yield Sample(tick, gait, step, _mean(around), energy)
+            yield Sample(tick, gait, step, sensed, _mean(around), energy)
             behind = ahead
+
+    def flush(self) -> list[SensorSample]:
+        """End the run, wherever it stands: sensor samples that have not arrived yet.
+
+        Returns:
+            These samples, in the order of their arrival.
+        """
+        return self._sensing.flush()
 
     def _look(self, rotors: Rotors) -> Step:
         """All that acts at this instant."""
