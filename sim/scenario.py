@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +14,7 @@ from capture.errors import UsageError
 from capture.robot import Robot
 
 from .gait import Serpentine
+from .modules import Modules
 from .physics.engine import EngineKind
 from .sensing import Noise, SensorModels
 from .toml_text import toml_text
@@ -35,15 +35,14 @@ class Scenario:
         name: Short name.
         description: One sentence.
         robot_name: The robot as the scenario names it.
-        robot: The robot, with the scenario's servos.
+        robot: The robot, with the scenario's modules.
         gait: What it is commanded to do.
         duration_s: Length of the run.
         settle_s: The first part of it that is not fit for steady-state analysis.
         world: Where it is.
         noise: What the servos' readings carry.
         sensing: How its sensors measure.
-        servo: Servo parameters of all joints that differ from the robot's own.
-        servo_of: The same of single joints, by joint name.
+        modules: Its servos and links that differ from the robot's own.
         seed: Of the noise.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
@@ -60,10 +59,7 @@ class Scenario:
     world: World = field(default_factory=World)
     noise: Noise = field(default_factory=Noise)
     sensing: SensorModels = field(default_factory=SensorModels)
-    servo: Mapping[str, float] = field(default_factory=dict[str, float])
-    servo_of: Mapping[str, Mapping[str, float]] = field(
-        default_factory=dict[str, Mapping[str, float]]
-    )
+    modules: Modules = field(default_factory=Modules)
     seed: int = 1
     epoch_s: int = 1_735_689_600  # 2025-01-01T00:00:00Z: near zero, viewers misread stamps
     physics_rate_hz: int = 1000
@@ -139,9 +135,6 @@ class Scenario:
             "world": world,
             "noise": dataclasses.asdict(self.noise),
             "sensing": dataclasses.asdict(self.sensing),
+            **self.modules.tables(),
         }
-        if self.servo:
-            values["servo"] = dict(self.servo)
-        if self.servo_of:
-            values["servo_of"] = {name: dict(one) for name, one in self.servo_of.items()}
         return toml_text(values)

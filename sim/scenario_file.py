@@ -42,6 +42,9 @@ A scenario::
     [servo_of.joint07]              # and of single joints
     stall_torque = 0.2
 
+    [link_of.link07]                # and of single links
+    mass_factor = 1.5               # its mass and moments of inertia, times this
+
     [noise]                         # standard deviations of what the servos report
     position = 0.0                  # rad
     velocity = 0.0                  # rad/s
@@ -59,20 +62,19 @@ frequency and lag.
 
 from __future__ import annotations
 
-import dataclasses
 import tomllib
-from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from capture.errors import Fault, ScenarioError
-from capture.robot import Plane, Robot, Servo
+from capture.robot import Plane, Robot
 from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
 from .gait import PlaneGait, Serpentine, Wave
+from .modules import read_modules
 from .physics.engine import EngineKind
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .sensing.toml import read_noise, read_sensing
@@ -80,7 +82,6 @@ from .world import FrictionLaw, Ground, World
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
 _SHELF = Shelf("scenario", "sim", "scenarios", ScenarioError)
-_MAY_BE_ZERO = ("viscous_friction", "coulomb_friction", "gear_damping")
 
 
 class _Surface(StrEnum):
@@ -136,7 +137,6 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
     robot_name = top.text("robot")
     robot = _robot(top, robot_name, source.parent)
-    servo = _servo_fields(top.table("servo"))
     parts: dict[str, Any] = {
         "name": top.name("name") if "name" in top else stem,
         "description": top.text("description"),
@@ -145,8 +145,7 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         "world": _world(top.table("world")),
         "noise": read_noise(top.table("noise")),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
-        "servo": servo,
-        "servo_of": _servos_of(top, robot),
+        "modules": read_modules(top, robot),
         "seed": top.integer("seed", at_least=0) if "seed" in top else Scenario.seed,
         "engine": (top.choice("engine", EngineKind) if "engine" in top else None)
         or Scenario.engine,
@@ -155,8 +154,7 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
     top.close()
     if (found := faults.all()) or robot is None:
         raise ScenarioError(source, found)
-    fitted = _with_servos(robot, servo, parts["servo_of"])
-    return Scenario(robot=fitted, **parts)
+    return Scenario(robot=parts["modules"].fitted(robot), **parts)
 
 
 def _times(top: Table) -> dict[str, float]:
@@ -240,42 +238,3 @@ def _world(table: Table) -> World:
     part.close()
     table.close()
     return World(gravity, heading, velocity, None if surface is _Surface.NONE else ground)
-
-
-def _servo_fields(table: Table) -> dict[str, float]:
-    """The servo parameters that a table gives."""
-    given: dict[str, float] = {}
-    for item in dataclasses.fields(Servo):
-        if item.name not in table:
-            table.number(item.name, default=0.0)  # asked for, so that a slip of it is recognised
-        elif item.name in _MAY_BE_ZERO:
-            given[item.name] = table.number(item.name, at_least=0.0)
-        else:
-            given[item.name] = table.number(item.name, above=0.0)
-    table.close()
-    return given
-
-
-def _servos_of(top: Table, robot: Robot | None) -> dict[str, dict[str, float]]:
-    """The servo parameters of single joints, by joint name."""
-    table = top.table("servo_of")
-    names = robot.joint_names if robot is not None else ()
-    fields = {name: _servo_fields(table.table(name)) for name in names}
-    given = {name: values for name, values in fields.items() if values}
-    if robot is not None:
-        table.close()
-    return given
-
-
-def _with_servos(
-    robot: Robot, servo: Mapping[str, float], servo_of: Mapping[str, Mapping[str, float]]
-) -> Robot:
-    """The robot with other servo parameters."""
-    joints = tuple(
-        dataclasses.replace(
-            joint,
-            servo=dataclasses.replace(joint.servo, **{**servo, **servo_of.get(joint.name, {})}),
-        )
-        for joint in robot.joints
-    )
-    return dataclasses.replace(robot, joints=joints)

@@ -57,6 +57,8 @@ stall_torque = 0.25
 [servo_of.joint03]
 stall_torque = 0.2
 coulomb_friction = 0
+[link_of.link04]
+mass_factor = 1.5
 [noise]
 position = 1e-3
 """
@@ -87,6 +89,9 @@ def test_every_key_is_read_and_written_back():
     stalls = [joint.servo.stall_torque for joint in scenario.robot.joints]
     assert stalls == [0.25, 0.25, 0.2, *[0.25] * 9]
     assert scenario.robot.joints[2].servo.coulomb_friction == 0.0
+    masses = [link.mass for link in scenario.robot.links]
+    assert masses == pytest.approx([0.1] * 3 + [0.15] + [0.1] * 9, rel=1e-15)
+    assert scenario.robot.links[3].inertia == pytest.approx((6e-5, 7.5e-5, 7.5e-5), rel=1e-15)
     assert parse_scenario(scenario.toml(), "y.toml") == scenario
 
 
@@ -178,6 +183,8 @@ def test_all_faults_are_listed_at_once():
         ("epoch_s = 2147483647", "", "epoch_s"),
         ("gait.ramp_s = -1", "", "gait.ramp_s"),
         ("", "[servo_of.joint99]\nstall_torque = 1", "servo_of.joint99"),
+        ("", "[link_of.link01]\nmass_factor = 0", "link_of.link01.mass_factor"),
+        ("", "[link_of.link14]\nmass_factor = 2", "link_of.link14"),
     ],
 )
 def test_faults_that_depend_on_other_keys(before, after, key):
