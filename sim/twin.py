@@ -66,6 +66,8 @@ class Twin:
         scenario: What it runs.
         gait: Its gait.
         servos: Its servos.
+        sensed: Sensor samples that arrive by the present tick, there before the gait is asked: a
+            gait that speaks over a bus hands them out first.
     """
 
     def __init__(self, scenario: Scenario, gait: Gait | None = None) -> None:
@@ -86,6 +88,7 @@ class Twin:
         self._below = np.zeros((3, len(radius)))
         self._below[2] = -radius
         self._ground_law = contact_law(world.ground, radius)
+        self.sensed: list[SensorSample] = []
         self._sensing = Senses(scenario)
         self._dt = 1.0 / scenario.physics_rate_hz
         self._body = engine_type(scenario.engine)(
@@ -138,12 +141,11 @@ class Twin:
         behind: list[Step] = []  # the control period that ends at the tick
         for tick in range(self.scenario.tick_count):
             time_s = tick / CONTROL_RATE_HZ
-            sensed: list[SensorSample] = []
             if tick:
                 behind = self._advance(behind, half, time_s - self._dt * half)
                 self._ledger.book(behind)
                 self._step = behind[-1]
-                sensed = self._sensing.observe(behind)
+                self.sensed = self._sensing.observe(behind)
             gait = self.gait.step(time_s, self._sensing.readings)
             self._reference = gait.command
             step = self._step = self._step._replace(drive=self._drive(self._step))
@@ -151,7 +153,7 @@ class Twin:
             last = tick == self.scenario.tick_count - 1
             ahead = [step] if last else self._advance([step], half, time_s)
             around = [part.drive for part in (*behind[-1 - half : -1], *ahead[:half])]
-            yield Sample(tick, gait, step, sensed, _mean(around), energy)
+            yield Sample(tick, gait, step, self.sensed, _mean(around), energy)
             behind = ahead
 
     def flush(self) -> list[SensorSample]:
