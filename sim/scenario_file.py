@@ -34,7 +34,9 @@ A scenario::
     mu_tangential = 0.05
     mu_normal = 0.5
     slip_speed = 0.01               # m/s, smoothing of friction
-    law = "ellipse"                 # or "box", "transeth"
+    law = "ellipse"                 # or "box", "transeth"; or "viscous", with drag for friction
+    drag_tangential = 1.0           # N s/m, of a link, viscous law
+    drag_normal = 10.0
 
     [servo]                         # instead of the robot's own parameters
     stall_torque = 0.25
@@ -234,6 +236,10 @@ def _world(table: Table) -> World:
         mu_normal=part.number("mu_normal", default=Ground.mu_normal, at_least=0.0),
         slip_speed=part.number("slip_speed", default=Ground.slip_speed, above=0.0),
         law=law or Ground.law,
+        drag_tangential=part.number(
+            "drag_tangential", default=Ground.drag_tangential, at_least=0.0
+        ),
+        drag_normal=part.number("drag_normal", default=Ground.drag_normal, at_least=0.0),
     )
     part.close()
     table.close()

@@ -3,7 +3,7 @@
 Each part is taken alone, as a spring or damper between two free masses stepped by the
 semi-implicit Euler rule, which is stable for omega dt < 2 (spring) and c dt / m < 2 (damper). The
 coupled robot has other bounds, so this ranks suspects; it proves nothing. Too small a smoothing of
-friction does not blow up, since friction is bounded: it makes the robot tremble.
+Coulomb friction does not blow up, since that is bounded: it makes the robot tremble.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 from .scenario import Scenario
+from .world import FrictionLaw
 
 
 def stability_numbers(scenario: Scenario) -> dict[str, float]:
@@ -27,13 +28,17 @@ def stability_numbers(scenario: Scenario) -> dict[str, float]:
     shares: dict[str, float] = {}
     if ground is not None:
         mass = min(link.mass for link in robot.links)
-        mu = max(ground.mu_normal, ground.mu_tangential)
-        g = math.hypot(*scenario.world.gravity)
         # A sideways force at the contact point, r below the centre, also rolls the link.
         roll = max(1 + part.mass * part.radius**2 / part.inertia[0] for part in robot.links)
         shares["world.ground.stiffness"] = ground.stiffness * dt**2 / mass / 4
         shares["world.ground.damping"] = ground.damping * dt / mass / 2
-        shares["world.ground.slip_speed"] = mu * g * roll * dt / ground.slip_speed / 2
+        if ground.law is FrictionLaw.VISCOUS:
+            for name in ("drag_tangential", "drag_normal"):
+                shares[f"world.ground.{name}"] = getattr(ground, name) * roll * dt / mass / 2
+        else:
+            mu = max(ground.mu_normal, ground.mu_tangential)
+            g = math.hypot(*scenario.world.gravity)
+            shares["world.ground.slip_speed"] = mu * g * roll * dt / ground.slip_speed / 2
     # Links turn about a joint with the inertia about their ends.
     link = min(min(part.inertia) + part.mass * part.length**2 / 4 for part in robot.links)
     for joint in robot.joints:
@@ -78,7 +83,7 @@ def likely_cause(scenario: Scenario) -> str:
         A clause for an error message.
     """
     shares = stability_numbers(scenario)
-    shares.pop("world.ground.slip_speed", None)  # friction is bounded
+    shares.pop("world.ground.slip_speed", None)  # Coulomb friction is bounded
     name, share = max(shares.items(), key=lambda item: item[1])
     if share < 0.5:
         return "no parameter is too stiff for the step: look at the gait and the start"

@@ -1,9 +1,9 @@
-"""The ground: a one-sided spring and damper, and anisotropic Coulomb friction.
+"""The ground: a one-sided spring and damper, and anisotropic friction or drag.
 
 Each link touches the ground in one point, the lowest point of a sphere of the link's radius about
 its centre. Friction acts there along the link's own axes: *tangential* is the link's x axis laid
-on the ground, *normal* is the horizontal direction 90 degrees to the left of it. The friction is
-regularised: it vanishes smoothly with the slip speed, so a body at rest under a load below the
+on the ground, *normal* is the horizontal direction 90 degrees to the left of it. Coulomb friction
+is regularised: it vanishes smoothly with the slip speed, so a body at rest under a load below the
 Coulomb limit creeps (there is no true stiction). A link whose x axis is exactly vertical has no
 tangential direction and feels no friction.
 
@@ -81,12 +81,29 @@ def friction_force(
         normal: Normal force [N], shape (n,).
         mu: (mu_t, mu_n), shape (2, 1).
         slip_speed: eps [m/s].
-        law: How the two coefficients combine.
+        law: One of Coulomb's: how the two coefficients combine.
 
     Returns:
         Force along (tangential, normal) [N], shape (2, n).
     """
     return _LAWS[law](slip, mu, slip_speed) * normal
+
+
+def drag_force(slip: FloatArray, depth: FloatArray, drag: FloatArray) -> FloatArray:
+    """Viscous drag along a link's tangential and normal axes, F_i = -c_i v_i.
+
+    It is that of resistive-force theory (Gray & Hancock, J. Exp. Biol. 32, 1955): linear in the
+    slip and independent of the load.
+
+    Args:
+        slip: Velocity of the contact points along (tangential, normal) [m/s], shape (2, n).
+        depth: Of the contact points below the surface; there is no drag above it [m], shape (n,).
+        drag: (c_t, c_n) [N s/m], shape (2, 1).
+
+    Returns:
+        Force along (tangential, normal) [N], shape (2, n).
+    """
+    return -drag * slip * (depth > 0.0)
 
 
 def tangents(quaternion: FloatArray) -> FloatArray:
@@ -158,6 +175,12 @@ def contact_law(ground: Ground | None, radius: FloatArray) -> ContactLaw:
     """
     surface = ground or Ground(stiffness=0.0, damping=0.0)
     mu = np.array([[surface.mu_tangential], [surface.mu_normal]])
+    drag = np.array([[surface.drag_tangential], [surface.drag_normal]])
+
+    def resistance(slip: FloatArray, normal: FloatArray, depth: FloatArray) -> FloatArray:
+        if surface.law is FrictionLaw.VISCOUS:
+            return drag_force(slip, depth, drag)
+        return friction_force(slip, normal, mu, surface.slip_speed, surface.law)
 
     def contact(
         position: FloatArray, quaternion: FloatArray, velocity: FloatArray, spin: FloatArray
@@ -170,8 +193,7 @@ def contact_law(ground: Ground | None, radius: FloatArray) -> ContactLaw:
         normal = normal_force(depth, -velocity[2], surface.stiffness, surface.damping)
         tangent = tangents(quaternion)
         slip = into_link_axes(tangent, at_point)
-        friction = friction_force(slip, normal, mu, surface.slip_speed, surface.law)
-        (tx, ty), (along, across) = tangent, friction
+        (tx, ty), (along, across) = tangent, resistance(slip, normal, depth)
         force = np.empty_like(at_point)
         np.subtract(tx * along, ty * across, out=force[0])
         np.add(ty * along, tx * across, out=force[1])

@@ -11,6 +11,7 @@ from capture.robot.kinematics import rotation_from_quaternion
 from sim import FrictionLaw, Ground
 from sim.physics.contact import contact_law, friction_force, normal_force, tangents
 
+COULOMB = tuple(law for law in FrictionLaw if law is not FrictionLaw.VISCOUS)
 MU = np.array([[0.05], [0.5]])
 EPS = 0.01
 speeds = st.floats(-5, 5, allow_subnormal=False)
@@ -29,7 +30,7 @@ def test_normal_force_never_pulls_and_ends_at_the_surface():
     assert normal_force(depth, rate, 2000.0, 20.0).tolist() == [0.0, 2.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("law", FrictionLaw)
+@pytest.mark.parametrize("law", COULOMB)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_along_one_axis_every_law_is_smoothed_coulomb(law, axis):
     v = np.array([-2.0, -0.01, 0.0, 0.003, 1.0])
@@ -40,7 +41,7 @@ def test_along_one_axis_every_law_is_smoothed_coulomb(law, axis):
     assert not force[1 - axis].any()
 
 
-@pytest.mark.parametrize("law", FrictionLaw)
+@pytest.mark.parametrize("law", COULOMB)
 def test_without_coefficients_there_is_no_friction(law):
     slip = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     assert not friction_force(slip, np.ones(3), np.zeros((2, 1)), EPS, law).any()
@@ -49,7 +50,7 @@ def test_without_coefficients_there_is_no_friction(law):
     assert not slippery[0].any()
 
 
-@given(vt=speeds, vn=speeds, law=st.sampled_from(FrictionLaw))
+@given(vt=speeds, vn=speeds, law=st.sampled_from(COULOMB))
 def test_friction_dissipates_and_stays_inside_its_bound(vt, vn, law):
     slip = np.array([[vt], [vn]])
     force = friction_force(slip, np.ones(1), MU, EPS, law)
@@ -104,6 +105,18 @@ def test_turning_everything_turns_the_forces(turn, yaw, law, seed):
 
     matrix, turned = at(yaw + turn, turn)
     np.testing.assert_allclose(turned, matrix @ at(yaw, 0.0)[1], atol=1e-12)
+
+
+@given(vt=speeds, vn=speeds, depth=st.floats(1e-6, 1e-2))
+def test_viscous_drag_is_linear_and_takes_no_notice_of_the_load(vt, vn, depth):
+    ground = Ground(law=FrictionLaw.VISCOUS, drag_tangential=0.3, drag_normal=4.0)
+    act = contact_law(ground, np.array([0.025]))
+    level, still = np.array([[0.0], [0.0], [0.0], [1.0]]), np.zeros((3, 1))
+    position, velocity = np.array([[0.0], [0.0], [0.025 - depth]]), np.array([[vt], [vn], [0.0]])
+    force = act(position, level, velocity, still).force[:, 0]
+    assert force == pytest.approx([-0.3 * vt, -4.0 * vn, 2000.0 * depth], rel=1e-9)
+    above = act(position + np.array([[0.0], [0.0], [2 * depth]]), level, velocity, still)
+    assert not above.force.any()
 
 
 def test_a_spinning_link_slips_at_its_lowest_point():
