@@ -1,9 +1,4 @@
-"""Message records in bulk: blocks are decompressed side by side and looked at together.
-
-A chunk holds about a hundred messages of a topic, and a look at so few costs more than what is
-seen. So the blocks of a few megabytes go into one buffer, which is used again for the next ones:
-memory that is written for the first time costs a page fault each 4 KiB, as much as decompression.
-"""
+"""Message records in bulk: those of many blocks are found and checked together."""
 
 from __future__ import annotations
 
@@ -17,11 +12,11 @@ from mcap.opcode import Opcode
 
 from ..arrays import IntArray
 from ..errors import LogError
+from .arenas import Placed, filled_arenas
 from .chunk import PREFIX_SIZE, Block, Buffer
 from .message_heads import BODY_AT, FIXED_SIZE, HEAD, Places, gather
 from .storage import LogFile
 
-_ARENA_SIZE = 16 << 20
 _START = struct.Struct("<BQ")  # of a record: opcode, length
 _START_KIND = np.dtype(f"V{_START.size}")
 _LOG_TIME_AT = 15
@@ -31,21 +26,6 @@ _LARGEST_COPIED = 2048
 lie side by side in the cache."""
 
 Window = tuple[int | None, int | None]
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A block's payload in a buffer.
-
-    Attributes:
-        block: The block.
-        base: What its message offsets count from.
-        stop: One past its last byte.
-    """
-
-    block: Block
-    base: int
-    stop: int
 
 
 @dataclass(frozen=True)
@@ -88,6 +68,7 @@ def record_batches(
     wanted: Sequence[Sequence[int]],
     blocks: Sequence[Block],
     warn: Callable[[str], None],
+    threads: int = 1,
 ) -> Iterator[tuple[Buffer, list[Records]]]:
     """The message records of some topics, many blocks at a time.
 
@@ -96,11 +77,13 @@ def record_batches(
         wanted: Channel ids, one sequence a topic.
         blocks: Where to look.
         warn: Takes one sentence for each block that couldn't be read.
+        threads: How many decompress the blocks.
 
     Yields:
         A buffer, which is overwritten when the next is asked for, and the records of each topic.
     """
-    for data, placed in _filled(log_file, wanted, blocks, warn):
+    ids = list(itertools.chain.from_iterable(wanted))
+    for data, placed in filled_arenas(log_file, ids, blocks, warn, threads):
         try:
             found = _records(log_file, data, placed, wanted)
         except LogError:  # which block is it? the others are read
@@ -113,44 +96,6 @@ def record_batches(
                     yield data, alone
         else:
             yield data, found
-
-
-def _filled(
-    log_file: LogFile,
-    wanted: Sequence[Sequence[int]],
-    blocks: Sequence[Block],
-    warn: Callable[[str], None],
-) -> Iterator[tuple[Buffer, list[Placed]]]:
-    """Buffers full of payloads; one that can't share a buffer comes alone."""
-    ids = {channel_id for channel_ids in wanted for channel_id in channel_ids}
-    arena = log_file.take_scratch()
-    size = min(_ARENA_SIZE, sum(block.size for block in blocks))
-    placed: list[Placed] = []
-    at = 0
-    for block in blocks:
-        if block.index_at and ids.isdisjoint(block.index_at):
-            continue
-        try:
-            if not log_file.inflates(block, _ARENA_SIZE):
-                data, base, stop = log_file.payload_once(block)
-                yield data, [Placed(block, base, stop)]
-                continue
-            if len(arena) < size:
-                arena = bytearray(size)
-            if at + block.size > len(arena):
-                yield arena, placed
-                placed, at = [], 0
-            with memoryview(arena) as whole, whole[at : at + block.size] as room:
-                log_file.inflate_into(block, room)
-        except LogError as error:
-            warn(f"{error}; its messages are missing")
-            continue
-        placed.append(Placed(block, at, at + block.size))
-        at += block.size
-    if placed:
-        yield arena, placed
-    if len(blocks) < len(log_file.blocks):  # after a window there is often another
-        log_file.keep_scratch(arena)
 
 
 def _records(

@@ -203,6 +203,7 @@ def read_messages(
     *,
     window_ns: Window = (None, None),
     warn: Callable[[str], None],
+    threads: int = 1,
 ) -> list[Messages]:
     """Read several topics in one pass over the file: each chunk is decompressed once.
 
@@ -211,6 +212,7 @@ def read_messages(
         requests: What to read, one a topic.
         window_ns: Half-open window of log times [Unix ns]; None for open ends.
         warn: Takes one sentence for each block that couldn't be read.
+        threads: How many decompress the blocks.
 
     Returns:
         The messages, one entry a request.
@@ -221,7 +223,7 @@ def read_messages(
         _GroupReader(request, *_expected(log_file, request, blocks), shared) for request in requests
     ]
     wanted = [request.channel_ids for request in requests]
-    for _, found in record_batches(log_file, wanted, blocks, warn):
+    for _, found in record_batches(log_file, wanted, blocks, warn, threads):
         for reader, records in zip(readers, found, strict=True):
             if len(records.offsets):
                 reader.add(records, window_ns)

@@ -18,7 +18,7 @@ import pandas as pd
 from ..arrays import IntArray
 from ..errors import DataError, RobotFileError
 from ..robot import Robot
-from ..robot.description import parse_robot
+from ..robot.description import robot_in_session
 from .columns import Group, Messages
 from .frames import (
     FD_FRAME_DTYPE,
@@ -29,6 +29,7 @@ from .frames import (
     join_batches,
 )
 from .joint_reader import JointReader
+from .read_ahead import threads_or_default
 from .signals import JointSignals
 from .stamp_clock import StampClock
 from .storage import LogFile
@@ -40,29 +41,35 @@ _NS = 1_000_000_000
 class Session:
     """A recorded session, opened for reading."""
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, threads: int | None = None) -> None:
         """Open a session.
 
         Args:
             path: The MCAP file; of a split session any part, or the folder that holds it.
+            threads: How many decompress what is read; None for one a core that this process may
+                use, at most four. What is read is the same.
 
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
             LogError: If it can't be opened.
+            UsageError: If ``threads`` is less than 1.
         """
+        threads = threads_or_default(threads)
         self.path = Path(path)
         self._file = LogFile(self.path)
         self._warnings = list(self._file.warnings)
-        self._topics = Topics(self._file, self._warn)
+        self._topics = Topics(self._file, self._warn, threads=threads)
         self._clock = StampClock(self._topics, self._warn)
         self._joints = JointReader(self.path, self._topics, self._clock, self._warn)
 
     @classmethod
-    def open(cls, path: Path | str) -> Self:
+    def open(cls, path: Path | str, *, threads: int | None = None) -> Self:
         """Open a session; the same as calling the class.
 
         Args:
             path: The MCAP file; of a split session any part, or the folder that holds it.
+            threads: How many decompress what is read; None for one a core that this process may
+                use, at most four. What is read is the same.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -70,8 +77,9 @@ class Session:
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
             LogError: If it can't be opened.
+            UsageError: If ``threads`` is less than 1.
         """
-        return cls(path)
+        return cls(path, threads=threads)
 
     def close(self) -> None:
         """Release the file."""
@@ -141,18 +149,9 @@ class Session:
     @cached_property
     def robot(self) -> Robot | None:
         """The robot whose description is attached, or None."""
-        stored = self.attachments
-        if "robot.toml" not in stored:
-            return None
-        databases = {
-            name: data.decode("utf-8", "replace")
-            for name, data in stored.items()
-            if name.endswith(".dbc")
-        }
         try:
-            text = stored["robot.toml"].decode()
-            return parse_robot(text, source=f"{self.path}:robot.toml", databases=databases)
-        except (RobotFileError, UnicodeDecodeError) as error:
+            return robot_in_session(self.attachments, self.path)
+        except RobotFileError as error:
             self._warn(f"the attached robot description can't be used: {error}")
             return None
 

@@ -6,6 +6,7 @@ files' blocks as one more block, in memory; nothing on the disk is changed.
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
@@ -19,6 +20,7 @@ from ..errors import LogError, NotALogError
 from .chunk import Block, Buffer
 from .mcap_file import McapFile
 from .message_heads import read_heads
+from .pages import new_pages
 from .part_files import PartFiles, first_part, open_parts
 from .part_names import PART_RECORD
 from .recovered import Recovered
@@ -63,7 +65,7 @@ class LogFile:
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
         self._sources: list[_Part] = []
-        self._scratch = bytearray()
+        self._scratch: mmap.mmap | None = None
         first = first_part(path)
         wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
@@ -85,25 +87,28 @@ class LogFile:
 
     def close(self) -> None:
         """Release everything."""
-        self._scratch = bytearray()
+        self._scratch = None
         self.parts.close()
 
-    def take_scratch(self) -> bytearray:
-        """Memory for payloads that was used before, and costs no page faults; may be empty.
+    def take_scratch(self, size: int) -> mmap.mmap:
+        """Memory for payloads; where there is some that was used before, it costs no page faults.
+
+        Args:
+            size: How much is needed [byte].
 
         Returns:
-            The caller's alone until :meth:`keep_scratch` gives it back.
+            At least as much, the caller's alone until :meth:`keep_scratch` gives it back.
         """
-        scratch, self._scratch = self._scratch, bytearray()
-        return scratch
+        scratch, self._scratch = self._scratch, None
+        return scratch if scratch is not None and len(scratch) >= size else new_pages(size)
 
-    def keep_scratch(self, scratch: bytearray) -> None:
+    def keep_scratch(self, scratch: mmap.mmap) -> None:
         """Keep memory for who reads next; the larger piece if there are two.
 
         Args:
             scratch: Nobody may look at it any more.
         """
-        if len(scratch) > len(self._scratch):
+        if self._scratch is None or len(scratch) > len(self._scratch):
             self._scratch = scratch
 
     def payload(self, block: Block) -> tuple[Buffer, int]:

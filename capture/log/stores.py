@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import IntArray
+from .pages import new_pages
 
 _SHORT_NS = 2**31
 _LARGE = 4 << 20
@@ -82,11 +83,7 @@ class ColumnStore:
         self._memory, self._ready = None, 0
         if size < _LARGE:
             return np.empty(shape, dtype=self._dtype)
-        # numpy would ask for huge pages, and in a virtual machine a new one costs milliseconds.
-        try:
-            memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        except OSError as error:
-            raise MemoryError(f"{size} bytes for a column") from error
+        memory = new_pages(size)
         if sys.platform == "linux":
             self._memory = memory
         return np.frombuffer(memory, dtype=self._dtype).reshape(shape)

@@ -49,14 +49,16 @@ class Channel:
 class Topics:
     """Reads topics of one file by name."""
 
-    def __init__(self, log_file: LogFile, warn: Callable[[str], None]) -> None:
+    def __init__(self, log_file: LogFile, warn: Callable[[str], None], *, threads: int = 1) -> None:
         """Sort the file's channels by topic.
 
         Args:
             log_file: The open file.
             warn: Takes one sentence for each irregularity.
+            threads: How many decompress what is read.
         """
         self._file = log_file
+        self._threads = threads
         self._warn = warn
         self._types: dict[str, MessageType] = {}
         self._ids: dict[str, list[int]] = {}
@@ -86,7 +88,9 @@ class Topics:
             Request(self._channel_ids(topic), self.message_type(topic), paths)
             for topic, paths in wanted.items()
         ]
-        found = read_messages(self._file, requests, window_ns=window_ns, warn=self._warn)
+        found = read_messages(
+            self._file, requests, window_ns=window_ns, warn=self._warn, threads=self._threads
+        )
         return dict(zip(wanted, found, strict=True))
 
     @property

@@ -1,0 +1,126 @@
+"""Blocks of a log decompressed side by side, in memory that is used again and again.
+
+A chunk holds about a hundred messages of a topic, and a look at so few costs more than what is
+seen. So the blocks of a few megabytes go into one buffer, which is used again for later ones:
+memory that is written for the first time costs a page fault each 4 KiB, as much as decompression.
+While one buffer is looked at, threads fill another.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+
+from ..errors import LogError
+from .chunk import Block, Buffer
+from .pages import new_pages
+from .read_ahead import Start, ahead, helpers
+from .storage import LogFile
+
+ARENA_SIZE = 8 << 20
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A block's payload in a buffer.
+
+    Attributes:
+        block: The block.
+        base: What its message offsets count from.
+        stop: One past its last byte.
+    """
+
+    block: Block
+    base: int
+    stop: int
+
+
+_Piece = Callable[[], tuple[Buffer, Placed]]
+"""Waits for a block's payload; raises LogError if it can't be read."""
+
+
+def filled_arenas(
+    log_file: LogFile,
+    channel_ids: Collection[int],
+    blocks: Sequence[Block],
+    warn: Callable[[str], None],
+    threads: int,
+) -> Iterator[tuple[Buffer, list[Placed]]]:
+    """Buffers full of payloads, in file order; one that can't share a buffer comes alone.
+
+    Args:
+        log_file: The file.
+        channel_ids: Blocks whose index has none of these channels are passed over.
+        blocks: Where to look.
+        warn: Takes one sentence for each block that couldn't be read.
+        threads: How many decompress; with more than one they do so ahead of what is used.
+
+    Yields:
+        A buffer, which is overwritten when the next is asked for, and what is in it.
+    """
+    ids = set(channel_ids)
+    wanted = [each for each in blocks if not each.index_at or not ids.isdisjoint(each.index_at)]
+    runs = list(_runs(log_file, wanted))
+    spare = 1 if threads > 1 and len(runs) > 1 else 0
+    size = max((run[-1].stop for run in runs if isinstance(run, list)), default=1)
+    arenas = [log_file.take_scratch(size), *(new_pages(size) for _ in range(spare))]
+    with helpers(max(min(threads, len(wanted)), 1)) as start:
+        for pieces in ahead(_begun(log_file, runs, arenas, start), spare):
+            found: list[tuple[Buffer, Placed]] = []
+            for piece in pieces:
+                try:
+                    found.append(piece())
+                except LogError as error:
+                    warn(f"{error}; its messages are missing")
+            if found:
+                yield found[0][0], [placed for _, placed in found]
+    if len(blocks) < len(log_file.blocks):  # after a window there is often another
+        log_file.keep_scratch(arenas[0])
+
+
+def _runs(log_file: LogFile, blocks: Sequence[Block]) -> Iterator[list[Placed] | Block]:
+    """Blocks that share a buffer, with their places in it, or one that comes alone."""
+    run: list[Placed] = []
+    at = 0
+    for block in blocks:
+        shares = log_file.inflates(block, ARENA_SIZE)
+        if run and not (shares and at + block.size <= ARENA_SIZE):
+            yield run
+            run, at = [], 0
+        if shares:
+            run.append(Placed(block, at, at + block.size))
+            at += block.size
+        else:
+            yield block
+    if run:
+        yield run
+
+
+def _begun(
+    log_file: LogFile,
+    runs: Iterable[list[Placed] | Block],
+    arenas: Sequence[mmap.mmap],
+    start: Start,
+) -> Iterator[list[_Piece]]:
+    """For each run what waits for its blocks; work on them begins when it is taken."""
+    for run, arena in zip(runs, cycle(arenas), strict=False):
+        if isinstance(run, list):
+            yield [start(partial(_inflated, log_file, arena, placed)) for placed in run]
+        elif run.size <= ARENA_SIZE:
+            yield [start(partial(_alone, log_file, run))]
+        else:  # two of that size at once are too much
+            yield [partial(_alone, log_file, run)]
+
+
+def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> tuple[Buffer, Placed]:
+    with memoryview(arena) as whole, whole[placed.base : placed.stop] as room:
+        log_file.inflate_into(placed.block, room)
+    return arena, placed
+
+
+def _alone(log_file: LogFile, block: Block) -> tuple[Buffer, Placed]:
+    data, base, stop = log_file.payload_once(block)
+    return data, Placed(block, base, stop)

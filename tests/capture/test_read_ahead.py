@@ -1,0 +1,245 @@
+"""Reading with several threads: the same as with one, in order, bounded, and nothing left."""
+
+import json
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+
+from capture import Session, SessionWriter
+from capture.errors import UsageError
+from capture.log import arenas
+from capture.log.durable_sink import DurableSink
+from capture.log.read_ahead import ahead, helpers
+from capture.log.storage import LogFile
+
+EPOCH_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+NAMES = [f"joint{k:02d}" for k in range(1, 26)]
+FIELDS = ["position", "velocity", "effort"]
+TOPICS = ["/joint_states", "/joint_current"]
+MIB = 1 << 20
+
+
+def values_of(ticks):
+    return np.random.default_rng(11).normal(size=(ticks, 25))
+
+
+def write_session(path, ticks, sink=None):
+    """Joints and the frames of a bus; the writer is left open where it has a sink."""
+    writer = SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, sink=sink)
+    channels = [
+        writer.joint_state(topic, NAMES, unit="1", velocity=True, effort=True) for topic in TOPICS
+    ]
+    note = writer.string("/gait/mode")
+    for tick, values in enumerate(values_of(ticks)):
+        t_ns = EPOCH_NS + tick * STEP_NS
+        for channel in channels:
+            channel.write(t_ns, values, -values, 2 * values)
+        note.write(EPOCH_NS, f"{tick:06d}")
+    if sink is None:
+        writer.close()
+    return writer
+
+
+@pytest.fixture
+def small_arenas(monkeypatch):
+    """Buffers of a few chunks, so that a small file needs many of them."""
+    monkeypatch.setattr(arenas, "ARENA_SIZE", 3 * MIB)
+
+
+def helpers_alive():
+    return [each for each in threading.enumerate() if each.name.startswith("undulog-read")]
+
+
+def read(path, threads, **window):
+    """All signals as one array of times and one of values, and what is warned of."""
+    with Session(path, threads=threads) as session:
+        found = session.joint_columns(dict.fromkeys(TOPICS, FIELDS), **window)
+        warnings = session.warnings
+    assert not helpers_alive()
+    times = np.array([signals.t_ns for signals in found.values()])
+    return times, np.array([signals.values for signals in found.values()]), warnings
+
+
+def truth(ticks):
+    """What :func:`read` should give."""
+    values = values_of(ticks).T
+    t_ns = EPOCH_NS + np.arange(ticks) * STEP_NS
+    return np.broadcast_to(t_ns, (6, 25, ticks)), np.array([values, -values, 2 * values] * 2)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4, None])
+@pytest.mark.usefixtures("small_arenas")
+def test_what_is_read_is_what_was_written_with_any_number_of_threads(tmp_path, threads):
+    write_session(tmp_path / "s.mcap", 10_000)
+    times, values, warnings = read(tmp_path / "s.mcap", threads)
+    expected = truth(10_000)
+    np.testing.assert_array_equal(times, expected[0])
+    np.testing.assert_array_equal(values, expected[1])
+    assert not warnings
+    start = EPOCH_NS + 4321 * STEP_NS
+    window = {"start_ns": start, "stop_ns": start + 3000 * STEP_NS}
+    times, values, _ = read(tmp_path / "s.mcap", threads, **window)
+    np.testing.assert_array_equal(times, expected[0][:, :, 4321:7321])
+    np.testing.assert_array_equal(values, expected[1][:, :, 4321:7321])
+
+
+@pytest.mark.usefixtures("small_arenas")
+def test_damaged_chunks_cost_their_own_messages_with_any_number_of_threads(tmp_path):
+    path = tmp_path / "s.mcap"
+    write_session(path, 10_000)
+    log_file = LogFile(path)
+    blocks, data = log_file.blocks, bytearray(path.read_bytes())
+    log_file.close()
+    assert len(blocks) > 12
+    harmed = [blocks[k] for k in (0, 5, 6, -1)]
+    for block in harmed:
+        data[(block.start + block.stop) // 2] ^= 0x55
+    path.write_bytes(data)
+    times, values, warnings = read(path, 1)
+    for block, text in zip(harmed, warnings, strict=True):
+        assert f"the chunk at byte {block.start} can't be decompressed" in text
+    ticks = (times[0, 0] - EPOCH_NS) // STEP_NS
+    assert 5000 < len(ticks) < 9000
+    np.testing.assert_array_equal(values, truth(10_000)[1][:, :, ticks])
+    for threads in (2, 4):
+        again = read(path, threads)
+        np.testing.assert_array_equal(again[0], times)
+        np.testing.assert_array_equal(again[1], values)
+        assert again[2] == warnings
+
+
+def transcribed(source, target, kind):
+    """The messages of a file in another file, compressed otherwise."""
+    with source.open("rb") as stream, target.open("wb") as output:
+        writer = McapWriter(output, compression=kind, chunk_size=1 << 18)
+        writer.start(profile="ros2", library="test")
+        ids = {}
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            if channel.id not in ids:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.id] = writer.register_channel(channel.topic, "cdr", known)
+            times = message.log_time, message.publish_time
+            writer.add_message(ids[channel.id], times[0], message.data, times[1])
+        writer.finish()
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+@pytest.mark.parametrize("kind", [CompressionType.LZ4, CompressionType.NONE])
+def test_chunks_that_are_not_zstd_are_read_as_well(tmp_path, kind, threads):
+    write_session(tmp_path / "ours.mcap", 2000)
+    transcribed(tmp_path / "ours.mcap", tmp_path / "s.mcap", kind)
+    times, values, _ = read(tmp_path / "s.mcap", threads)
+    np.testing.assert_array_equal(times, truth(2000)[0])
+    np.testing.assert_array_equal(values, truth(2000)[1])
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_what_only_the_write_ahead_log_has_comes_last(tmp_path, threads):
+    path = tmp_path / "s.mcap"
+    writer = write_session(path, 1500, DurableSink(path))
+    try:
+        with Session(path, threads=threads) as session:
+            assert any("write-ahead log" in text for text in session.warnings)
+            told = session.table("/gait/mode")  # all have the same stamp: as they lie in the file
+        times, values, _ = read(path, threads)
+    finally:
+        writer.close()
+    assert told["data"].tolist() == [f"{tick:06d}" for tick in range(1500)]
+    np.testing.assert_array_equal(times, truth(1500)[0])
+    np.testing.assert_array_equal(values, truth(1500)[1])
+
+
+@pytest.mark.usefixtures("small_arenas")
+def test_no_thread_outlives_a_reader_that_gives_up(tmp_path):
+    write_session(tmp_path / "s.mcap", 10_000)
+    log_file = LogFile(tmp_path / "s.mcap")
+    ids = list(log_file.channels)
+    batches = arenas.filled_arenas(log_file, ids, log_file.blocks, print, 4)
+    next(batches)
+    assert helpers_alive()
+    batches.close()
+    assert not helpers_alive()
+    log_file.close()  # nobody looks at the file any more
+
+
+def test_a_session_needs_one_thread_at_least(tmp_path):
+    write_session(tmp_path / "s.mcap", 5)
+    with pytest.raises(UsageError, match="threads=0: give 1 or more"):
+        Session.open(tmp_path / "s.mcap", threads=0)
+
+
+def test_work_is_begun_so_far_ahead_and_no_further():
+    begun = []
+    for k, item in enumerate(ahead((begun.append(n) or n for n in range(20)), 3)):
+        assert item == k
+        assert begun == list(range(min(k + 4, 20)))
+    assert list(ahead(iter(()), 3)) == []
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_an_error_comes_where_the_result_is_asked_for(threads):
+    with helpers(threads) as start:
+        pieces = [start(lambda n=n: 12 // n) for n in (1, 0, 3)]
+        assert pieces[0]() == 12
+        with pytest.raises(ZeroDivisionError):
+            pieces[1]()
+        assert pieces[2]() == 4
+    assert not helpers_alive()
+
+
+def test_what_has_not_begun_is_left_undone_at_the_end():
+    done, gate = [], threading.Event()
+    with helpers(2) as start:
+        for n in range(50):
+            start(lambda n=n: (gate.wait(), done.append(n)))
+        threading.Timer(0.05, gate.set).start()
+    assert len(done) < 50
+    assert not helpers_alive()
+
+
+MEASURE = """
+import json, sys
+from pathlib import Path
+from capture import Session
+
+def status(key):
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(key + ":"):
+            return int(line.split()[1]) * 1024
+
+path, threads, wanted = Path(sys.argv[1]), int(sys.argv[2]), json.loads(sys.argv[3])
+
+def read(stop_ns):
+    with Session(path, threads=threads) as session:
+        return session.joint_columns(wanted, stop_ns=stop_ns)
+
+read(int(sys.argv[4]))  # what is imported late is imported now
+Path("/proc/self/clear_refs").write_text("5")  # the high-water mark begins anew
+before = status("VmRSS")
+found = read(None)
+arrays = {a.ctypes.data: a.nbytes for s in found.values() for a in (*s.t_ns, *s.values)}
+print(status("VmHWM") - before - sum(arrays.values()) - path.stat().st_size)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("threads", [1, 4])
+def test_beyond_the_arrays_and_the_file_a_reader_needs_little(tmp_path, threads):
+    path = tmp_path / "s.mcap"
+    write_session(path, 150_000)  # some 200 MB of arrays
+    wanted = json.dumps(dict.fromkeys(TOPICS, FIELDS))
+    told = subprocess.run(
+        [sys.executable, "-c", MEASURE, path, str(threads), wanted, str(EPOCH_NS + 10**9)],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert int(told.stdout) <= 64 * MIB
