@@ -88,9 +88,11 @@ def record(
                 if stop is not None and stop.requested:
                     break
         except SimulationError as error:
+            log.hear(twin.flush())
             log.say("error", str(error))
             writer.set_verdict("bad", [str(error)])
             raise
+        log.hear(twin.flush())
         assert sample is not None  # noqa: S101 - a run has at least two samples
         complete = sample.tick == scenario.tick_count - 1
         if complete:

@@ -1,16 +1,18 @@
 """The twin's samples, written to the log contract.
 
-All joints are sampled at the stamp, as no real servo bus can: ``/joint_sample_offset`` is there so
-that recordings of robot and twin are read alike, and it is zero. Position and velocity are those
-of the instant; effort, current and voltage are means over one control period around it, so that
-energies computed from the log are right (:mod:`sim.twin`). Time is simulated: nothing of
-the machine's clock enters the file, and the same scenario gives the same bytes.
+What the sensors tell is written when it arrives at the robot's computer: ``header.stamp`` is the
+sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
+joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
+means over one control period, so that energies computed from the log are right
+(:mod:`sim.sensing.polling`). Commands, gait, odometry and ledger are the twin's own and carry the
+tick. Time is simulated: nothing of the machine's clock enters the file, and the same scenario gives
+the same bytes.
 """
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
 import numpy as np
@@ -20,6 +22,7 @@ from capture.robot.kinematics import rotation_from_quaternion
 
 from .physics.ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario
+from .sensing.contract import JointSample, SensorSample
 from .stability import warnings
 from .twin import Sample, Twin
 from .urdf import frame_origins, urdf
@@ -43,8 +46,7 @@ def session_facts(scenario: Scenario) -> Mapping[str, str]:
         "planned_duration_s": repr(scenario.duration_s),
         "settle_s": repr(scenario.settle_s),
         "physics_rate_hz": str(scenario.physics_rate_hz),
-        "joint_sampling": "all joints at the stamp; effort, current and voltage are means over "
-        "one control period around it",
+        "joint_sampling": _sampling(scenario.sensing.servo.slot_s),
         "engine": scenario.engine,
         scenario.engine.package: version(scenario.engine.package),
         "numpy": version("numpy"),
@@ -86,10 +88,6 @@ class SessionLog:
         self._mode = writer.string("/gait/mode")
         self._events = writer.log("/rosout")
         self._lower, self._upper = robot.limits()
-        self._random = np.random.default_rng(scenario.seed)
-        self._noise = np.array(
-            [[scenario.noise.position], [scenario.noise.velocity], [scenario.noise.effort]]
-        )
         self._last_mode = ""
         self._said: set[str] = set()
         self._t_ns = self._epoch_ns
@@ -116,14 +114,9 @@ class SessionLog:
             sample: The twin's sample.
         """
         t_ns = self._t_ns = self._epoch_ns + sample.tick * _TICK_NS
-        body, drive = sample.step.body, sample.drive
-        truth = np.array([body.angle, body.rate, drive.torque])
-        reported = truth + self._noise * self._random.standard_normal(truth.shape)
+        body = sample.step.body
         self._commands.write(t_ns, sample.gait.command)
-        self._states.write(t_ns, *reported)
-        self._offsets.write(t_ns, np.zeros(truth.shape[1]))
-        self._current.write(t_ns, drive.current)
-        self._voltage.write(t_ns, drive.voltage)
+        self.hear(sample.sensed)
         self._gait.write(t_ns, sample.gait.values)
         self._energy.write(t_ns, sample.energy)
         position, quaternion = body.position[:, 0], body.quaternion[:, 0]
@@ -140,6 +133,24 @@ class SessionLog:
             self._mode.write(t_ns, sample.gait.mode)
         self._note(sample)
 
+    def hear(self, samples: Sequence[SensorSample]) -> None:
+        """Write what the sensors told, as arrived by the time of the last sample written.
+
+        Args:
+            samples: From :attr:`Sample.sensed`, or from :meth:`Twin.flush` at the end of the run.
+        """
+        for sample in samples:
+            if isinstance(sample, JointSample):
+                self._write_joints(sample)
+
+    def _write_joints(self, sample: JointSample) -> None:
+        t_ns, now_ns = self._epoch_ns + sample.cycle * _TICK_NS, self._t_ns
+        states = sample.position, sample.velocity, sample.effort
+        self._states.write(t_ns, *states, log_time_ns=now_ns)
+        self._offsets.write(t_ns, sample.offset_s, log_time_ns=now_ns)
+        self._current.write(t_ns, sample.current, log_time_ns=now_ns)
+        self._voltage.write(t_ns, sample.voltage, log_time_ns=now_ns)
+
     def _note(self, sample: Sample) -> None:
         """Say what deserves saying about a sample."""
         if sample.tick == round(self._scenario.settle_s * CONTROL_RATE_HZ):
@@ -152,3 +163,13 @@ class SessionLog:
             self.say(
                 "warn", f"{joint.name} passed its limits {joint.lower:g} to {joint.upper:g} rad"
             )
+
+
+def _sampling(slot_s: float) -> str:
+    """How the joints are sampled, in words."""
+    at = (
+        f"each joint {slot_s:g} s after the one before it, at the stamp plus /joint_sample_offset"
+        if slot_s
+        else "all joints at the stamp"
+    )
+    return f"{at}; effort, current and voltage are means over one control period around it"

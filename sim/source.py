@@ -115,6 +115,8 @@ class TwinSource:
                 self.counts.frames += 1
                 continue
             self._finished = True
+            if self._twin is not None:
+                self._log.hear(self._twin.flush())
             now_ns = self._context.now_ns()
             if item is None:
                 events.append(SourceEvent(now_ns, "info", f"{self._scenario.name} has ended"))

@@ -66,7 +66,7 @@ class JointPolling:
             dt: Physics step [s].
             seed: Of the noise.
         """
-        self._offset_s = frozen(servos.slot_s * np.arange(joint_count))
+        self._offset_s = frozen(servos.slot_s * np.arange(joint_count, dtype=np.float64))
         self._servos = servos
         self._noise = np.array([[noise.position], [noise.velocity], [noise.effort]])
         self._random = np.random.default_rng([seed, STREAM])

@@ -15,9 +15,18 @@ from capture import Session
 from capture.errors import OutputExistsError, SimulationError
 from capture.interruption import StopRequest
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
-from sim import Ground, Noise, World, load_scenario, parse_scenario
+from sim import (
+    Ground,
+    Noise,
+    SensorModels,
+    ServoPolling,
+    World,
+    load_scenario,
+    parse_scenario,
+)
 from sim.physics.ledger import TERMS
 from sim.record import record
+from sim.sensing.contract import JointSample
 from sim.twin import Twin
 from sim.urdf import urdf
 
@@ -44,9 +53,18 @@ def session(recording):
 
 
 @pytest.fixture(scope="module")
-def truth(scenario):
+def run(scenario):
+    """The twin's samples, and what its sensors told of the joints with the time of arrival [s]."""
     with Twin(scenario) as twin:
-        return list(twin.samples())
+        samples = list(twin.samples())
+        heard = [(s.time_s, told) for s in samples for told in s.sensed]
+        heard += [(samples[-1].time_s, told) for told in twin.flush()]
+    return samples, [(at, told) for at, told in heard if isinstance(told, JointSample)]
+
+
+@pytest.fixture(scope="module")
+def truth(run):
+    return run[0]
 
 
 def columns(session, topic, field="position"):
@@ -88,23 +106,44 @@ def test_the_channels_are_those_of_the_contract(session):
     assert counts["/tf"] == 13  # 20 Hz
 
 
-def test_joints_come_back_exactly(session, truth, scenario):
+def test_joints_come_back_exactly(session, run, scenario):
     states = session.joints("/joint_states", "position")
     assert states.names == scenario.robot.joint_names
     expected = scenario.epoch_ns + HUNDREDTH_NS * np.arange(61)
     assert all(np.array_equal(t, expected) for t in states.t_ns)
-    steps = [sample.step for sample in truth]
-    drives = [sample.drive for sample in truth]
+    truth, told = run[0], [sample for _, sample in run[1]]
     for topic, field, values in (
         ("/joint_commands", "position", [sample.gait.command for sample in truth]),
-        ("/joint_states", "position", [step.body.angle for step in steps]),
-        ("/joint_states", "velocity", [step.body.rate for step in steps]),
-        ("/joint_states", "effort", [drive.torque for drive in drives]),
-        ("/joint_current", "position", [drive.current for drive in drives]),
-        ("/joint_voltage", "position", [drive.voltage for drive in drives]),
+        ("/joint_states", "position", [sample.step.body.angle for sample in truth]),
+        ("/joint_states", "velocity", [sample.step.body.rate for sample in truth]),
+        ("/joint_states", "effort", [sample.effort for sample in told]),
+        ("/joint_current", "position", [sample.current for sample in told]),
+        ("/joint_voltage", "position", [sample.voltage for sample in told]),
         ("/joint_sample_offset", "position", np.zeros((61, 25))),
     ):
         np.testing.assert_array_equal(columns(session, topic, field), values)
+
+
+def test_a_sample_is_logged_when_it_arrives_two_ticks_after_its_stamp(session, run, scenario):
+    arrivals = [round(at * 100) for at, _ in run[1]]
+    assert arrivals == [min(cycle + 2, 60) for cycle in range(61)]
+    logged = [log_ns for log_ns, _ in session.messages("/joint_states")]
+    assert logged == [scenario.epoch_ns + HUNDREDTH_NS * tick for tick in arrivals]
+
+
+def test_joints_in_turn_come_back_at_their_own_times(scenario, tmp_path):
+    slot_s = 0.2e-3
+    polled = dataclasses.replace(scenario, sensing=SensorModels(ServoPolling(slot_s=slot_s)))
+    path = tmp_path / "turns.mcap"
+    record(polled, path)
+    with Session.open(path) as session:
+        assert session.metadata["undulog"]["joint_sampling"].startswith("each joint 0.0002 s after")
+        states = session.joints("/joint_states", "position")
+        offset_ns = np.rint(1e9 * slot_s * np.arange(25)).astype(int)
+        for t_ns, offset in zip(states.t_ns, offset_ns, strict=True):
+            expected = scenario.epoch_ns + HUNDREDTH_NS * np.arange(60) + offset
+            np.testing.assert_array_equal(t_ns[:-1], expected)
+            assert t_ns[-1] == scenario.epoch_ns + 60 * HUNDREDTH_NS
 
 
 def test_gait_and_ledger_come_back_by_name(session, truth):
