@@ -13,7 +13,8 @@ from typing import Any
 from capture.errors import UsageError
 from capture.robot import Robot
 
-from .gait import Serpentine
+from .gait import GaitParameters
+from .gait.toml import gait_table
 from .modules import Modules
 from .physics.engine import EngineKind
 from .sensing import Noise, SensorModels
@@ -53,7 +54,7 @@ class Scenario:
     description: str
     robot_name: str
     robot: Robot
-    gait: Serpentine
+    gait: GaitParameters
     duration_s: float
     settle_s: float = 0.0
     world: World = field(default_factory=World)
@@ -110,8 +111,6 @@ class Scenario:
 
     def toml(self) -> str:
         """The scenario as TOML, every value written out; reading it gives the same scenario."""
-        gait: dict[str, Any] = {"ramp_s": self.gait.ramp_s}
-        gait |= {str(plane): dataclasses.asdict(one) for plane, one in self.gait.planes.items()}
         ground = self.world.ground
         world: dict[str, Any] = {
             "gravity": list(self.world.gravity),
@@ -131,7 +130,7 @@ class Scenario:
             "epoch_s": self.epoch_s,
             "physics_rate_hz": self.physics_rate_hz,
             "engine": self.engine,
-            "gait": gait,
+            "gait": gait_table(self.gait),
             "world": world,
             "noise": dataclasses.asdict(self.noise),
             "sensing": dataclasses.asdict(self.sensing),

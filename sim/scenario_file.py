@@ -12,6 +12,7 @@ A scenario::
     engine = "bullet"               # or "mujoco": who solves the body's dynamics
 
     [gait]
+    kind = "serpentine"             # or "delay-blocks", "oscillators": see docs/gaits.md
     ramp_s = 2.0                    # amplitude and offset grow from nothing over this time
 
     [gait.horizontal]               # and [gait.vertical]; rad throughout
@@ -59,7 +60,7 @@ A scenario::
     command_resolution = 0.0        # rad, step in which the servos take commands
 
 Required are ``description``, ``robot``, ``duration_s`` and one plane of the gait with amplitude,
-frequency and lag.
+frequency and lag (``delay_s`` of delay blocks).
 """
 
 from __future__ import annotations
@@ -70,12 +71,12 @@ from pathlib import Path
 from typing import Any
 
 from capture.errors import Fault, ScenarioError
-from capture.robot import Plane, Robot
+from capture.robot import Robot
 from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
-from .gait import PlaneGait, Serpentine, Wave
+from .gait.toml import read_gait
 from .modules import read_modules
 from .physics.engine import EngineKind
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
@@ -143,7 +144,7 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         "name": top.name("name") if "name" in top else stem,
         "description": top.text("description"),
         "robot_name": robot_name,
-        "gait": _gait(top.table("gait"), robot),
+        "gait": read_gait(top.table("gait"), robot, max_frequency_hz=CONTROL_RATE_HZ / 4),
         "world": _world(top.table("world")),
         "noise": read_noise(top.table("noise")),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
@@ -193,31 +194,6 @@ def _robot(top: Table, name: str, folder: Path) -> Robot | None:
             "robot", f"a TOML file beside the scenario, or one of {listed(robot_names(), name)}"
         )
     return None
-
-
-def _gait(table: Table, robot: Robot | None) -> Serpentine:
-    planes: dict[Plane, PlaneGait] = {}
-    for plane in Plane:
-        if plane not in table:
-            continue
-        part = table.table(plane)
-        wave = part.choice("wave", Wave) if "wave" in part else None
-        planes[plane] = PlaneGait(
-            amplitude=part.number("amplitude", at_least=0.0),
-            frequency_hz=part.number("frequency_hz", above=0.0, at_most=CONTROL_RATE_HZ / 4),
-            lag=part.number("lag", at_least=0.0),
-            wave=wave or PlaneGait.wave,
-            offset=part.number("offset", default=0.0),
-            phase=part.number("phase", default=0.0),
-        )
-        part.close()
-        if robot is not None and not len(robot.joint_indices(plane)):
-            table.fault(plane, f"leave it out: {robot.name} has no {plane} joints")
-    ramp_s = table.number("ramp_s", default=Serpentine.ramp_s, at_least=0.0)
-    if not planes:
-        table.fault(Plane.HORIZONTAL, "a table for at least one plane, horizontal or vertical")
-    table.close()
-    return Serpentine(planes, ramp_s)
 
 
 def _world(table: Table) -> World:

@@ -19,7 +19,7 @@ import numpy as np
 from capture.arrays import FloatArray
 from capture.errors import SimulationError
 
-from .gait import Gait, GaitTick, SerpentineGait
+from .gait import Gait, GaitTick, generator
 from .physics.contact import contact_law
 from .physics.engine import engine_type
 from .physics.ledger import Ledger, Step
@@ -82,7 +82,7 @@ class Twin:
         """
         robot, world = scenario.robot, scenario.world
         self.scenario = scenario
-        self.gait: Gait = gait or SerpentineGait(scenario.gait, robot)
+        self.gait: Gait = gait or generator(scenario.gait, robot)
         self.servos = Servos([joint.servo for joint in robot.joints])
         radius = np.array([link.radius for link in robot.links])
         self._below = np.zeros((3, len(radius)))

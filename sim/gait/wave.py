@@ -1,4 +1,4 @@
-"""One plane's travelling wave: its parameters and which way it runs."""
+"""One plane's travelling wave: its parameters and which way it runs, and what is logged of it."""
 
 from __future__ import annotations
 
@@ -43,6 +43,10 @@ class PlaneGait:
 
 
 VALUE_NAMES = ("A", "omega", "lag", "offset", "phase")
-"""What is logged of a plane: amplitude [rad], omega [rad/s], signed lag [rad], offset [rad], and
-the phase of the plane's first joint [rad]: the command of its joint i (from 1) is
-A sin(phase + (i - 1) lag) + offset."""
+"""What is logged of a plane: amplitude [rad], omega [rad/s], signed lag [rad], offset [rad] and
+phase [rad], the last two and the amplitude those of the plane's first joint. Where all joints of
+the plane are alike, the command of its joint i (from 1) is A sin(phase + (i - 1) lag) + offset."""
+
+JOINT_VALUE_NAMES = ("A", "offset", "phase")
+"""What is logged of every driven joint, as ``joint03.A``, where a gait may set joints apart: the
+joint's command is A sin(phase) + offset."""

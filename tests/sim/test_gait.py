@@ -104,7 +104,8 @@ def test_too_much_amplitude_is_cut_keeping_the_wave(make_robot):
     ],
 )
 def test_limits_need_not_be_symmetric(wanted, expected):
-    assert within_limits(*wanted, -0.2, 0.5) == pytest.approx(expected)
+    one = [np.array([value]) for value in (*wanted, -0.2, 0.5)]
+    assert [value[0] for value in within_limits(*one)] == pytest.approx(expected)
 
 
 def test_smoothstep():

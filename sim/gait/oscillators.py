@@ -1,0 +1,170 @@
+"""The oscillator generator: each plane a chain of coupled oscillators, perhaps felt back.
+
+Eq. 1 of Meister, Stepanenko & Kernbach 2011 for the joints of each plane. Joint i is commanded
+A_i r_i sin(phi_i) + Y_i; A and Y follow what is asked for by :class:`~sim.gait.approach.Approach`,
+so that nothing jumps, and begin at zero.
+
+With feedback each oscillator turns by what its own servo reports,
+
+    phi_i' = omega_i + eps (2 ((q_i - Y_i) / A) cos phi_i - b_i) + coupling,
+
+A the plane's own amplitude: of a response q_i - Y_i = g_i A sin(phi_i + delta_i) a cycle leaves
+eps (g_i sin(delta_i) - b_i), and a steady b_i = g_i sin(delta_i) removes what is constant of it.
+The angles are those last reported, so delta_i holds their age too; a joint that has reported
+nothing yet is not fed back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TypeAlias
+
+import numpy as np
+
+from capture.arrays import FloatArray, IntArray
+from capture.robot import Plane, Robot
+
+from ..readings import Readings
+from .approach import Approach
+from .coupled import Coupling, HopfOscillators, PhaseOscillators
+from .coupled import Oscillators as OscillatorState
+from .rhythm import Change, IntegratedPhase, Swing
+from .wave import PlaneGait
+from .waves import WaveGenerator
+
+Numbers: TypeAlias = "float | tuple[float, ...]"
+"""One number for all, or one for each."""
+
+
+class OscillatorKind(StrEnum):
+    """What each oscillator is."""
+
+    PHASE = "phase"
+    HOPF = "hopf"
+
+
+@dataclass(frozen=True)
+class OscillatorChain(PlaneGait):
+    """One plane's chain of n oscillators; ``lag`` and ``phase`` are the pattern it starts in.
+
+    Attributes:
+        oscillator: Phase or Hopf oscillators.
+        forward: b_f, of joint i on joint i + 1 [1/s], one number or n - 1.
+        backward: b_b, of joint i + 1 on joint i [1/s], one number or n - 1.
+        detuning: omega_i - omega [rad/s], one number or n.
+        start_phase: Deviation from the pattern at the start [rad], one number or n.
+        approach_rate: Of amplitude and offset towards what is asked for [1/s].
+        attraction: alpha of Hopf oscillators [1/s].
+        feedback: eps [1/s].
+        feedback_bias: b, one number or n.
+    """
+
+    oscillator: OscillatorKind = OscillatorKind.PHASE
+    forward: Numbers = 5.0
+    backward: Numbers = 5.0
+    detuning: Numbers = 0.0
+    start_phase: Numbers = 0.0
+    approach_rate: float = 4.0
+    attraction: float = 5.0
+    feedback: float = 0.0
+    feedback_bias: Numbers = 0.0
+
+
+@dataclass(frozen=True)
+class OscillatorChains:
+    """Parameters of the oscillator gait.
+
+    Attributes:
+        planes: The planes that are driven; the joints of the others are held straight.
+    """
+
+    planes: dict[Plane, OscillatorChain] = field(default_factory=dict[Plane, OscillatorChain])
+
+
+class OscillatorGait(WaveGenerator):
+    """The oscillator generator; it always tells every joint's own values."""
+
+    def __init__(self, parameters: OscillatorChains, robot: Robot) -> None:
+        """Start at time zero with straight joints.
+
+        Args:
+            parameters: What to do.
+            robot: Who is to do it.
+        """
+        rhythms = {
+            plane: _OscillatorRhythm(chain, robot.joint_indices(plane))
+            for plane, chain in parameters.planes.items()
+        }
+        super().__init__(rhythms, robot, per_joint=True)
+
+
+class _OscillatorRhythm:
+    """One plane's chain."""
+
+    def __init__(self, chain: OscillatorChain, joints: IntArray) -> None:
+        n = len(joints)
+        self._chain, self._joints = chain, joints
+        self._omega = 2.0 * math.pi * chain.frequency_hz
+        self._phase = IntegratedPhase(chain.phase, self._omega)
+        self._bias = np.broadcast_to(chain.feedback_bias, n)
+        self._detuning = np.broadcast_to(chain.detuning, n)
+        coupling = Coupling(
+            np.broadcast_to(chain.forward, n - 1),
+            np.broadcast_to(chain.backward, n - 1),
+            chain.signed_lag,
+        )
+        start = np.arange(n, dtype=np.float64) * chain.signed_lag + np.broadcast_to(
+            chain.start_phase, n
+        )
+        self._oscillators: OscillatorState = (
+            HopfOscillators(start, coupling, chain.attraction)
+            if chain.oscillator is OscillatorKind.HOPF
+            else PhaseOscillators(start, coupling)
+        )
+        self._amplitude = Approach(np.zeros(n), chain.approach_rate)
+        self._offset = Approach(np.zeros(n), chain.approach_rate)
+        # What is in force until the next tick.
+        self._time_s, self._factor = 0.0, 1.0
+        self._felt, self._steady = np.zeros(n), np.zeros(n)
+
+    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:
+        chain, elapsed = self._chain, time_s - self._time_s
+        self._turn(elapsed)
+        amplitude, offset = self._amplitude.advance(elapsed), self._offset.advance(elapsed)
+        self._amplitude.aim(chain.amplitude * change.amplitude_factor)
+        self._offset.aim(chain.offset + change.offset)
+        self._time_s, self._factor = time_s, change.frequency_factor
+        omega = self._omega * self._factor
+        common = self._phase.advance(time_s, omega)
+        if chain.feedback > 0.0:
+            self._feel(readings.angle[self._joints], offset)
+        return Swing(
+            amplitude=amplitude * self._oscillators.radius,
+            offset=offset,
+            phase=common + self._oscillators.theta,
+            omega=omega,
+            lag=chain.signed_lag,
+        )
+
+    def _feel(self, angle: FloatArray, offset: FloatArray) -> None:
+        """Take the servos' reports; joints without one are left out."""
+        known = np.isfinite(angle)
+        eps = self._chain.feedback
+        deviation = np.where(known, angle - offset, 0.0)
+        self._felt = eps * 2.0 * deviation / self._chain.amplitude
+        self._steady = np.where(known, eps * self._bias, 0.0)
+
+    def _turn(self, elapsed_s: float) -> None:
+        """Advance the oscillators by what has been in force since the last tick."""
+        omega, phase = self._omega * self._factor, self._phase.value
+        detuning, felt, steady = self._factor * self._detuning, self._felt, self._steady
+
+        def extra(time_s: float, theta: FloatArray) -> FloatArray:
+            return detuning + felt * np.cos(phase + omega * time_s + theta) - steady
+
+        # Without feedback the detuning is all there is, and constant: nothing to resolve.
+        strongest = float(np.abs(felt).max())
+        fastest = abs(omega) + strongest if strongest > 0.0 else 0.0
+        self._oscillators.advance(elapsed_s, extra, fastest)
