@@ -380,9 +380,10 @@ class _SensorTopic:
             values = row[:, None]
         else:
             t_ns, values = _side_by_side(pieces)
+        known = ~np.isnan(values).all(axis=1)  # a frame of several sensors may be of the others
         return [
             Message(topic, t, partial(write, row, t))
-            for t, row in zip(t_ns.tolist(), values, strict=True)
+            for t, row in zip(t_ns[known].tolist(), values[known], strict=True)
         ]
 
 

@@ -38,9 +38,19 @@ class _Slot:
     upper: float
 
     def placed(self, value: float, size: int) -> int:
+        if value == math.inf and self.entry.out_of_range is not None:
+            return self._code(self.entry.out_of_range, size)
         physical = self.entry.physical(value)
         bits = self.entry.bits.raw_bits(physical, self.lower, self.upper)
         return self.entry.bits.placed(bits, size)
+
+    def unknown(self, size: int) -> int | None:
+        """What stands for no value, at its place; None where nothing does."""
+        return None if self.entry.unknown is None else self._code(self.entry.unknown, size)
+
+    def _code(self, raw: int, size: int) -> int:
+        bits = self.entry.bits
+        return bits.placed(raw & ((1 << bits.length) - 1), size)
 
 
 @dataclass
@@ -53,6 +63,7 @@ class _Frame:
         fixed: Multiplexers and initial values of what the map doesn't name, at their places.
         slots: The values that it carries.
         last: The last of each, at its place.
+        unknown: What stands for no value of those that have it, at its place.
     """
 
     id_flags: int
@@ -60,6 +71,7 @@ class _Frame:
     fixed: int
     slots: dict[BusValue, _Slot]
     last: dict[BusValue, int] = field(default_factory=dict[BusValue, int])
+    unknown: dict[BusValue, int] = field(default_factory=dict[BusValue, int])
 
     def data(self, values: Mapping[BusValue, float]) -> bytes | None:
         """Its bytes, None if no value is of this frame."""
@@ -70,7 +82,9 @@ class _Frame:
             if not math.isnan(value):
                 self.last[key] = slot.placed(value, self.size)
                 given = True
-            word |= self.last[key]
+                word |= self.last[key]
+            else:
+                word |= self.unknown.get(key, self.last[key])
         return word.to_bytes(self.size, "little") if given else None
 
 
@@ -108,7 +122,8 @@ class BusEncoder:
         """Encode values.
 
         Each is rounded to the nearest that its field can hold; one beyond the field's range, or
-        beyond the DBC's minimum and maximum, becomes the nearest end of it (+inf: the greatest).
+        beyond the DBC's minimum and maximum, becomes the nearest end of it (+inf: what the map
+        names for out of range, or the greatest).
 
         Args:
             values: In the session's units (SI); NaN counts as not given. What no frame carries is
@@ -117,8 +132,8 @@ class BusEncoder:
 
         Returns:
             Records of :data:`capture.log.frames.FRAME_DTYPE`, in the order of the map: every frame
-            of which a value is given. Its other fields are as they were sent last, at first the
-            DBC's initial value, or zero.
+            of which a value is given. Its other fields hold what the map names for unknown; else
+            they are as they were sent last, at first the DBC's initial value, or zero.
         """
         ready = [(frame, data) for frame in self._frames if (data := frame.data(values))]
         frames = empty_frames(len(ready))
@@ -159,7 +174,12 @@ def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
             key: _initial(dbc[signal.signal], message.length)
             for key, signal in zip(slots, own, strict=True)
         }
-        frames.append(_Frame(frame_id(message), message.length, fixed, slots, last))
+        unknown = {
+            key: code
+            for key, slot in slots.items()
+            if (code := slot.unknown(message.length)) is not None
+        }
+        frames.append(_Frame(frame_id(message), message.length, fixed, slots, last, unknown))
     return frames
 
 

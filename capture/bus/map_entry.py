@@ -40,6 +40,8 @@ class MapEntry:
         offset: Added after ``scale``.
         conditions: The multiplexers that select it, each with the values that do.
         size: Data bytes needed, multiplexers included.
+        unknown: Raw number that stands for NaN, or None.
+        out_of_range: Raw number that stands for +inf, or None.
     """
 
     quantity: Quantity
@@ -50,6 +52,8 @@ class MapEntry:
     offset: float
     conditions: Conditions
     size: int
+    unknown: int | None = None
+    out_of_range: int | None = None
 
     @property
     def selection(self) -> tuple[tuple[int, ...], ...]:
@@ -65,7 +69,12 @@ class MapEntry:
         Returns:
             Shape (n,).
         """
-        return self.unit.convert(self.scale * self.bits.values(data) + self.offset)
+        values = self.unit.convert(self.scale * self.bits.values(data) + self.offset)
+        if self.unknown is not None:
+            values[self.bits.raw(data) == self.unknown] = np.nan
+        if self.out_of_range is not None:
+            values[self.bits.raw(data) == self.out_of_range] = np.inf
+        return values
 
     def physical(self, value: float) -> float:
         """The DBC's physical value of a value: the inverse of what :meth:`values` does with it.
@@ -154,4 +163,6 @@ def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
         offset=signal.offset,
         conditions=conditions,
         size=max([bits.size, *(multiplexer.size for multiplexer, _ in conditions)]),
+        unknown=signal.unknown,
+        out_of_range=signal.out_of_range,
     )

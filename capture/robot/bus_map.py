@@ -13,6 +13,7 @@ from .model import Bus, BusSignal, Direction, Joint, Quantity, Sensor, SensorKin
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
+    from cantools.database.can.signal import Signal
 
 _PLACEHOLDER = "{joint}"
 _OF_SENSOR = {
@@ -132,13 +133,15 @@ def _signal(
     sensors: tuple[Sensor, ...],
 ) -> BusSignal:
     message, signal = entry.text("message"), entry.text("signal")
+    dbc: Signal | None = None
     if messages is None:
         pass
     elif message and message not in messages:
         entry.fault("message", listed(messages, message))
     elif message and signal:
-        known = [each.name for each in messages[message].signals]
-        if signal not in known:
+        known = {each.name: each for each in messages[message].signals}
+        dbc = known.get(signal)
+        if dbc is None:
             entry.fault("signal", f"a signal of {message}: {listed(known, signal)}")
     direction = entry.choice("direction", Direction) or Direction.RX
     target, quantity = entry.text("target"), entry.choice("quantity", Quantity)
@@ -156,6 +159,8 @@ def _signal(
         except UsageError:
             entry.fault("unit", f"for {quantity}: {listed(valid_units(quantity), unit)}")
         _check_axis(entry, axis, [s for s in sensors if s.name == target])
+    if quantity is not Quantity.RANGE and "out_of_range" in entry:
+        entry.fault("out_of_range", "leave it out: only a range has it")
     return BusSignal(
         message=message,
         signal=signal,
@@ -166,7 +171,23 @@ def _signal(
         scale=entry.number("scale", default=1.0, nonzero=True),
         offset=entry.number("offset", default=0.0),
         axis=axis,
+        unknown=_code(entry, "unknown", dbc),
+        out_of_range=_code(entry, "out_of_range", dbc),
     )
+
+
+def _code(entry: Table, key: str, dbc: Signal | None) -> int | None:
+    """A raw number with a meaning of its own; None where there is none."""
+    if key not in entry:
+        return None
+    least = -(1 << (dbc.length - 1)) if dbc is not None and dbc.is_signed else 0
+    greatest = least + (1 << dbc.length) - 1 if dbc is not None else None
+    number = entry.integer(key, at_least=least if dbc is not None else -(1 << 63))
+    if dbc is not None and dbc.is_float:
+        entry.fault(key, "leave it out: a float has numbers for that, NaN and inf")
+    elif greatest is not None and number > greatest:
+        entry.fault(key, f"a raw number of {dbc.length if dbc else 0} bits, {least} to {greatest}")
+    return number
 
 
 def _quantities(

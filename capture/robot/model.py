@@ -198,6 +198,8 @@ class BusSignal:
         scale: Applied to the decoded value (gear ratio, sign), 1 by default.
         offset: Added after ``scale``, in ``unit``.
         axis: Axis of the sensor's frame for a vector quantity (``x``, ``y``, ``z``), else empty.
+        unknown: Raw number of the DBC signal, before its scale, that stands for no value (NaN).
+        out_of_range: Raw number of a range's signal that stands for nothing in range (+inf).
     """
 
     message: str
@@ -209,6 +211,8 @@ class BusSignal:
     scale: float = 1.0
     offset: float = 0.0
     axis: str = ""
+    unknown: int | None = None
+    out_of_range: int | None = None
 
 
 @dataclass(frozen=True)

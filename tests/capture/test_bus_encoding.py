@@ -115,7 +115,7 @@ def test_frames_are_those_that_cantools_packs():
     expected = {"position": -12.34, "velocity": 0, "torque": 251, "current": -1500}
     message = database.get_message_by_name("joint03_state")
     assert joint["id_flags"] == message.frame_id
-    assert joint["data"].tobytes() == message.encode(expected | {"temperature": 0})
+    assert joint["data"].tobytes() == message.encode(expected | {"temperature": "unknown"})
     message = database.get_message_by_name("acceleration")
     size = int(acceleration["dlc"])
     expected = message.encode({"x": 0, "y": 0, "z": 1000})
@@ -135,8 +135,24 @@ def test_a_value_that_is_not_given_stays_as_it_was_sent():
     )
 
 
-def test_nothing_in_range_is_the_greatest_distance():
+def test_what_is_out_of_range_or_unknown_has_numbers_of_its_own():
     robot = load_robot("snake25")
+    (frame,) = BusEncoder(robot, Direction.RX).encode({("ir01", Quantity.RANGE, ""): math.inf})
+    database = cantools.database.load_string(dict(robot.databases)["snake25.dbc"], "dbc")
+    told = database.decode_message("ranges_1", frame["data"].tobytes())
+    assert told == {
+        "ir01": "nothing in range",
+        **dict.fromkeys(("ir02", "ir03", "ir04"), "unknown"),
+    }
+    found = decoded(robot, np.array([frame]))
+    assert found.pop(("ir01", Quantity.RANGE, "")) == math.inf
+    assert all(map(math.isnan, found.values()))
+
+
+def test_without_such_a_number_nothing_in_range_is_the_greatest_distance():
+    robot = load_robot("snake25")
+    plain = robot.toml.replace(", unknown = 65534, out_of_range = 65535", "")
+    robot = parse_robot(plain, source="plain.toml", databases=dict(robot.databases))
     frames = BusEncoder(robot, Direction.RX).encode({("ir01", Quantity.RANGE, ""): math.inf})
     assert decoded(robot, frames)["ir01", Quantity.RANGE, ""] == 65.535
 

@@ -375,3 +375,19 @@ axes = ["x", "y"]
     robot = parse_robot(MINIMAL + sensor + good, "worm.toml", {"worm.dbc": DBC})
     assert robot.bus is not None
     assert robot.bus.signals[0].axis == "y"
+
+
+def test_numbers_with_a_meaning_of_their_own_must_fit_the_signal():
+    coded = BUS.replace('"deg"', '"deg", unknown = -40000, out_of_range = 5')
+    assert faults_of(MINIMAL + coded, {"worm.dbc": DBC})[1:] == [
+        "  bus.signals[0].out_of_range: found 5; valid: leave it out: only a range has it",
+        "  bus.signals[0].unknown: found -40000; valid: a whole number >= -32768",
+    ]
+    great = BUS.replace('"deg"', '"deg", unknown = 32768')
+    assert faults_of(MINIMAL + great, {"worm.dbc": DBC})[1:] == [
+        "  bus.signals[0].unknown: found 32768; valid: a raw number of 16 bits, -32768 to 32767"
+    ]
+    good = BUS.replace('"deg"', '"deg", unknown = -32768')
+    robot = parse_robot(MINIMAL + good, "worm.toml", {"worm.dbc": DBC})
+    assert robot.bus is not None
+    assert robot.bus.signals[0].unknown == -32768
