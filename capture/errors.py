@@ -9,6 +9,7 @@
     |  `- SettingsError                    settings of a recording, all faults listed
     |- RobotFileError (ValueError)          a robot description with faults, all listed
     |- ScenarioError (ValueError)           a scenario file with faults, all listed
+    |- PlanError (ValueError)               a drive plan with faults, all listed
     |- SimulationError (ArithmeticError)    the twin blew up: time, link and likely cause
     |- DataError (ValueError)               samples unfit for what was asked
     |- SourceError                          a source that can't be opened or used
@@ -121,6 +122,12 @@ class ScenarioError(FaultyFileError):
     """A scenario with faults."""
 
     kind = "scenario"
+
+
+class PlanError(FaultyFileError):
+    """A plan of what to drive, with faults."""
+
+    kind = "plan"
 
 
 class SettingsError(UsageError):
