@@ -15,18 +15,14 @@ Two balances close over any stretch of time::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import ArrayLike
 
 from capture.arrays import FloatArray
 from capture.robot import Robot
 
-from .contact import Contact, into_link_axes
-from .engine import BodyState
-from .servo import Drive, Rotors, Servos
+from .contact import into_link_axes
+from .servo import Servos
+from .steps import Step, Steps
 from .vectors import cross
 
 JOINT_TERMS = (
@@ -56,16 +52,7 @@ TERMS = JOINT_TERMS + GROUND_TERMS + STORED_TERMS + RESIDUAL_TERMS
 """All terms, in the order of :meth:`Ledger.read`."""
 
 
-class Step(NamedTuple):
-    """Everything that acts during one physics step, as it stands at its start."""
-
-    body: BodyState
-    contact: Contact
-    rotors: Rotors
-    drive: Drive
-
-
-def joint_flows(steps: Sequence[Step], servos: Servos, dt: float) -> FloatArray:
+def joint_flows(steps: Steps, servos: Servos, dt: float) -> FloatArray:
     """Energies that pass the joints during consecutive steps.
 
     Args:
@@ -76,12 +63,11 @@ def joint_flows(steps: Sequence[Step], servos: Servos, dt: float) -> FloatArray:
     Returns:
         Energies [J], rows as :data:`JOINT_TERMS`, shape (9, m).
     """
-    rates = np.array([step.body.rate for step in steps])
-    speeds = np.array([step.rotors.speed for step in steps])
-    rate, speed = _middle(rates), _middle(speeds)
-    acting = speeds[:-1]  # friction acts with the speed at the start of the step
-    mechanical = rate * np.array([step.drive.torque for step in steps[:-1]])
-    voltage = np.array([step.drive.voltage for step in steps[:-1]])
+    body, _, rotors, drive = steps.stacked
+    rate, speed = _middle(body.rate), _middle(rotors.speed)
+    acting = rotors.speed[:-1]  # friction acts with the speed at the start of the step
+    mechanical = rate * drive.torque[:-1]
+    voltage = drive.voltage[:-1]
     current = servos.current(voltage, speed)
     electrical = voltage * current
     powers = (
@@ -93,12 +79,12 @@ def joint_flows(steps: Sequence[Step], servos: Servos, dt: float) -> FloatArray:
         servos.resistance * current * current,
         servos.viscous * acting * speed,
         servos.friction(acting) * speed,
-        servos.gear_damping * (acting - rates[:-1]) * (speed - rate),
+        servos.gear_damping * (acting - body.rate[:-1]) * (speed - rate),
     )
     return dt * np.array(powers).sum(axis=1)
 
 
-def ground_flows(steps: Sequence[Step], stiffness: float, dt: float) -> FloatArray:
+def ground_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
     """Energies that the ground takes during consecutive steps.
 
     Args:
@@ -109,14 +95,13 @@ def ground_flows(steps: Sequence[Step], stiffness: float, dt: float) -> FloatArr
     Returns:
         Energies [J], as :data:`GROUND_TERMS`, shape (3,).
     """
-    velocity = _middle(np.array([step.contact.velocity for step in steps]))
-    acting = [step.contact for step in steps[:-1]]
-    tangent = np.array([contact.tangent for contact in acting])
-    force = np.array([contact.force for contact in acting])
+    contact = steps.stacked.contact
+    velocity = _middle(contact.velocity)
+    tangent, depth, force = (part[:-1] for part in contact[1:])
     along, across = (into_link_axes(tangent, force) * into_link_axes(tangent, velocity)).sum(
         axis=(0, 2)
     )
-    damping = force[:, 2] - stiffness * _pressed([contact.depth for contact in acting])
+    damping = force[:, 2] - stiffness * _pressed(depth)
     return -dt * np.array([along, across, (damping * velocity[:, 2]).sum()])
 
 
@@ -158,7 +143,7 @@ class Ledger:
         """Cumulative flows of each joint [J], rows as :data:`JOINT_TERMS`, shape (9, m)."""
         return self._joints.copy()
 
-    def book(self, steps: Sequence[Step]) -> None:
+    def book(self, steps: Steps) -> None:
         """Add the flows of consecutive steps.
 
         Args:
@@ -216,7 +201,7 @@ def _middle(series: FloatArray) -> FloatArray:
     return 0.5 * (series[1:] + series[:-1])
 
 
-def _pressed(depth: ArrayLike) -> FloatArray:
+def _pressed(depth: FloatArray) -> FloatArray:
     """Compression of the ground: its depth where positive."""
     return np.maximum(depth, 0.0)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 from capture.arrays import FloatArray
 
-from ..physics.ledger import Step
+from ..physics.steps import Step
 from ..readings import Readings
 
 

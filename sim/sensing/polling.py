@@ -22,7 +22,7 @@ import numpy as np
 
 from capture.arrays import FloatArray, IntArray, frozen
 
-from ..physics.ledger import Step
+from ..physics.steps import Step
 from .contract import JointSample
 from .model import Noise, ServoPolling
 from .quantise import quantised

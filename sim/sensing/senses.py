@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from ..physics.ledger import Step
+from ..physics.steps import Step
 from ..readings import Readings
 from ..scenario import CONTROL_RATE_HZ, Scenario
 from .contract import JointSample, SensorSample

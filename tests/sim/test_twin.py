@@ -9,6 +9,7 @@ from capture.errors import SimulationError
 from capture.robot import Plane
 from sim import FrictionLaw, Ground, PlaneGait, Serpentine, Wave, World
 from sim.physics.ledger import TERMS
+from sim.sensing.contract import JointSample
 from sim.twin import Twin
 
 G = 9.81
@@ -132,9 +133,13 @@ def test_power_closes_over_five_cycles(make_scenario, make_robot, name, planes):
 
 def test_the_ledger_agrees_with_the_logged_torques(make_scenario, make_robot):
     # The same energies from 100 Hz samples: E_net = sum of the integral of tau q'.
-    samples = run(make_scenario(make_robot(9, stall_torque=0.25), duration_s=4.0))
-    power = [(s.drive.torque * s.step.body.rate).sum() for s in samples]
-    electrical = [(s.drive.voltage * s.drive.current).sum() for s in samples]
+    with Twin(make_scenario(make_robot(9, stall_torque=0.25), duration_s=4.0)) as twin:
+        samples = list(twin.samples())
+        sensed = [one for sample in samples for one in sample.sensed] + twin.flush()
+    joints = [one for one in sensed if isinstance(one, JointSample)]
+    assert len(joints) == len(samples) == 401
+    power = [(one.effort * one.velocity).sum() for one in joints]
+    electrical = [(one.voltage * one.current).sum() for one in joints]
     energy = dict(zip(TERMS, samples[-1].energy, strict=True))
     assert np.trapezoid(power, dx=0.01) == pytest.approx(energy["mechanical_net"], rel=0.02)
     assert np.trapezoid(electrical, dx=0.01) == pytest.approx(energy["electrical_net"], rel=0.02)
