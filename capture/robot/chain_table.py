@@ -96,6 +96,7 @@ def _servo(table: Table) -> Servo:
         ),
         gear_stiffness=table.number("gear_stiffness", default=Servo.gear_stiffness, above=0),
         gear_damping=table.number("gear_damping", default=Servo.gear_damping, at_least=0),
+        backlash=table.number("backlash", default=Servo.backlash, at_least=0),
     )
     table.close()
     return servo

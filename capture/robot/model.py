@@ -56,6 +56,7 @@ class Servo:
         coulomb_friction: t_c [N m].
         gear_stiffness: k_g [N m/rad].
         gear_damping: c_g [N m s/rad].
+        backlash: B, the gear's play between its flanks [rad]; 0: none.
     """
 
     supply_v: float = 6.0
@@ -67,6 +68,7 @@ class Servo:
     coulomb_friction: float = 0.03
     gear_stiffness: float = 40.0
     gear_damping: float = 0.05
+    backlash: float = 0.0
 
     @property
     def resistance_ohm(self) -> float:

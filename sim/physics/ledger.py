@@ -163,7 +163,7 @@ class Ledger:
         """
         body, rotors, servos = step.body, step.rotors, self._servos
         spin = _into_link_frames(body.quaternion, body.spin)
-        twist = rotors.angle - body.angle
+        twist = servos.twist(body.angle, rotors.angle)
         depth = _pressed(step.contact.depth)
         return np.array(
             [

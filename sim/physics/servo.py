@@ -6,8 +6,11 @@ the chain. Equations, per joint (rotor angle th and speed om referred to the joi
 
     u      = clip(Kp (q_ref - q), -1, 1)            duty
     i      = (u V - Kt om) / R                      winding current, Ke = Kt
-    t_g    = k_g (th - q) + c_g (om - q')           gear torque, acts on the joint
+    t_g    = k_g D(th - q) + c_g (om - q')          gear torque, acts on the joint
     Jm om' = Kt i - b om - t_c tanh(om / 0.05) - t_g
+
+D(x) = x - clip(x, -B/2, B/2) is the dead zone of a gear with the play B between its flanks (Nordin
+and Gutman, Automatica 38, 2002): there the spring is slack and only the damper acts, the grease.
 """
 
 from __future__ import annotations
@@ -55,7 +58,7 @@ class Servos:
 
     Attributes:
         supply, resistance, torque_constant, gain, inertia, viscous, coulomb, gear_stiffness,
-        gear_damping: The parameters of :class:`capture.robot.Servo`, SI, each of shape (m,).
+        gear_damping, play: The parameters of :class:`capture.robot.Servo`, SI, each of shape (m,).
     """
 
     def __init__(self, servos: Sequence[Servo]) -> None:
@@ -77,6 +80,8 @@ class Servos:
         self.coulomb = column([s.coulomb_friction for s in servos])
         self.gear_stiffness = column([s.gear_stiffness for s in servos])
         self.gear_damping = column([s.gear_damping for s in servos])
+        self.play = column([s.backlash for s in servos])
+        self._tight = not self.play.any()
 
     def current(self, voltage: FloatArray, speed: FloatArray) -> FloatArray:
         """Winding current i = (u V - Kt om)/R.
@@ -105,9 +110,24 @@ class Servos:
             Voltage, current, torque and the friction torques.
         """
         voltage = self.supply * _clip(self.gain * (reference - angle), 1.0)
-        twist, twist_rate = rotors.angle - angle, rotors.speed - rate
+        twist, twist_rate = self.twist(angle, rotors.angle), rotors.speed - rate
         torque = self.gear_stiffness * twist + self.gear_damping * twist_rate
         return Drive(voltage, self.current(voltage, rotors.speed), torque)
+
+    def twist(self, angle: FloatArray, rotor: FloatArray) -> FloatArray:
+        """How far the gears' springs are wound up, D(th - q).
+
+        Args:
+            angle: Joint angles q [rad], shape (..., m).
+            rotor: Rotor angles th [rad], shape (..., m).
+
+        Returns:
+            [rad], 0 within the play, shape (..., m).
+        """
+        between = rotor - angle
+        if self._tight:
+            return between
+        return between - _clip(between, 0.5 * self.play)
 
     def friction(self, speed: FloatArray) -> FloatArray:
         """Coulomb friction of the rotors, t_c tanh(om / 0.05).
@@ -137,6 +157,6 @@ class Servos:
         return Rotors(rotors.angle + dt * speed, speed)
 
 
-def _clip(values: FloatArray, bound: float) -> FloatArray:
+def _clip(values: FloatArray, bound: float | FloatArray) -> FloatArray:
     """``numpy.clip`` to +-bound; that function costs thrice as much on short arrays."""
     return np.minimum(np.maximum(values, -bound), bound)

@@ -56,12 +56,31 @@ def test_a_held_joint_winds_up_the_gear_to_the_motor_torque():
     assert state.angle == pytest.approx([torque / servo.gear_stiffness], rel=1e-9)
 
 
+def test_a_gear_with_play_winds_up_by_half_of_it_more():
+    servos, state, zero = Servos([Servo(backlash=0.06)] * 2), rotors(0.0, 0.0), np.zeros(2)
+    for _ in range(3000):
+        drive = servos.drive(np.array([0.1, -0.1]), zero, zero, state)
+        state = servos.advance(state, drive, 1e-3)
+    torque = 1.0 * 8.0 * 0.1 * 6.0 / Servo().resistance_ohm
+    assert drive.torque == pytest.approx([torque, -torque], rel=1e-9)
+    assert state.angle == pytest.approx([torque / 40.0 + 0.03, -torque / 40.0 - 0.03], rel=1e-9)
+
+
+def test_within_the_play_only_the_damper_acts():
+    servos = Servos([Servo(backlash=0.1)] * 3 + [Servo()])
+    state = Rotors(np.array([0.05, -0.02, 0.07, 0.07]), np.full(4, 0.3))
+    drive = servos.drive(np.zeros(4), np.zeros(4), np.full(4, 0.1), state)
+    grease = 0.05 * 0.2
+    assert drive.torque == pytest.approx([grease, grease, 40 * 0.02 + grease, 40 * 0.07 + grease])
+
+
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000))
 def test_no_more_energy_leaves_the_gear_than_enters_the_motor(seed):
     # Passivity, Ke = Kt: whatever is commanded and however the joint is moved.
     random = np.random.default_rng(seed)
-    servos, dt, m = Servos([Servo(stall_torque=0.25)] * 4), 1e-3, 4
+    servos = Servos([Servo(stall_torque=0.25, backlash=play) for play in (0, 0, 0.02, 0.2)])
+    dt, m = 1e-3, 4
     state, angle = rotors(*np.zeros(m)), np.zeros(m)
     entered, left = np.zeros(m), np.zeros(m)
     for k in range(400):
@@ -75,5 +94,5 @@ def test_no_more_energy_leaves_the_gear_than_enters_the_motor(seed):
         angle, state = angle + dt * rate, after
     # What may be stored at most is stored: the rest must have been lost, never gained.
     stored = servos.inertia * state.speed**2 / 2
-    stored += servos.gear_stiffness * (state.angle - angle) ** 2 / 2
+    stored += servos.gear_stiffness * servos.twist(angle, state.angle) ** 2 / 2
     assert (entered - left - stored > -1e-3 * np.abs(left)).all()

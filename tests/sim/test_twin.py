@@ -94,22 +94,21 @@ def test_speed_does_not_depend_on_the_heading(two_cycles, degrees):
     assert (back.real, back.imag) == pytest.approx(tuple(reference[:2]), rel=1e-9)
 
 
+LATERAL = {Plane.HORIZONTAL: PlaneGait(0.4, 1.0, math.pi / 3)}
+CATERPILLAR = {Plane.VERTICAL: PlaneGait(0.4, 1.0, math.pi / 3)}
+SIDEWINDING = {
+    Plane.HORIZONTAL: PlaneGait(0.4, 1.0, math.pi / 6),
+    Plane.VERTICAL: PlaneGait(0.15, 1.0, math.pi / 6, phase=math.pi / 2),
+}
+
+
 @pytest.mark.parametrize(
-    ("name", "planes"),
-    [
-        ("lateral", {Plane.HORIZONTAL: PlaneGait(0.4, 1.0, math.pi / 3)}),
-        ("caterpillar", {Plane.VERTICAL: PlaneGait(0.4, 1.0, math.pi / 3)}),
-        (
-            "sidewinding",
-            {
-                Plane.HORIZONTAL: PlaneGait(0.4, 1.0, math.pi / 6),
-                Plane.VERTICAL: PlaneGait(0.15, 1.0, math.pi / 6, phase=math.pi / 2),
-            },
-        ),
-    ],
+    ("planes", "backlash"),
+    [(LATERAL, 0.0), (CATERPILLAR, 0.0), (SIDEWINDING, 0.0), (LATERAL, 0.03)],
+    ids=["lateral", "caterpillar", "sidewinding", "lateral with backlash"],
 )
-def test_power_closes_over_five_cycles(make_scenario, make_robot, name, planes):
-    robot = make_robot(13, stall_torque=0.5)
+def test_power_closes_over_five_cycles(make_scenario, make_robot, planes, backlash):
+    robot = make_robot(13, stall_torque=0.5, backlash=backlash)
     samples = run(make_scenario(robot, gait=Serpentine(planes, 1.0), duration_s=8.0))
     flow = dict(zip(TERMS, samples[800].energy - samples[300].energy, strict=True))
     assert flow["mechanical_abs"] > 0.1
