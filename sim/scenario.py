@@ -18,6 +18,7 @@ from .gait.toml import gait_table
 from .modules import Modules
 from .physics.engine import EngineKind
 from .sensing import Noise, SensorModels
+from .serve.faults import BusFault
 from .toml_text import toml_text
 from .world import World
 
@@ -48,6 +49,7 @@ class Scenario:
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
         engine: Who solves the body's dynamics.
+        faults: What goes wrong on its bus, where it is served on one.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Scenario:
     epoch_s: int = 1_735_689_600  # 2025-01-01T00:00:00Z: near zero, viewers misread stamps
     physics_rate_hz: int = 1000
     engine: EngineKind = EngineKind.BULLET
+    faults: tuple[BusFault, ...] = ()
 
     @property
     def epoch_ns(self) -> int:
@@ -136,4 +139,6 @@ class Scenario:
             "sensing": dataclasses.asdict(self.sensing),
             **self.modules.tables(),
         }
+        if self.faults:
+            values["faults"] = [fault.as_table() for fault in self.faults]
         return toml_text(values)

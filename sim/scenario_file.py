@@ -59,6 +59,11 @@ A scenario::
     dead_band = 0.0                 # rad, of the encoders
     command_resolution = 0.0        # rad, step in which the servos take commands
 
+    [[faults]]                      # of the bus that `sim serve` offers: see sim.serve.faults
+    kind = "lost"
+    joint = "joint07"
+    value = 0.1
+
 Required are ``description``, ``robot``, ``duration_s`` and one plane of the gait with amplitude,
 frequency and lag (``delay_s`` of delay blocks).
 """
@@ -81,6 +86,7 @@ from .modules import read_modules
 from .physics.engine import EngineKind
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .sensing.toml import read_noise, read_sensing
+from .serve.faults import read_faults
 from .world import FrictionLaw, Ground, World
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
@@ -149,6 +155,7 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         "noise": read_noise(top.table("noise")),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "modules": read_modules(top, robot),
+        "faults": read_faults(top, robot),
         "seed": top.integer("seed", at_least=0) if "seed" in top else Scenario.seed,
         "engine": (top.choice("engine", EngineKind) if "engine" in top else None)
         or Scenario.engine,

@@ -11,7 +11,8 @@ def toml_text(values: Mapping[str, Any]) -> str:
     """Write nested tables as TOML.
 
     Args:
-        values: Strings, numbers, booleans, arrays of these, and tables; the keys bare words.
+        values: Strings, numbers, booleans, arrays of these, and tables, these
+            in arrays too; the keys bare words.
 
     Returns:
         TOML text: plain keys first, then the tables.
@@ -37,6 +38,9 @@ def _value(value: object) -> str:
         return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007F")
     if isinstance(value, int | float):
         return repr(value)
+    if isinstance(value, Mapping):  # in an array
+        table = cast("Mapping[str, object]", value)
+        return "{ " + ", ".join(f"{key} = {_value(v)}" for key, v in table.items()) + " }"
     if isinstance(value, Sequence):
         return "[" + ", ".join(map(_value, cast("Sequence[object]", value))) + "]"
     raise TypeError(f"TOML has no {type(value).__name__}")

@@ -1,0 +1,124 @@
+"""The robot's clock, and control ticks that keep to it.
+
+The robot's clock starts with its process and runs with the computer's monotonic clock. Tick k is
+due at start + k periods; deadlines are anchored at the start, so no pause accumulates. A twin that
+needs longer than a period for a period is behind, and catches up where it can. Where it can't,
+simulated time stands still and the ticks that follow are due later: samples then have a gap on the
+robot's clock, which a recording shows and its health check tells.
+"""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_right
+from dataclasses import dataclass
+
+PATIENCE_NS = 100_000_000
+"""So far behind the twin may be [ns] and still try to catch up."""
+
+_NS = 1_000_000_000
+
+
+@dataclass
+class PaceTally:
+    """How well the twin kept up.
+
+    Attributes:
+        ticks: Control ticks begun.
+        overruns: Ticks begun a period or more after they were due.
+        worst_s: The greatest delay of a tick [s].
+        stood_still_s: How long simulated time stood still in all [s].
+    """
+
+    ticks: int = 0
+    overruns: int = 0
+    worst_s: float = 0.0
+    stood_still_s: float = 0.0
+
+
+class Pacer:
+    """When each control tick is due on the robot's clock.
+
+    Attributes:
+        period_ns: Control period [ns].
+        tally: How well the ticks kept to it.
+    """
+
+    def __init__(self, period_ns: int, *, fast: bool = False) -> None:
+        """Start the robot's clock at zero.
+
+        Args:
+            period_ns: Control period [ns].
+            fast: Don't keep to the wall clock: each tick is due at once, and the robot's clock
+                shows simulated time.
+        """
+        self.period_ns = period_ns
+        self.tally = PaceTally()
+        self._fast = fast
+        self._zero_ns = time.monotonic_ns()
+        self._present_ns = 0
+        self._from_tick = [0]  # where simulated time stood still, and tick 0 as seen from there on
+        self._start_ns = [0]
+
+    @property
+    def start_ns(self) -> int:
+        """When tick 0 was due, on the robot's clock [ns]."""
+        return self._start_ns[0]
+
+    def now_ns(self) -> int:
+        """The robot's clock [ns]."""
+        return self._present_ns if self._fast else time.monotonic_ns() - self._zero_ns
+
+    def start(self, start_ns: int) -> None:
+        """Say when tick 0 is due.
+
+        Args:
+            start_ns: On the robot's clock [ns]; it is rounded up to whole microseconds, since
+                socketcand has no finer times.
+        """
+        self._start_ns[0] = self._present_ns if self._fast else _whole_us(start_ns)
+
+    def clock_ns(self, elapsed_ns: int) -> int:
+        """The robot's clock at a moment of simulated time [ns].
+
+        Args:
+            elapsed_ns: Simulated time since tick 0 [ns].
+        """
+        place = bisect_right(self._from_tick, elapsed_ns // self.period_ns) - 1
+        return self._start_ns[max(place, 0)] + elapsed_ns
+
+    def wait_s(self, tick: int) -> float:
+        """How long to wait for a tick [s]; 0 when it is due.
+
+        Args:
+            tick: Its number.
+        """
+        if self._fast:
+            self._present_ns = self.clock_ns(tick * self.period_ns)
+            return 0.0
+        return max(0, self.clock_ns(tick * self.period_ns) - self.now_ns()) / _NS
+
+    def begin(self, tick: int) -> float:
+        """Note that a tick begins.
+
+        Args:
+            tick: Its number.
+
+        Returns:
+            For how long simulated time stood still before it [s]; 0 nearly always.
+        """
+        late_ns = 0 if self._fast else self.now_ns() - self.clock_ns(tick * self.period_ns)
+        tally = self.tally
+        tally.ticks += 1
+        tally.overruns += late_ns >= self.period_ns
+        tally.worst_s = max(tally.worst_s, late_ns / _NS)
+        if late_ns < PATIENCE_NS:
+            return 0.0
+        self._from_tick.append(tick)
+        self._start_ns.append(_whole_us(self._start_ns[-1] + late_ns))
+        tally.stood_still_s += late_ns / _NS
+        return late_ns / _NS
+
+
+def _whole_us(t_ns: int) -> int:
+    return -(-t_ns // 1000) * 1000

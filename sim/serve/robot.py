@@ -1,0 +1,270 @@
+"""The virtual robot: the twin, commanded over its bus and reporting there.
+
+At each control tick what the sensors have told by then goes out first, and then the newest commands
+are latched, so that a controller that is quick enough (in lockstep: every controller) closes its
+loop within the tick, as one in process does. The frames of a tick go out in one burst; their device
+times are the sampling times.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import BoolArray
+from capture.interruption import StopRequest
+from capture.robot import Robot
+from capture.sources.records import records
+
+from ..gait import GaitTick
+from ..readings import Readings
+from ..scenario import CONTROL_RATE_HZ, Scenario
+from ..sensing.contract import SensorSample
+from ..twin import Twin
+from .bus import VirtualBus
+from .commands import WATCHDOG_S, CommandLatch
+from .encode import ReplyEncoder
+from .fault_line import FaultLine
+from .faults import BusFault
+from .pacing import Pacer, PaceTally
+from .socketcand_server import Sent
+
+_NS = 1_000_000_000
+PERIOD_NS = _NS // CONTROL_RATE_HZ
+"""Control period [ns]."""
+
+_PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
+
+
+class _StoppedError(Exception):
+    """An end was asked for while the robot waited."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """How a run went.
+
+    Attributes:
+        duration_s: Simulated time from the first tick to the last [s].
+        complete: Whether it reached its planned end, rather than being stopped.
+        start_ns: The robot's clock at the first tick [ns].
+        pace: How well it kept up with real time.
+        commands: Command frames that the servos took.
+        lost: Replies that an ordered fault lost.
+        hit: Transmissions that ordered noise hit.
+    """
+
+    duration_s: float
+    complete: bool
+    start_ns: int
+    pace: PaceTally
+    commands: int
+    lost: int
+    hit: int
+
+
+class VirtualRobot:
+    """A robot on a bus; as a :class:`sim.gait.Gait` it hands the bus's commands to the twin."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        bus: VirtualBus,
+        pacer: Pacer,
+        *,
+        faults: Sequence[BusFault] = (),
+        lockstep: bool = False,
+        wait: bool = False,
+        say: Callable[[str, str], None],
+        each_tick: Callable[[], None] = lambda: None,
+        stop: StopRequest | None = None,
+    ) -> None:
+        """Put it on its bus; :meth:`run` brings it to life.
+
+        Args:
+            scenario: The twin; its gait is not looked at.
+            bus: Its bus.
+            pacer: Its clock.
+            faults: What is to go wrong, beside the scenario's own faults.
+            lockstep: Wait at each tick until every servo has a command for it.
+            wait: Begin with the first command; in lockstep it does so anyway.
+            say: Told what happens: level, text.
+            each_tick: Called once a tick, and while it waits.
+            stop: Looked at while it waits.
+
+        Raises:
+            DataError: If the robot has no bus.
+        """
+        self._scenario, self._bus, self._pacer = scenario, bus, pacer
+        self._lockstep, self._wait_for_commands = lockstep, wait
+        self._say, self._each_tick = say, each_tick
+        self._stop = stop or StopRequest()
+        robot = self._robot = scenario.robot
+        self._replies = ReplyEncoder(robot)
+        self._latch = CommandLatch(robot)
+        ordered = (*scenario.faults, *faults)
+        self._line = FaultLine(ordered, robot, self._replies, scenario.seed)
+        self._tick = 0
+        self._silent = False
+        self._told_cut: set[str] = set()
+        self._twin: Twin | None = None
+        if made_up := self._replies.made_up:
+            say("warn", f"reads 0 on the bus, as the twin has none: {', '.join(made_up)}")
+
+    @property
+    def robot(self) -> Robot:
+        """Who it is."""
+        return self._robot
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """No values: what the controller meant is not on the bus."""
+        return ()
+
+    def run(self) -> Served:
+        """Live until the scenario ends or a stop is asked for.
+
+        Returns:
+            How it went.
+
+        Raises:
+            SimulationError: If the twin's state becomes impossible.
+            UsageError: If the engine cannot hold the robot.
+        """
+        last = -1
+        with Twin(self._scenario, self) as self._twin:
+            try:
+                for sample in self._twin.samples():
+                    last = sample.tick
+                    if self._stop.requested:
+                        break
+            except _StoppedError:
+                pass
+            if last >= 0:
+                self._report(self._twin.flush(), last)
+        return Served(
+            duration_s=max(last, 0) / CONTROL_RATE_HZ,
+            complete=last == self._scenario.tick_count - 1,
+            start_ns=self._pacer.start_ns,
+            pace=self._pacer.tally,
+            commands=self._latch.frames,
+            lost=self._line.lost,
+            hit=self._line.hit,
+        )
+
+    def step(self, time_s: float, readings: Readings) -> GaitTick:
+        """Wait for the tick, report, and take the newest commands.
+
+        Args:
+            time_s: Time since the start [s].
+            readings: What the encoders have told.
+
+        Returns:
+            The commands that are in force from here on.
+        """
+        tick = self._tick
+        if not tick:
+            self._begin()
+        while (wait_s := self._pacer.wait_s(tick)) > 0.0:
+            self._serve(wait_s)
+        if self._twin is not None and tick:
+            self._report(self._twin.sensed, tick)
+        if self._lockstep:
+            self._listen_to_all(tick)
+        else:
+            self._serve(0.0)
+            self._keep_pace(tick)
+            self._watch()
+        self._tick += 1
+        self._tell_cuts()
+        command = self._line.command(self._latch.angle, readings.angle, time_s)
+        return GaitTick(command, np.empty(0), "bus", ())
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """Fix when tick 0 is due."""
+        if self._lockstep:
+            while not self._bus.waiting:
+                self._idle(_PATIENCE_S)
+            self._pacer.start(self._pacer.now_ns())
+        elif self._wait_for_commands:
+            while not self._latch.frames:
+                self._serve(_PATIENCE_S)
+            # Half a period on, so that a controller of the same rate speaks between the ticks.
+            self._pacer.start(self._pacer.now_ns() + PERIOD_NS // 2)
+        else:
+            self._pacer.start(self._pacer.now_ns() + PERIOD_NS)
+        self._say("info", f"starts at {self._pacer.start_ns / _NS:.6f} s of its own clock")
+
+    def _idle(self, timeout_s: float) -> None:
+        """Serve the bus for a moment; frames of clients wait."""
+        self._each_tick()
+        if self._stop.requested:
+            raise _StoppedError
+        self._bus.wait(timeout_s)
+
+    def _serve(self, timeout_s: float) -> None:
+        """Serve the bus for a moment; commands are latched as they come."""
+        self._idle(timeout_s)
+        if sent := self._bus.pull():
+            frames = self._bus.relay(sent, self._pacer.now_ns())
+            self._latch.take(frames, heard=self._line.hears(self._tick / CONTROL_RATE_HZ))
+
+    def _listen_to_all(self, tick: int) -> None:
+        """Lockstep: take frames until every servo has a command, and no more."""
+        heard = self._line.hears(tick / CONTROL_RATE_HZ)
+        missing = self._latch.commanded.copy()
+        pulled: list[Sent] = []
+        waited_ns, told = time.monotonic_ns(), False
+        while missing.any():
+            if fresh := self._bus.pull(int(missing.sum())):
+                missing &= ~self._latch.take(records(s.record for s in fresh), heard=heard)
+                pulled += fresh
+                continue
+            self._idle(_PATIENCE_S)
+            if not told and time.monotonic_ns() - waited_ns > _PATIENCE_S * _NS:
+                self._say("warn", f"waits for commands of {self._listed(missing)}")
+                told = True
+        self._keep_pace(tick)
+        self._bus.relay(pulled, self._pacer.clock_ns(tick * PERIOD_NS))
+
+    def _keep_pace(self, tick: int) -> None:
+        overruns = self._pacer.tally.overruns
+        stood_still_s = self._pacer.begin(tick)
+        if self._pacer.tally.overruns > overruns and not self._lockstep:
+            self._say("warn", "the twin is more than a control period behind real time")
+        if stood_still_s:
+            text = f"simulated time stood still for {stood_still_s:.2f} s: samples have a gap there"
+            self._say("warn", text)
+
+    def _report(self, samples: Sequence[SensorSample], tick: int) -> None:
+        """Send what the sensors have told by a tick."""
+        time_s = tick / CONTROL_RATE_HZ
+        frames = self._replies.frames(self._line.samples(samples, time_s), self._pacer.clock_ns)
+        now_ns = self._pacer.clock_ns(tick * PERIOD_NS)
+        self._bus.send(self._line.replies(frames, now_ns, time_s))
+
+    def _watch(self) -> None:
+        """Say when servos get no commands any more."""
+        silent = self._latch.silent(self._pacer.now_ns(), round(WATCHDOG_S * _NS))
+        if bool(silent.any()) is not self._silent:
+            self._silent = bool(silent.any())
+            if self._silent:
+                names = self._listed(silent)
+                self._say("warn", f"no command for {WATCHDOG_S:g} s: {names} hold their angles")
+            else:
+                self._say("info", "commands are back")
+
+    def _tell_cuts(self) -> None:
+        for name in sorted(self._latch.cut - self._told_cut):
+            self._told_cut.add(name)
+            self._say("warn", f"{name} was told to go beyond its limits, and stops there")
+
+    def _listed(self, chosen: BoolArray) -> str:
+        """Some joints by name."""
+        names = [n for n, is_one in zip(self._robot.joint_names, chosen, strict=True) if is_one]
+        return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")

@@ -1,0 +1,305 @@
+"""A socketcand server for one bus, on loopback only: several clients, none of whom can block it.
+
+Protocol: https://github.com/linux-can/socketcand, ``doc/protocol.md``. Of its modes there is the
+raw one, in which a client gets every frame that it did not send itself; frames can be sent in the
+default mode too. What a client can't take at once waits in a queue of its own. A queue that is full
+ends the connection: on a bus nobody waits for a listener.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import selectors
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from capture.errors import UsageError
+from capture.log.frames import FrameArray
+
+from .socketcand_text import ClientText, frame_text, sent_frame
+
+MOST_CLIENTS = 16
+"""Clients at once."""
+MOST_BYTES = 1 << 20
+"""What waits for one client, at most: some ten seconds of a robot of 25 joints."""
+MOST_SENT = 10_000
+"""Frames that clients sent and the robot has not taken yet; from there on clients have to wait."""
+HOLD_S = 0.05
+"""A client that goes to raw mode gets its first frames this much later: python-can's takes what
+comes with the answer for part of it."""
+
+_CHUNK = 1 << 14
+_UNSUPPORTED = ("add", "update", "delete", "subscribe", "unsubscribe", "filter", "muxfilter")
+_SEND = ("send", "sendrtr")
+
+
+class Sent(NamedTuple):
+    """A frame that a client sent.
+
+    Attributes:
+        client: Number of the client.
+        record: As :data:`capture.sources.records.pack_record` packs it, without times.
+    """
+
+    client: int
+    record: bytes
+
+
+class _Client:
+    """One connection."""
+
+    def __init__(self, number: int, sock: socket.socket, peer: str) -> None:
+        self.number, self.sock, self.peer = number, sock, peer
+        self.text = ClientText()
+        self.bus_open = self.raw = False
+        self.held_until = 0.0
+        self.out = bytearray()
+        self.watched = selectors.EVENT_READ
+
+
+class SocketcandServer:
+    """Serves one bus.
+
+    Attributes:
+        dropped: Clients whose connection was ended because they were too slow or made no sense.
+    """
+
+    def __init__(self, host: str, port: int, bus: str, say: Callable[[str, str], None]) -> None:
+        """Listen.
+
+        Args:
+            host: A name or address of the loopback interface.
+            port: TCP port; 0 for any that is free.
+            bus: Name of the bus, e.g. ``can0``.
+            say: Told what happens: level, text.
+
+        Raises:
+            UsageError: If the host is not loopback, or nobody can listen there.
+        """
+        self.dropped = 0
+        self._bus, self._say = bus, say
+        self._clients: dict[int, _Client] = {}
+        self._number = 0
+        self._sent: deque[Sent] = deque()
+        self._selector = selectors.DefaultSelector()
+        self._listener = _listen(host, port)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Where it listens: address and port."""
+        host, port = self._listener.getsockname()[:2]
+        return host, port
+
+    @property
+    def clients(self) -> int:
+        """Connected clients that have opened the bus."""
+        return sum(client.bus_open for client in self._clients.values())
+
+    @property
+    def waiting(self) -> int:
+        """Frames that clients sent and nobody has taken yet."""
+        return len(self._sent)
+
+    def pump(self, timeout_s: float) -> None:
+        """Wait until something happens, and take and give what there is.
+
+        Args:
+            timeout_s: How long to wait at most [s].
+        """
+        now = time.monotonic()
+        held = [client.held_until - now for client in self._clients.values() if client.out]
+        waits = [wait for wait in held if wait > 0]
+        for key, mask in self._selector.select(max(0.0, min([timeout_s, *waits]))):
+            client: _Client | None = key.data
+            if client is None:
+                self._accept()
+                continue
+            if mask & selectors.EVENT_READ:
+                self._read(client)
+            if mask & selectors.EVENT_WRITE and client.number in self._clients:
+                self._write(client)
+        if waits:
+            for client in [client for client in self._clients.values() if client.out]:
+                self._write(client)
+
+    def take(self) -> Sent | None:
+        """The oldest frame that a client sent and nobody has taken; None where there is none."""
+        if not self._sent:
+            return None
+        if len(self._sent) == MOST_SENT:
+            found = self._sent.popleft()
+            for client in self._clients.values():
+                self._watch(client)
+            return found
+        return self._sent.popleft()
+
+    def broadcast(self, frames: FrameArray, but: int | None = None) -> None:
+        """Give frames to every client in raw mode.
+
+        Args:
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,); their device
+                times are told.
+            but: Number of the client that sent them.
+        """
+        listening = [c for c in self._clients.values() if c.raw and c.number != but]
+        if not len(frames) or not listening:
+            return
+        text = frame_text(frames)
+        for client in listening:
+            self._give(client, text)
+
+    def close(self) -> None:
+        """Give what can be given at once, and end all connections; safe to call twice."""
+        for client in list(self._clients.values()):
+            client.held_until = 0.0
+            self._write(client)
+            self._forget(client)
+        self._selector.close()
+        self._listener.close()
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        try:
+            sock, peer = self._listener.accept()
+        except OSError as error:
+            self._say("warn", f"a client could not be let in: {error.strerror}")
+            return
+        if len(self._clients) >= MOST_CLIENTS:
+            self._say("warn", f"no more than {MOST_CLIENTS} clients are let in")
+            sock.close()
+            return
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._number += 1
+        client = _Client(self._number, sock, f"client {self._number} at port {peer[1]}")
+        self._clients[client.number] = client
+        self._selector.register(sock, client.watched, client)
+        self._give(client, b"< hi >")
+
+    def _read(self, client: _Client) -> None:
+        try:
+            chunk = client.sock.recv(_CHUNK)
+            messages = client.text.feed(chunk)
+        except BlockingIOError:
+            return
+        except OSError:
+            chunk, messages = b"", []
+        except ValueError as error:
+            self._drop(client, f"makes no sense: {error}")
+            return
+        for message in messages:
+            if client.number not in self._clients:
+                return
+            self._hear(client, message)
+        if not chunk and client.number in self._clients:
+            self._say("info", f"{client.peer} is gone")
+            self._forget(client)
+        elif len(self._sent) >= MOST_SENT:
+            for each in self._clients.values():
+                self._watch(each)
+
+    def _hear(self, client: _Client, message: str) -> None:
+        """Act on one message."""
+        word, _, rest = message.partition(" ")
+        if word in _SEND and client.bus_open:
+            record = sent_frame(word, rest.strip())
+            if record is None:
+                self._give(client, b"< error syntax error >")
+            else:
+                self._sent.append(Sent(client.number, record))
+        elif word == "echo":
+            self._give(client, b"< echo >")
+        elif not client.bus_open:
+            if word == "open" and rest.strip() == self._bus:
+                client.bus_open = True
+                self._say("info", f"{client.peer} opened {self._bus}")
+                self._give(client, b"< ok >")
+            else:
+                self._give(client, b"< error could not open bus >")
+                if client.number in self._clients:
+                    self._drop(client, f"asked for {message!r}; there is only {self._bus}")
+        elif word in ("rawmode", "bcmmode"):
+            self._give(client, b"< ok >")
+            client.raw = word == "rawmode"
+            client.held_until = time.monotonic() + HOLD_S
+        elif word in _UNSUPPORTED:
+            self._give(client, b"< error only the raw mode is served >")
+        else:
+            self._give(client, b"< error unknown command >")
+
+    def _give(self, client: _Client, text: bytes) -> None:
+        client.out += text
+        if len(client.out) > MOST_BYTES:
+            self._drop(client, "does not take its frames and was let go")
+        else:
+            self._write(client)
+
+    def _write(self, client: _Client) -> None:
+        """Send what the connection takes."""
+        if client.out and time.monotonic() >= client.held_until:
+            try:
+                del client.out[: client.sock.send(client.out)]
+            except BlockingIOError:
+                pass
+            except OSError:
+                self._say("info", f"{client.peer} is gone")
+                self._forget(client)
+                return
+        self._watch(client)
+
+    def _watch(self, client: _Client) -> None:
+        """Wait for what can go on: reading unless too much was read, writing what is left."""
+        events = 0
+        if len(self._sent) < MOST_SENT:
+            events |= selectors.EVENT_READ
+        if client.out and time.monotonic() >= client.held_until:
+            events |= selectors.EVENT_WRITE
+        if events == client.watched:
+            return
+        if not events:
+            self._selector.unregister(client.sock)
+        elif not client.watched:
+            self._selector.register(client.sock, events, client)
+        else:
+            self._selector.modify(client.sock, events, client)
+        client.watched = events
+
+    def _drop(self, client: _Client, why: str) -> None:
+        self.dropped += 1
+        self._say("warn", f"{client.peer} {why}")
+        self._forget(client)
+
+    def _forget(self, client: _Client) -> None:
+        if client.watched:
+            self._selector.unregister(client.sock)
+        client.sock.close()
+        del self._clients[client.number]
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """A listener on loopback, and nowhere else."""
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (OSError, OverflowError) as error:
+        raise UsageError(f"{host}:{port} is no address to serve at: {error}") from error
+    family, _, _, _, address = found[0]
+    if not ipaddress.ip_address(address[0]).is_loopback:
+        raise UsageError(
+            f"{host} is not this computer's loopback; a virtual robot is served there only, e.g. "
+            f"at 127.0.0.1:{port}"
+        )
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen()
+        listener.setblocking(False)
+    except OSError as error:
+        listener.close()
+        raise UsageError(f"can't serve at {host}:{port}: {error.strerror}") from error
+    return listener
