@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from capture.interruption import StopRequest
 from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain
 
+from .gait import Gait
 from .physics.ledger import TERMS
 from .scenario import Scenario
 from .session_log import SessionLog, session_facts
@@ -38,10 +40,39 @@ class Recording:
     energy: dict[str, float]
 
 
+@dataclass(frozen=True)
+class Driver:
+    """Who commands the joints instead of the scenario's own gait.
+
+    Attributes:
+        gait: The commands; a run that is stopped has come to rest by then.
+        facts: What the session's metadata says of it.
+        attachments: File name to TOML text that explains it, e.g. ``plan.toml``.
+    """
+
+    gait: Gait
+    facts: Mapping[str, str]
+    attachments: Mapping[str, bytes]
+
+    def session_id(self, scenario: Scenario) -> str:
+        """Hash of everything that decides what the run gives.
+
+        Args:
+            scenario: Where it runs.
+
+        Returns:
+            32 hexadecimal digits.
+        """
+        told = [f"{key}={value}".encode() for key, value in sorted(self.facts.items())]
+        parts = [scenario.session_id.encode(), *told, *self.attachments.values()]
+        return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
+
+
 def record(
     scenario: Scenario,
     path: Path | str,
     *,
+    driver: Driver | None = None,
     force: bool = False,
     stop: StopRequest | None = None,
     on_sample: Callable[[Sample], None] | None = None,
@@ -54,6 +85,7 @@ def record(
     Args:
         scenario: What to run.
         path: The file to create.
+        driver: Who commands the joints; the scenario's own gait if None.
         force: Replace an existing file.
         stop: Looked at between samples.
         on_sample: Told of each sample after it was written, e.g. to show progress.
@@ -67,18 +99,21 @@ def record(
         LogWriteError: If the file can't be written.
     """
     sample: Sample | None = None
+    session_id = scenario.session_id if driver is None else driver.session_id(scenario)
     with (
-        Twin(scenario) as twin,
+        Twin(scenario, None if driver is None else driver.gait) as twin,
         SessionWriter(
             path,
-            session_id=scenario.session_id,
+            session_id=session_id,
             epoch_ns=scenario.epoch_ns,
             robot=scenario.robot,
             clock={"twin": ClockDomain.SIMULATED},
-            metadata=session_facts(scenario),
+            metadata={**session_facts(scenario), **(driver.facts if driver is not None else {})},
             force=force,
         ) as writer,
     ):
+        for name, data in driver.attachments.items() if driver is not None else ():
+            writer.attach(name, "application/toml", data)
         log = SessionLog(writer, twin)
         try:
             for sample in twin.samples():
@@ -98,13 +133,17 @@ def record(
         if complete:
             log.say("info", f"end at {sample.time_s:g} s")
             writer.set_verdict("good")
+        elif driver is not None:  # it was asked to come to rest, and has
+            planned = f"{scenario.duration_s:g} s"
+            log.say("info", f"at rest at {sample.time_s:g} s of {planned}: it was asked to stop")
+            writer.set_verdict("good")
         else:
             text = f"stopped at {sample.time_s:g} s of {scenario.duration_s:g} s"
             log.say("warn", text)
             writer.set_verdict("degraded", [text])
     return Recording(
         path=Path(path),
-        session_id=scenario.session_id,
+        session_id=session_id,
         sample_count=sample.tick + 1,
         duration_s=sample.time_s,
         complete=complete,

@@ -27,6 +27,9 @@ from .stability import warnings
 from .twin import Sample, Twin
 from .urdf import frame_origins, urdf
 
+GAIT_UNIT = "rad, omega in rad/s"
+"""Unit of the values on ``/gait``."""
+
 _TF_EVERY = 5  # ticks: 20 Hz, a view aid
 _TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
 
@@ -79,7 +82,8 @@ class SessionLog:
         self._offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
         self._current = writer.joint_state("/joint_current", names, unit="A")
         self._voltage = writer.joint_state("/joint_voltage", names, unit="V")
-        self._gait = writer.joint_state("/gait", twin.gait.names, unit="rad, omega in rad/s")
+        told = twin.gait.names  # recorded commands may come without their gait
+        self._gait = writer.joint_state("/gait", told, unit=GAIT_UNIT) if told else None
         self._energy = writer.joint_state("/energy_ledger", TERMS, unit="J")
         self._odometry = writer.odometry("/odom", frame="world", child=head)
         self._transforms = writer.transforms(
@@ -117,7 +121,8 @@ class SessionLog:
         body = sample.step.body
         self._commands.write(t_ns, sample.gait.command)
         self.hear(sample.sensed)
-        self._gait.write(t_ns, sample.gait.values)
+        if self._gait is not None:
+            self._gait.write(t_ns, sample.gait.values)
         self._energy.write(t_ns, sample.energy)
         position, quaternion = body.position[:, 0], body.quaternion[:, 0]
         into_head = rotation_from_quaternion(quaternion).T

@@ -1,0 +1,122 @@
+"""The verb ``drive``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from capture.console import emit_json, progress, refuse_existing
+from capture.errors import UsageError
+from capture.interruption import interruptible
+
+if TYPE_CHECKING:
+    from ..record import Recording
+    from ..scenario import Scenario
+    from .driven import Driven
+
+_TWIN = "twin"
+
+
+def drive(
+    what: str,
+    /,
+    *,
+    on: str,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    duration: float | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Drive a gait, a plan or recorded commands on the twin or over a bus.
+
+    On the twin it runs faster than real time and is recorded like `undulog sim run`. SIGINT and
+    SIGTERM let the joints come to rest within a second, and then end the run.
+
+    Example: `undulog drive flat --on twin -o driven.mcap`
+
+    Args:
+        what: Name of a shipped scenario, or a scenario's TOML file: its gait is driven. Or a plan,
+            a TOML file of segments. Or a session, `.mcap`: its commands are given again.
+        on: `twin` (the world that it was made for) or `twin:SCENARIO`.
+        output: The session file to write, `.mcap`.
+        duration: How long to drive in seconds, instead of what the gait or plan says.
+        force: Replace the output if it is there.
+        json: Print one JSON object instead of text.
+    """
+    from ..scenario_file import load_scenario
+    from .driven import find_driven
+
+    if output is not None and output.suffix != ".mcap":
+        raise UsageError(
+            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+        )
+    scheme, colon, rest = on.partition(":")
+    if scheme == _TWIN and (rest or not colon):
+        world = load_scenario(rest) if rest else None
+        driven = find_driven(what, world)
+        return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
+    raise UsageError(f"--on {on}: expected twin or twin:SCENARIO")
+
+
+def _on_twin(
+    driven: Driven, scenario: Scenario, output: Path | None, *, force: bool, as_json: bool
+) -> int:
+    from .in_process import drive_twin
+
+    if output is None:
+        raise UsageError(
+            "a run of the twin is recorded: name the session with -o, e.g. -o run.mcap"
+        )
+    refuse_existing(output, force=force)
+    start = time.monotonic()
+    with interruptible() as stop, progress(driven.name, scenario.duration_s) as bar:
+        recording = drive_twin(
+            driven,
+            scenario,
+            output,
+            force=force,
+            stop=stop,
+            on_sample=lambda sample: bar.update(
+                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
+            ),
+        )
+    factor = recording.duration_s / (time.monotonic() - start)
+    if as_json:
+        emit_json(_reported(driven, scenario, recording, factor))
+    else:
+        print("\n".join(_told(driven, scenario, recording, factor)))
+    return 0
+
+
+def _reported(
+    driven: Driven, scenario: Scenario, recording: Recording, factor: float
+) -> dict[str, Any]:
+    return {
+        "driven": driven.name,
+        "kind": driven.kind,
+        "on": f"{_TWIN}:{scenario.name}",
+        "robot": scenario.robot.name,
+        "path": str(recording.path),
+        "session_id": recording.session_id,
+        "duration_s": recording.duration_s,
+        "planned_duration_s": scenario.duration_s,
+        "complete": recording.complete,
+        "ticks": recording.sample_count,
+        "real_time_factor": factor,
+    }
+
+
+def _told(driven: Driven, scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+    if recording.complete:
+        first = f"{recording.path}: drove {driven.name} for {recording.duration_s:g} s"
+    else:
+        first = (
+            f"stopped at rest at {recording.duration_s:g} s of {scenario.duration_s:g} s; "
+            f"{recording.path} is complete up to there"
+        )
+    who = f"{driven.kind} on the twin of {scenario.robot.name} in {scenario.name}, "
+    who += f"{recording.sample_count} ticks, session {recording.session_id}"
+    return [first, who, f"simulated at {factor:.1f} x real time"]

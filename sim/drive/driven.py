@@ -1,0 +1,170 @@
+"""What is driven: a scenario's gait, a plan, or the commands of a session; found by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture import Session
+from capture.errors import DataError, PlanError, UsageError
+from capture.robot import Plane, Robot
+from capture.shipped import Shelf
+
+from ..gait import Gait, generator
+from ..scenario import Scenario
+from ..scenario_file import load_scenario, parse_scenario
+from .command_session import CommandReplay, RecordedCommands
+from .plan import PlanGait
+from .plan_file import is_plan, parse_plan
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What is driven.
+
+    Attributes:
+        kind: ``gait``, ``plan`` or ``commands``.
+        name: What to call it.
+        robot: Who it was made for.
+        world: The scenario that it was made for, None where that isn't known.
+        duration_s: How long it lasts.
+        planes: The planes that it needs.
+        make: Builds the gait, at time zero, for a robot.
+        facts: What a session's metadata says of it.
+        attachments: File name to TOML text that explains it.
+        own_gait: Whether ``world.gait`` is what is driven, so that a run's scenario says it all.
+    """
+
+    kind: str
+    name: str
+    robot: Robot
+    world: Scenario | None
+    duration_s: float
+    planes: tuple[Plane, ...]
+    make: Callable[[Robot], Gait]
+    facts: Mapping[str, str]
+    attachments: Mapping[str, bytes]
+    own_gait: bool = False
+
+    def scenario(self, world: Scenario | None, duration_s: float | None) -> Scenario:
+        """The scenario of a run on the twin.
+
+        Args:
+            world: Where to run it; where it was made for if None.
+            duration_s: Length of the run; its own if None.
+
+        Returns:
+            The world, with the length and, if it is a scenario's gait, that gait.
+
+        Raises:
+            UsageError: If no world is known, or its robot lacks a plane.
+        """
+        where = world or self.world
+        if where is None:
+            raise UsageError(
+                f"{self.name} does not say in which world it ran; name one, e.g. --on twin:flat"
+            )
+        for plane in self.planes:
+            if not len(where.robot.joint_indices(plane)):
+                raise UsageError(
+                    f"{self.name} moves {plane} joints and {where.robot.name} of {where.name} has "
+                    "none"
+                )
+        if self.own_gait and self.world is not None:
+            where = dataclasses.replace(where, gait=self.world.gait)
+        return where.changed(duration_s=self.duration_s if duration_s is None else duration_s)
+
+
+def find_driven(word: str, world: Scenario | None = None) -> Driven:
+    """Find what is to be driven.
+
+    Args:
+        word: Name of a shipped scenario, or a file: a scenario or a plan (TOML), or a session of
+            commands (MCAP).
+        world: Where it will be run, if that is known: its robot takes recorded commands.
+
+    Returns:
+        What it is.
+
+    Raises:
+        UsageError: If there is no such thing.
+        FaultyFileError: If a file has faults; lists all of them.
+        LogError: If a session can't be read, or has no commands.
+        DataError: If a session's commands are of another robot, or of none.
+    """
+    path = Path(word)
+    if path.suffix == ".mcap":
+        return _commands(path, world)
+    found = Shelf("gait or plan", "sim", "scenarios", PlanError).read(word)
+    if is_plan(found.text):
+        return _plan(found.text, found.source)
+    return _gait(load_scenario(word))
+
+
+def _gait(scenario: Scenario) -> Driven:
+    def make(robot: Robot) -> Gait:
+        return generator(scenario.gait, robot)
+
+    return Driven(
+        kind="gait",
+        name=scenario.name,
+        robot=scenario.robot,
+        world=scenario,
+        duration_s=scenario.duration_s,
+        planes=tuple(scenario.gait.planes),
+        make=make,
+        facts={"driven": "gait", "driven.by": scenario.name},
+        attachments={"gait.toml": scenario.toml().encode()},
+        own_gait=True,
+    )
+
+
+def _plan(text: str, source: Path) -> Driven:
+    plan = parse_plan(text, source)
+    return Driven(
+        kind="plan",
+        name=plan.name,
+        robot=plan.scenario.robot,
+        world=plan.scenario,
+        duration_s=plan.duration_s,
+        planes=tuple(plan.start),
+        make=lambda robot: PlanGait(plan, robot),
+        facts={"driven": "plan", "driven.by": plan.name},
+        attachments={"plan.toml": text.encode()},
+    )
+
+
+def _commands(path: Path, world: Scenario | None) -> Driven:
+    facts = {"driven": "commands", "driven.by": path.name}
+    with Session.open(path) as session:
+        recorded = RecordedCommands.read(session)
+        scenario = _recorded_scenario(session) if world is None else world
+        robot = session.robot if world is None else world.robot
+        facts["driven.session_id"] = session.session_id
+    if robot is None:
+        raise DataError(f"{path}: the session has no robot; name one by its world, e.g. twin:flat")
+    try:
+        replay = CommandReplay(recorded, robot)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+    return Driven(
+        kind="commands",
+        name=path.name,
+        robot=robot,
+        world=scenario,
+        duration_s=replay.duration_s,
+        planes=(),
+        make=lambda robot: CommandReplay(recorded, robot),
+        facts=facts,
+        attachments={},
+    )
+
+
+def _recorded_scenario(session: Session) -> Scenario | None:
+    """The scenario that a session of the twin ran."""
+    text = session.attachments.get("scenario.toml")
+    if text is None:
+        return None
+    return parse_scenario(text.decode(), f"{session.path}:scenario.toml")

@@ -1,0 +1,79 @@
+"""Coming to rest: whatever drives the joints is faded out within a bounded time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.robot import Robot
+
+from ..gait import Gait, GaitTick
+from ..gait.limits import smoothstep
+from ..readings import Readings
+
+FADE_S = 1.0
+"""A gait that is to stop comes to rest within this time [s]."""
+
+STOP = "stop"
+"""The mode of a gait that comes to rest."""
+
+_FADED = ("A", "offset")
+
+
+class FadingGait:
+    """A gait, untouched until it is to end; then its commands shrink smoothly to straight joints.
+
+    The commands are multiplied by 1 - S((t - t_0) / T), S(x) = 3 x^2 - 2 x^3; for a wave that is
+    its amplitude and offset going to zero while its phase runs on. It works for any gait, recorded
+    commands and adaptive ones alike.
+    """
+
+    def __init__(self, gait: Gait, robot: Robot, fade_s: float = FADE_S) -> None:
+        """Wrap a gait.
+
+        Args:
+            gait: Who commands.
+            robot: Whose joints.
+            fade_s: T [s].
+        """
+        self._gait, self._fade_s = gait, fade_s
+        self._rest = np.clip(np.zeros(len(robot.joints)), *robot.limits())
+        self._asked = False
+        self._begun_s: float | None = None
+        self._time_s = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values: the gait's own."""
+        return self._gait.names
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last command was the pose at rest, to be held from then on."""
+        return self._begun_s is not None and self._time_s - self._begun_s >= self._fade_s
+
+    def begin(self) -> None:
+        """Come to rest from the next step on; safe to call again."""
+        self._asked = True
+
+    def step(self, time_s: float, readings: Readings) -> GaitTick:
+        """Advance to a time and say what to do from then on.
+
+        Args:
+            time_s: Time since the start [s], never less than in the call before.
+            readings: For the gait.
+
+        Returns:
+            Commands and values.
+        """
+        tick = self._gait.step(time_s, readings)
+        self._time_s = time_s
+        if not self._asked:
+            return tick
+        if self._begun_s is None:
+            self._begun_s = time_s
+        share = 1.0 - smoothstep((time_s - self._begun_s) / self._fade_s)
+        command: FloatArray = self._rest + share * (tick.command - self._rest)
+        faded = [name.rpartition(".")[2] in _FADED for name in self.names]
+        values = np.where(faded, share * tick.values, tick.values)
+        return GaitTick(command, values, STOP, tick.clamped)

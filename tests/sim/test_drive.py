@@ -1,0 +1,265 @@
+"""Driving the twin in process: gaits, plans, recorded commands, and the end on request."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import undulog as front
+from capture import Session
+from capture.errors import DataError
+from capture.log.writer import SessionWriter
+from capture.robot import Plane
+from sim import PlaneGait, Readings, Serpentine, SerpentineGait
+from sim.drive.command_session import CommandReplay, RecordedCommands
+from sim.drive.fading import FadingGait
+
+COLUMNS = (
+    ("/joint_commands", "position"),
+    ("/joint_states", "position"),
+    ("/joint_states", "velocity"),
+    ("/joint_states", "effort"),
+    ("/joint_current", "position"),
+    ("/joint_voltage", "position"),
+    ("/gait", "position"),
+    ("/energy_ledger", "position"),
+)
+
+
+def column_bytes(path):
+    """All joint columns of a session with their times, as bytes."""
+    with Session.open(path) as session:
+        found = [session.joints(topic, field) for topic, field in COLUMNS]
+    return [
+        (one.names, t_ns.tobytes(), values.tobytes())
+        for one in found
+        for t_ns, values in zip(one.t_ns, one.values, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A run of the twin by itself."""
+    path = tmp_path_factory.mktemp("drive") / "plain.mcap"
+    assert front.run(["sim", "run", "weak-servo-pi3", "-o", str(path), "--duration", "0.6"]) == 0
+    return path
+
+
+def test_driving_a_scenarios_gait_is_running_the_scenario(plain, tmp_path, capsys):
+    path = tmp_path / "driven.mcap"
+    words = ["drive", "weak-servo-pi3", "--on", "twin", "-o", str(path), "--duration", "0.6"]
+    assert front.run([*words, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["kind"], report["on"]) == ("gait", "twin:weak-servo-pi3")
+    assert (report["complete"], report["ticks"], report["duration_s"]) == (True, 61, 0.6)
+    assert column_bytes(path) == column_bytes(plain)
+    with Session.open(path) as session, Session.open(plain) as own:
+        assert set(session.channels) == set(own.channels)
+        assert session.session_id == report["session_id"] != own.session_id
+        assert session.metadata["undulog"]["driven"] == "gait"
+        assert session.verdict == "good"
+        assert session.warnings == []
+
+
+def test_recorded_commands_drive_the_same_run_bit_by_bit(plain, tmp_path, capsys):
+    path = tmp_path / "again.mcap"
+    assert front.run(["drive", str(plain), "--on", "twin", "-o", str(path)]) == 0
+    assert f"{path}: drove plain.mcap for 0.6 s" in capsys.readouterr().out
+    assert column_bytes(path) == column_bytes(plain)
+    with Session.open(path) as session, Session.open(plain) as own:
+        facts = session.metadata["undulog"]
+        assert facts["driven"] == "commands"
+        assert facts["driven.session_id"] == own.session_id
+        assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
+
+
+def test_the_same_drive_gives_the_same_file(plain, tmp_path):
+    for name in "ab":
+        path = tmp_path / f"{name}.mcap"
+        assert front.run(["drive", str(plain), "--on", "twin", "-o", str(path)]) == 0
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+PLAN = """
+description = "Faster, with a bend."
+scenario = "flat"
+[[segments]]
+duration_s = 0.3
+[[segments]]
+duration_s = 0.4
+transition_s = 0.2
+mode = "turn"
+horizontal = { offset = 0.1, frequency_hz = 1.0 }
+"""
+
+
+def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, capsys):
+    plan, path = tmp_path / "bend.toml", tmp_path / "bend.mcap"
+    plan.write_text(PLAN)
+    assert front.run(["drive", str(plan), "--on", "twin", "-o", str(path)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == f"{path}: drove bend for 0.7 s"
+    assert told[1].startswith("plan on the twin of snake25 in flat, 71 ticks")
+    with Session.open(path) as session:
+        assert session.attachments["plan.toml"].decode() == PLAN
+        facts = session.metadata["undulog"]
+        assert (facts["driven"], facts["driven.by"]) == ("plan", "bend")
+        gait = session.joints("/gait")
+        omega = gait.signal("horizontal.omega").values
+        assert omega[[0, 29, 50, 70]] == pytest.approx([np.pi, np.pi, 2 * np.pi, 2 * np.pi])
+        modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
+        assert modes == [(0, "walk"), (300_000_000, "turn")]
+
+
+def test_a_gait_can_be_driven_in_another_world(tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    words = ["drive", "flat", "--on", "twin:weak-servo-pi3", "-o", str(path), "--duration", "0.1"]
+    assert front.run(words) == 0
+    with Session.open(path) as session:
+        assert "stall_torque = 0.25" in session.attachments["scenario.toml"].decode()
+        assert session.metadata["undulog"]["driven.by"] == "flat"
+    vertical = [
+        "drive",
+        "snake13-vertical-pi3",
+        "--on",
+        "twin:flat",
+        "-o",
+        str(tmp_path / "b.mcap"),
+    ]
+    assert front.run([*vertical, "--duration", "0.1"]) == 0
+    words = ["drive", "flat", "--on", "twin:nowhere", "-o", str(tmp_path / "c.mcap")]
+    assert front.run(words) == 2
+    assert "no scenario 'nowhere'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("flt", "--on", "twin", "-o", "a.mcap"), "did you mean flat?"),
+        (("flat", "--on", "twin"), "name the session with -o"),
+        (("flat", "--on", "twin", "-o", "a.csv"), "name it a.mcap"),
+        (("flat", "--on", "twins", "-o", "a.mcap"), "expected twin"),
+        (("flat", "--on", "twin", "-o", "a.mcap", "--duration", "0"), "a duration of 0 s"),
+    ],
+)
+def test_wrong_usage_says_what_would_be_right(words, told, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert front.run(["drive", *words]) == 2
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number):
+    path = tmp_path / "stopped.mcap"
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "undulog", "drive", "flat", "--on", "twin"),
+            *("-o", str(path), "--duration", "3600"),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while not (path.exists() and path.stat().st_size > 0):
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(1.0)
+    process.send_signal(number)
+    told, complained = process.communicate(timeout=60)
+    assert (process.returncode, complained) == (0, "")
+    assert told.startswith("stopped at rest at ")
+    with Session.open(path) as session:
+        assert (session.verdict, session.warnings) == ("good", [])
+        commands = np.array(session.joints("/joint_commands").values)
+        modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
+        said = [message.msg for _, message in session.messages("/rosout")]
+    assert said[-1].endswith("of 3600 s: it was asked to stop")
+    assert [mode for _, mode in modes] == ["walk", "stop"]
+    assert not commands[:, -1].any()
+    begun = modes[1][0] // 10_000_000
+    assert commands.shape[1] - 1 - begun == 100  # within a second of robot's time
+    # Smooth: no step is larger than that of the gait plus that of the fade, A (omega + S'max / T).
+    assert np.abs(np.diff(commands[:, begun - 1 :])).max() <= 0.4 * (np.pi + 1.5) * 0.01
+
+
+def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
+    robot = make_robot(5, planar=True)
+    wave = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 1.0, 0.5, offset=0.1)}, ramp_s=0.0)
+    own, faded = SerpentineGait(wave, robot), FadingGait(SerpentineGait(wave, robot), robot, 0.5)
+    knows = Readings.nothing(robot)
+    for k in range(160):
+        expected, tick = own.step(k / 100, knows), faded.step(k / 100, knows)
+        if k == 99:
+            faded.begin()
+        x = min(max((k - 100) / 50, 0.0), 1.0)
+        share = 1.0 - x * x * (3.0 - 2.0 * x)
+        np.testing.assert_allclose(tick.command, share * expected.command, atol=1e-15)
+        np.testing.assert_allclose(
+            tick.values, expected.values * [share, 1, 1, share, 1], atol=1e-15
+        )
+        assert tick.mode == ("walk" if k < 100 else "stop")
+        assert faded.at_rest == (k >= 150)
+
+
+def written(path, rows, names=("joint01", "joint02"), **options):
+    """A session of commands: (time [ns], values) for each message."""
+    with SessionWriter(path, session_id="s", epoch_ns=0, **options) as writer:
+        channel = writer.joint_state("/joint_commands", names, unit="rad")
+        for t_ns, values in rows:
+            channel.write(10**18 + t_ns, values)
+    with Session.open(path) as session:
+        return RecordedCommands.read(session)
+
+
+def test_each_joint_holds_its_newest_command(tmp_path, make_robot):
+    robot = make_robot(4)
+    rows = [
+        (0, (np.nan, 0.1)),
+        (4_000_000, (0.2, np.nan)),
+        (20_000_000, (0.3, 9.0)),
+        (25_000_000, (-0.1, np.nan)),
+    ]
+    replay = CommandReplay(written(tmp_path / "a.mcap", rows), robot)
+    assert replay.names == ()
+    assert replay.duration_s == 0.03
+    ticks = [replay.step(k / 100, Readings.nothing(robot)) for k in range(5)]
+    limit = robot.joints[1].upper
+    assert [tick.command.tolist() for tick in ticks] == [
+        [0.2, 0.1, 0.0],  # a joint without a command yet has its first one
+        [0.2, 0.1, 0.0],
+        [0.3, limit, 0.0],
+        [-0.1, limit, 0.0],
+        [-0.1, limit, 0.0],
+    ]
+    assert [tick.clamped for tick in ticks] == [(), (), *3 * [("joint02",)]]
+    assert {tick.mode for tick in ticks} == {"replay"}
+
+
+def test_commands_without_a_gait_give_a_session_without_one(tmp_path, capsys):
+    source = tmp_path / "given.mcap"
+    written(source, [(0, (0.0, 0.0)), (50_000_000, (0.1, 0.0))])
+    path = tmp_path / "a.mcap"
+    assert front.run(["drive", str(source), "--on", "twin", "-o", str(path)]) == 1
+    assert "name one by its world" in capsys.readouterr().err
+    assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) == 0
+    with Session.open(path) as session:
+        assert "/gait" not in session.channels
+        assert session.joints("/joint_commands").signal("joint01").values.tolist() == [
+            *[0.0] * 5,
+            0.1,
+        ]
+
+
+def test_commands_of_another_robot_are_refused(tmp_path, make_robot):
+    recorded = written(tmp_path / "a.mcap", [(0, (0.0, 0.0))], names=("joint01", "hip"))
+    with pytest.raises(DataError, match="chain lacks: hip"):
+        CommandReplay(recorded, make_robot(4))
+    recorded = written(tmp_path / "b.mcap", [(0, (np.nan, np.nan))])
+    with pytest.raises(DataError, match="no command"):
+        CommandReplay(recorded, make_robot(4))
