@@ -40,6 +40,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "log export": ("capture.cli:export_log", "Write frames or joint columns for other tools."),
     "sim list": ("sim.cli:list_scenarios", "List the shipped scenarios."),
     "sim run": ("sim.cli:run", "Simulate a scenario and record it."),
+    "sim serve": ("sim.serve.cli:serve", "Be a robot on a bus, in real time."),
     "drive": ("sim.drive.cli:drive", "Drive a gait, a plan or recorded commands."),
     "analyse": ("analysis.cli:analyse", "Numbers: response, energy, spread over the segments."),
     "report": ("analysis.report.cli:report", "The offline report, one HTML page."),

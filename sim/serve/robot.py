@@ -124,8 +124,11 @@ class VirtualRobot:
         """No values: what the controller meant is not on the bus."""
         return ()
 
-    def run(self) -> Served:
+    def run(self, ready: Callable[[], None] = lambda: None) -> Served:
         """Live until the scenario ends or a stop is asked for.
+
+        Args:
+            ready: Called when the twin stands on the ground and the bus can be used.
 
         Returns:
             How it went.
@@ -136,6 +139,7 @@ class VirtualRobot:
         """
         last = -1
         with Twin(self._scenario, self) as self._twin:
+            ready()
             try:
                 for sample in self._twin.samples():
                     last = sample.tick
