@@ -25,7 +25,7 @@ from .options import flag, number, only
 from .python_can import bus_class, python_can_source
 from .slcan import SlcanSettings, slcan_source
 from .socketcan import socketcan_source
-from .socketcand import PORT, socketcand_source
+from .socketcand import server_of, socketcand_source
 
 
 def open_can(address: SourceAddress) -> Source:
@@ -66,11 +66,7 @@ def _open_slcan(address: SourceAddress, interface: str, channel: str) -> Source:
 
 
 def _open_socketcand(address: SourceAddress, interface: str, channel: str) -> Source:
-    only(address, ("host", "port"))
-    host = address.options.get("host", "localhost")
-    port = number(address, "port", PORT)
-    if not 0 < port < 65536:
-        raise UsageError(f"{address.text!r}: port {port} is not one of 1 to 65535")
+    host, port = server_of(address)
     facts = _facts(interface, channel, None) | {"host": host, "port": str(port)}
     return socketcand_source(address, host, port, channel, facts)
 

@@ -10,11 +10,13 @@ import errno
 import socket
 from collections.abc import Mapping, Sequence
 
+from ..errors import UsageError
 from ..log.frames import FrameArray
 from ..robot import ClockDomain
 from .contract import SourceAddress
 from .events import Tally
 from .link import LinkedSource
+from .options import number, only
 from .socketcand_text import SocketcandText
 
 PORT = 29536
@@ -88,6 +90,25 @@ class SocketcandLink:
         self._socket.close()
 
 
+def server_of(address: SourceAddress) -> tuple[str, int]:
+    """Where an address says that its server is.
+
+    Args:
+        address: E.g. of ``can:socketcand:can0?host=192.168.7.2``.
+
+    Returns:
+        Host and TCP port.
+
+    Raises:
+        UsageError: If an option is unknown or has no valid value.
+    """
+    only(address, ("host", "port"))
+    port = number(address, "port", PORT)
+    if not 0 < port < 65536:
+        raise UsageError(f"{address.text!r}: port {port} is not one of 1 to 65535")
+    return address.options.get("host", "localhost"), port
+
+
 def open_socketcand(host: str, port: int, channel: str, tally: Tally) -> SocketcandLink:
     """Connect, open the bus and go to raw mode.
 
@@ -103,6 +124,28 @@ def open_socketcand(host: str, port: int, channel: str, tally: Tally) -> Socketc
     Raises:
         OSError: If the server isn't there, has no such bus, or speaks something else.
     """
+    sock, rest = connect(host, port)
+    try:
+        rest = enter_raw_mode(sock, rest, channel)
+    except OSError:
+        sock.close()
+        raise
+    return SocketcandLink(sock, rest, tally)
+
+
+def connect(host: str, port: int) -> tuple[socket.socket, bytes]:
+    """Connect and be greeted.
+
+    Args:
+        host: Name or address.
+        port: TCP port.
+
+    Returns:
+        The socket, with a time limit, and what came already behind the greeting.
+
+    Raises:
+        OSError: If the server isn't there, or speaks something else.
+    """
     sock = socket.create_connection((host, port), timeout=_CONNECT_S)
     try:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -111,15 +154,30 @@ def open_socketcand(host: str, port: int, channel: str, tally: Tally) -> Socketc
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-        rest = _expect(sock, b"", b"hi")
-        sock.sendall(b"< open %s >" % channel.encode())
-        rest = _expect(sock, rest, b"ok")
-        sock.sendall(b"< rawmode >")
-        rest = _expect(sock, rest, b"ok")
+        return sock, _expect(sock, b"", b"hi")
     except OSError:
         sock.close()
         raise
-    return SocketcandLink(sock, rest, tally)
+
+
+def enter_raw_mode(sock: socket.socket, rest: bytes, channel: str) -> bytes:
+    """Open a bus and go to raw mode.
+
+    Args:
+        sock: Connected and greeted.
+        rest: What came already.
+        channel: The bus, as the server calls it.
+
+    Returns:
+        What came already behind the last answer.
+
+    Raises:
+        OSError: If the server has no such bus, or speaks something else.
+    """
+    sock.sendall(b"< open %s >" % channel.encode())
+    rest = _expect(sock, rest, b"ok")
+    sock.sendall(b"< rawmode >")
+    return _expect(sock, rest, b"ok")
 
 
 def socketcand_source(
@@ -146,8 +204,19 @@ def socketcand_source(
     )
 
 
-def _expect(sock: socket.socket, rest: bytes, word: bytes) -> bytes:
-    """Wait for an answer; returns what came behind it."""
+def read_answer(sock: socket.socket, rest: bytes) -> tuple[str, bytes]:
+    """Wait for an answer.
+
+    Args:
+        sock: With a time limit.
+        rest: What came already.
+
+    Returns:
+        What stands in its brackets, blanks around it removed, and what came behind it.
+
+    Raises:
+        OSError: If none comes.
+    """
     while b">" not in rest:
         chunk = sock.recv(4096)
         if not chunk:
@@ -156,9 +225,15 @@ def _expect(sock: socket.socket, rest: bytes, word: bytes) -> bytes:
         if len(rest) > _LONGEST_ANSWER:
             break
     answer, _, rest = rest.partition(b">")
-    if answer.replace(b"<", b"").strip() != word:
-        said = answer.decode("ascii", "replace").strip()[:80]
+    return answer.replace(b"<", b"").strip().decode("ascii", "replace"), rest
+
+
+def _expect(sock: socket.socket, rest: bytes, word: bytes) -> bytes:
+    """Wait for an answer; returns what came behind it."""
+    answer, rest = read_answer(sock, rest)
+    if answer != word.decode():
         with contextlib.suppress(OSError):
             sock.shutdown(socket.SHUT_RDWR)
+        said = answer[:80]
         raise OSError(errno.EPROTO, f"the server says {said!r} instead of '< {word.decode()} >'")
     return rest
