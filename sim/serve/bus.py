@@ -54,6 +54,24 @@ class VirtualBus:
         """Frames that clients sent and nobody has pulled yet."""
         return 0 if self._server is None else self._server.waiting
 
+    def identify(self, identity: str) -> None:
+        """Say what clients are told that ask.
+
+        Args:
+            identity: E.g. ``virtual-robot snake25 paced``.
+        """
+        if self._server is not None:
+            self._server.identity = identity
+
+    def mark(self, tick: int) -> None:
+        """Tell clients that asked for it that all frames of a control tick are out.
+
+        Args:
+            tick: Its number.
+        """
+        if self._server is not None:
+            self._server.mark(tick)
+
     def wait(self, timeout_s: float) -> None:
         """Serve the clients until something happens.
 

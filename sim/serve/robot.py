@@ -111,6 +111,8 @@ class VirtualRobot:
         self._silent = False
         self._told_cut: set[str] = set()
         self._twin: Twin | None = None
+        pace = "lockstep" if lockstep else "paced"
+        bus.identify(f"virtual-robot {scenario.robot.name} {pace}")
         if made_up := self._replies.made_up:
             say("warn", f"reads 0 on the bus, as the twin has none: {', '.join(made_up)}")
 
@@ -171,11 +173,13 @@ class VirtualRobot:
         """
         tick = self._tick
         if not tick:
+            self._bus.mark(0)  # nothing is told before it: a controller in lockstep may speak
             self._begin()
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
             self._serve(wait_s)
         if self._twin is not None and tick:
             self._report(self._twin.sensed, tick)
+            self._bus.mark(tick)
         if self._lockstep:
             self._listen_to_all(tick)
         else:

@@ -2,13 +2,16 @@
 
 Protocol: https://github.com/linux-can/socketcand, ``doc/protocol.md``. Of its modes there is the
 raw one, in which a client gets every frame that it did not send itself; frames can be sent in the
-default mode too. What a client can't take at once waits in a queue of its own. A queue that is full
-ends the connection: on a bus nobody waits for a listener.
+default mode too. One message is not socketcand's: a client that sends ``< undulog >`` is told what
+is served, ``< undulog virtual-robot NAME PACE >``, and from then on gets ``< tick N >`` after the
+frames of each control tick.
+
+What a client can't take at once waits in a queue of its own. A queue that is full ends the
+connection: on a bus nobody waits for a listener.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import selectors
 import socket
 import time
@@ -16,9 +19,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from capture.errors import UsageError
 from capture.log.frames import FrameArray
 
+from .loopback import listen_on_loopback
 from .socketcand_text import ClientText, frame_text, sent_frame
 
 MOST_CLIENTS = 16
@@ -54,7 +57,7 @@ class _Client:
     def __init__(self, number: int, sock: socket.socket, peer: str) -> None:
         self.number, self.sock, self.peer = number, sock, peer
         self.text = ClientText()
-        self.bus_open = self.raw = False
+        self.bus_open = self.raw = self.marks = False
         self.held_until = 0.0
         self.out = bytearray()
         self.watched = selectors.EVENT_READ
@@ -65,6 +68,7 @@ class SocketcandServer:
 
     Attributes:
         dropped: Clients whose connection was ended because they were too slow or made no sense.
+        identity: What a client that asks is told of the robot.
     """
 
     def __init__(self, host: str, port: int, bus: str, say: Callable[[str, str], None]) -> None:
@@ -80,12 +84,14 @@ class SocketcandServer:
             UsageError: If the host is not loopback, or nobody can listen there.
         """
         self.dropped = 0
+        self.identity = ""
+        self._tick: int | None = None
         self._bus, self._say = bus, say
         self._clients: dict[int, _Client] = {}
         self._number = 0
         self._sent: deque[Sent] = deque()
         self._selector = selectors.DefaultSelector()
-        self._listener = _listen(host, port)
+        self._listener = listen_on_loopback(host, port)
         self._selector.register(self._listener, selectors.EVENT_READ)
 
     @property
@@ -122,7 +128,7 @@ class SocketcandServer:
                 self._read(client)
             if mask & selectors.EVENT_WRITE and client.number in self._clients:
                 self._write(client)
-        if waits:
+        if held:  # the selector can't tell when a hold is over
             for client in [client for client in self._clients.values() if client.out]:
                 self._write(client)
 
@@ -151,6 +157,16 @@ class SocketcandServer:
         text = frame_text(frames)
         for client in listening:
             self._give(client, text)
+
+    def mark(self, tick: int) -> None:
+        """Tell those who asked that all frames of a control tick are out.
+
+        Args:
+            tick: Its number; a client that goes to raw mode later is told of the newest.
+        """
+        self._tick = tick
+        for client in [c for c in self._clients.values() if c.raw and c.marks]:
+            self._give(client, b"< tick %d >" % tick)
 
     def close(self) -> None:
         """Give what can be given at once, and end all connections; safe to call twice."""
@@ -212,8 +228,9 @@ class SocketcandServer:
                 self._give(client, b"< error syntax error >")
             else:
                 self._sent.append(Sent(client.number, record))
-        elif word == "echo":
-            self._give(client, b"< echo >")
+        elif word in ("echo", "undulog"):
+            client.marks |= word == "undulog"
+            self._give(client, b"< echo >" if word == "echo" else self._introduction())
         elif not client.bus_open:
             if word == "open" and rest.strip() == self._bus:
                 client.bus_open = True
@@ -227,10 +244,15 @@ class SocketcandServer:
             self._give(client, b"< ok >")
             client.raw = word == "rawmode"
             client.held_until = time.monotonic() + HOLD_S
+            if client.raw and client.marks and self._tick is not None:
+                self._give(client, b"< tick %d >" % self._tick)
         elif word in _UNSUPPORTED:
             self._give(client, b"< error only the raw mode is served >")
         else:
             self._give(client, b"< error unknown command >")
+
+    def _introduction(self) -> bytes:
+        return f"< undulog {self.identity} >".encode()
 
     def _give(self, client: _Client, text: bytes) -> None:
         client.out += text
@@ -279,27 +301,3 @@ class SocketcandServer:
             self._selector.unregister(client.sock)
         client.sock.close()
         del self._clients[client.number]
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """A listener on loopback, and nowhere else."""
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    except (OSError, OverflowError) as error:
-        raise UsageError(f"{host}:{port} is no address to serve at: {error}") from error
-    family, _, _, _, address = found[0]
-    if not ipaddress.ip_address(address[0]).is_loopback:
-        raise UsageError(
-            f"{host} is not this computer's loopback; a virtual robot is served there only, e.g. "
-            f"at 127.0.0.1:{port}"
-        )
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen()
-        listener.setblocking(False)
-    except OSError as error:
-        listener.close()
-        raise UsageError(f"can't serve at {host}:{port}: {error.strerror}") from error
-    return listener

@@ -1,0 +1,392 @@
+"""The socketcand server, with python-can's client and our own source as its peers."""
+
+import socket
+import threading
+import time
+from contextlib import contextmanager
+
+import can
+import numpy as np
+import pytest
+from can.interfaces.socketcand.socketcand import (
+    convert_ascii_message_to_can_message,
+    convert_can_message_to_ascii_message,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from capture import SessionWriter
+from capture.errors import UsageError
+from capture.log.frames import DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, empty_frames
+from capture.sources.address import parse_address
+from capture.sources.contract import SourceContext
+from capture.sources.events import Tally
+from capture.sources.records import records
+from capture.sources.registry import open_source
+from capture.sources.socketcand_text import SocketcandText
+from sim.serve.bus import VirtualBus
+from sim.serve.socketcand_server import MOST_CLIENTS, MOST_SENT, SocketcandServer
+from sim.serve.socketcand_text import ClientText, frame_text, sent_frame
+
+PATIENCE_S = 60.0
+
+
+def traffic(count, seed=1):
+    rng = np.random.default_rng(seed)
+    frames = empty_frames(count)
+    extended = rng.random(count) < 0.3
+    frames["id_flags"] = np.where(
+        extended, rng.integers(0, 2**29, count) | EXTENDED_FLAG, rng.integers(0, 2**11, count)
+    )
+    frames["dlc"] = rng.integers(0, 9, count)
+    data = rng.integers(0, 256, (count, 8))
+    data[np.arange(8) >= frames["dlc"][:, None]] = 0
+    frames["data"] = data
+    frames["t_device_ns"] = np.cumsum(rng.integers(1, 9000, count) * 1000)
+    return frames
+
+
+def same(found, truth):
+    fields = ("id_flags", "dlc", "data")
+    return len(found) == len(truth) and all(np.array_equal(found[f], truth[f]) for f in fields)
+
+
+def as_frames(messages):
+    frames = empty_frames(len(messages))
+    for frame, message in zip(frames, messages, strict=True):
+        frame["id_flags"] = message.arbitration_id | message.is_extended_id * EXTENDED_FLAG
+        frame["dlc"] = message.dlc
+        frame["data"] = list(bytes(message.data).ljust(8, b"\0"))
+    return frames
+
+
+def as_messages(frames):
+    return [
+        can.Message(
+            arbitration_id=int(f["id_flags"]) & 0x1FFFFFFF,
+            is_extended_id=bool(f["id_flags"] & EXTENDED_FLAG),
+            data=f["data"][: f["dlc"]].tobytes(),
+        )
+        for f in frames
+    ]
+
+
+class Serving:
+    """A bus whose clients are served by a thread; its robot is the test."""
+
+    def __init__(self):
+        self.said = []
+        self.server = SocketcandServer(
+            "localhost", 0, "can0", lambda level, text: self.said.append((level, text))
+        )
+        self.port = self.server.address[1]
+        self.bus = VirtualBus(self.server, None, lambda *_: None)
+        self.lock, self.ended = threading.Lock(), False
+        self.pulling = True
+        self.pulled = []
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self):
+        while not self.ended:
+            with self.lock:
+                self.bus.wait(0.005)
+                if self.pulling and (sent := self.bus.pull()):
+                    self.pulled.append(self.bus.relay(sent, 12_345_678_000))
+            time.sleep(0.0005)
+
+    def send(self, frames):
+        with self.lock:
+            self.bus.send(frames)
+
+    def until(self, condition, what):
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < deadline, (what, self.said)
+            time.sleep(0.005)
+
+    def frames(self):
+        return np.concatenate([empty_frames(0), *self.pulled])
+
+    def raw(self):
+        return sum(client.raw for client in self.server._clients.values())
+
+    def close(self):
+        self.ended = True
+        self.thread.join()
+        self.bus.close()
+
+
+@pytest.fixture
+def serving():
+    made = Serving()
+    yield made
+    made.close()
+
+
+@contextmanager
+def peer(serving):
+    bus = can.Bus(interface="socketcand", host="127.0.0.1", port=serving.port, channel="can0")
+    try:
+        yield bus
+    finally:
+        bus.shutdown()
+
+
+@contextmanager
+def hand(serving, *words):
+    """A client by hand; what it asked for has been answered when the block begins."""
+    with socket.create_connection(("127.0.0.1", serving.port)) as sock:
+        sock.settimeout(PATIENCE_S)
+        assert heard(sock, b"< hi >") == b"< hi >"
+        for word in words:
+            sock.sendall(b"< %s >" % word)
+            assert heard(sock, b"< ok >") == b"< ok >"
+        yield sock
+
+
+def heard(sock, end):
+    data = b""
+    while not data.endswith(end):
+        chunk = sock.recv(65536)
+        if not chunk:
+            return data
+        data += chunk
+    return data
+
+
+def received(bus, count):
+    messages = []
+    while len(messages) < count:
+        message = bus.recv(PATIENCE_S)
+        assert message is not None, len(messages)
+        messages.append(message)
+    return messages
+
+
+# -- text ------------------------------------------------------------------------------------
+
+
+def test_what_the_server_writes_both_clients_read_alike():
+    truth = traffic(500)
+    text = frame_text(truth)
+    tally = Tally(lambda: 0)
+    found = SocketcandText().feed(text, 5, tally)
+    assert same(found, truth)
+    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    pieces = [piece + ">" for piece in text.decode().split(">")[:-1]]
+    theirs = [convert_ascii_message_to_can_message(piece) for piece in pieces]
+    assert same(as_frames(theirs), truth)
+    odd = empty_frames(2)
+    odd["id_flags"] = [ERROR_FLAG | 0x40, REMOTE_FLAG | 0x123]
+    odd["dlc"] = [8, 3]
+    assert frame_text(odd) == b"< error 040 0.000000 >< rtr 123 0.000000 3 >"
+    assert SocketcandText().feed(frame_text(odd), 5, tally)["id_flags"].tolist() == (
+        odd["id_flags"].tolist()
+    )
+    assert tally.counts.malformed == 0
+
+
+@given(
+    identifier=st.integers(0, 2**29 - 1),
+    extended=st.booleans(),
+    data=st.binary(max_size=8),
+)
+def test_what_python_can_sends_is_read(identifier, extended, data):
+    identifier &= 0x1FFFFFFF if extended else 0x7FF
+    message = can.Message(arbitration_id=identifier, is_extended_id=extended, data=data)
+    text = convert_can_message_to_ascii_message(message).encode()
+    (said,) = ClientText().feed(text)
+    word, _, rest = said.partition(" ")
+    record = sent_frame(word, rest.strip())
+    assert record is not None
+    assert same(records([record]), as_frames([message]))
+    assert records([record])["dir"].tolist() == [DIR_TX]
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        "",
+        "123",
+        "123 1",
+        "123 9 1 2 3 4 5 6 7 8 9",
+        "800 0",
+        "20000000 0",
+        "1 1 100",
+        "x 0",
+        "1 0 1",
+    ],
+)
+def test_broken_frames_are_no_frames(rest):
+    assert sent_frame("send", rest) is None
+
+
+def test_remote_requests_have_a_length_and_no_data():
+    record = sent_frame("sendrtr", "1AAAAAAA 2")
+    assert record is not None
+    (frame,) = records([record])
+    assert frame["id_flags"] == 0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG
+    assert (frame["dlc"], frame["data"].any()) == (2, False)
+    assert sent_frame("sendrtr", "123 1 22") is None
+
+
+# -- peers -----------------------------------------------------------------------------------
+
+
+def test_frames_go_to_everyone_but_their_sender(serving):
+    own, other = traffic(300, 1), traffic(200, 2)
+    with peer(serving) as first, peer(serving) as second:
+        serving.until(lambda: serving.raw() == 2, "two clients")
+        serving.send(own)
+        assert same(as_frames(received(first, 300)), own)
+        assert same(as_frames(received(second, 300)), own)
+        for message in as_messages(other):
+            first.send(message)
+        messages = received(second, 200)
+        assert same(as_frames(messages), other)
+        assert {message.timestamp for message in messages} == {12.345678}
+        serving.until(lambda: len(serving.frames()) == 200, "all frames at the robot")
+        assert same(serving.frames(), other)
+        assert first.recv(0.2) is None
+
+
+def test_our_own_source_records_the_bus(serving, tmp_path):
+    own, other = traffic(300, 3), traffic(100, 4)
+    source = open_source(parse_address(f"can:socketcand:can0?port={serving.port}"))
+    with SessionWriter(tmp_path / "x.mcap", session_id="s", epoch_ns=time.time_ns()) as writer:
+        source.start(SourceContext(time.monotonic_ns, writer))
+        try:
+            serving.until(lambda: serving.raw() == 1, "our source")
+            arrays = []
+            serving.send(own)
+            with peer(serving) as foreign:
+                for message in as_messages(other):
+                    foreign.send(message)
+
+                def enough():
+                    arrays.extend(source.poll().frames)
+                    return sum(map(len, arrays)) >= 400
+
+                serving.until(enough, "all frames")
+        finally:
+            source.stop()
+    found = np.concatenate(arrays)
+    assert same(found, np.concatenate([own, other]))
+    assert np.array_equal(found["t_device_ns"][:300], own["t_device_ns"])
+    assert source.counts.malformed == 0
+
+
+def test_pythons_client_can_join_a_busy_bus(serving):
+    own = traffic(20, 5)
+    stop = threading.Event()
+
+    def chatter():
+        while not stop.is_set():
+            serving.send(own)
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    try:
+        for _ in range(10):
+            with peer(serving) as bus:
+                assert bus.recv(PATIENCE_S) is not None
+    finally:
+        stop.set()
+        thread.join()
+
+
+# -- manners ---------------------------------------------------------------------------------
+
+
+def test_answers_are_those_of_the_protocol(serving):
+    with hand(serving, b"open can0") as sock:
+        for said, answer in (
+            (b"echo", b"< echo >"),
+            (b"bcmmode", b"< ok >"),
+            (b"subscribe 0 0 123", b"< error only the raw mode is served >"),
+            (b"statistics 100", b"< error unknown command >"),
+            (b"send 123 2 11", b"< error syntax error >"),
+        ):
+            sock.sendall(b"< %s >" % said)
+            assert heard(sock, b">") == answer
+        sock.sendall(b"< send 123 1 A >")  # without the raw mode one can send, too
+        serving.until(lambda: len(serving.pulled), "the frame")
+    with hand(serving) as sock:
+        sock.sendall(b"< send 123 1 A >")
+        assert heard(sock, b">") == b"< error could not open bus >"
+        assert sock.recv(10) == b""
+    with hand(serving) as sock:
+        sock.sendall(b"< open can7 >")
+        assert heard(sock, b">") == b"< error could not open bus >"
+        assert sock.recv(10) == b""
+    serving.until(lambda: any("there is only can0" in text for _, text in serving.said), "why")
+
+
+def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
+    own = traffic(1000, 6)
+    with hand(serving, b"open can0", b"rawmode"), peer(serving) as good:
+        serving.until(lambda: serving.raw() == 2, "two clients")
+        sent = 0
+        while not serving.server.dropped:
+            serving.send(own)
+            sent += 1000
+            assert len(received(good, 1000)) == 1000
+            assert sent < 2_000_000
+    said = [text for level, text in serving.said if level == "warn"]
+    assert len(said) == 1
+    assert "does not take its frames" in said[0]
+
+
+def test_a_client_that_makes_no_sense_is_let_go(serving):
+    with hand(serving) as sock:
+        sock.sendall(b"<" + b"A" * 1000)
+        assert sock.recv(10) == b""
+    assert serving.server.dropped == 1
+
+
+def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(serving):
+    with serving.lock:
+        serving.pulling = False
+    many = traffic(60_000, 7)
+    text = b"".join(
+        convert_can_message_to_ascii_message(message).encode() for message in as_messages(many)
+    )
+    with hand(serving, b"open can0") as sock:
+        thread = threading.Thread(target=sock.sendall, args=(text,))
+        thread.start()
+        serving.until(lambda: serving.bus.waiting >= MOST_SENT, "a full queue")
+        time.sleep(0.2)
+        assert serving.bus.waiting < MOST_SENT + 2000
+        with serving.lock:
+            serving.pulling = True
+        serving.until(lambda: sum(map(len, serving.pulled)) == len(many), "all frames")
+        thread.join()
+    assert same(serving.frames(), many)
+
+
+def test_no_more_clients_than_there_is_room_for(serving):
+    socks = [socket.create_connection(("127.0.0.1", serving.port)) for _ in range(MOST_CLIENTS)]
+    try:
+        assert all(heard(sock, b">") == b"< hi >" for sock in socks)
+        with socket.create_connection(("127.0.0.1", serving.port)) as late:
+            assert late.recv(10) == b""
+    finally:
+        for sock in socks:
+            sock.close()
+
+
+def test_only_loopback_is_served():
+    for host in ("0.0.0.0", "192.0.2.1"):
+        with pytest.raises(UsageError, match="is not this computer's loopback"):
+            SocketcandServer(host, 0, "can0", lambda *_: None)
+    with pytest.raises(UsageError, match="no address to serve at"):
+        SocketcandServer("no.such.host.invalid", 0, "can0", lambda *_: None)
+
+
+def test_a_port_that_is_taken_is_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(UsageError, match=f"can't serve at 127.0.0.1:{port}: Address already"):
+            SocketcandServer("127.0.0.1", port, "can0", lambda *_: None)
