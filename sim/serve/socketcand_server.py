@@ -230,7 +230,8 @@ class SocketcandServer:
                 self._sent.append(Sent(client.number, record))
         elif word in ("echo", "undulog"):
             client.marks |= word == "undulog"
-            self._give(client, b"< echo >" if word == "echo" else self._introduction())
+            said = "echo" if word == "echo" else f"undulog {self.identity}"
+            self._give(client, f"< {said} >".encode())
         elif not client.bus_open:
             if word == "open" and rest.strip() == self._bus:
                 client.bus_open = True
@@ -250,9 +251,6 @@ class SocketcandServer:
             self._give(client, b"< error only the raw mode is served >")
         else:
             self._give(client, b"< error unknown command >")
-
-    def _introduction(self) -> bytes:
-        return f"< undulog {self.identity} >".encode()
 
     def _give(self, client: _Client, text: bytes) -> None:
         client.out += text
