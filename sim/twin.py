@@ -22,6 +22,7 @@ from .physics.plant import Plant
 from .physics.steps import Step, Steps
 from .scenario import CONTROL_RATE_HZ, Scenario
 from .sensing.contract import SensorSample
+from .sensing.quantise import quantised
 from .sensing.senses import Senses
 from .stability import likely_cause
 
@@ -114,6 +115,7 @@ class Twin:
         Raises:
             SimulationError: If the state becomes impossible.
         """
+        resolution = self.scenario.sensing.servo.command_resolution
         for tick in range(self.scenario.tick_count):
             time_s = tick / CONTROL_RATE_HZ
             if tick:
@@ -122,6 +124,7 @@ class Twin:
                 self._ledger.book(steps)
                 self.sensed = self._sensing.observe(steps)
             gait = self.gait.step(time_s, self._sensing.readings)
+            gait = gait._replace(command=quantised(gait.command, resolution))
             self._plant.command(gait.command)
             step = self._plant.now
             yield Sample(tick, gait, step, self.sensed, self._ledger.read(step))
