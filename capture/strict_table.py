@@ -281,17 +281,44 @@ class Table:
         Returns:
             The numbers.
         """
-        value = self.look(key)[1]
-        if value is None and default is not None:
+        if default is not None and self.look(key)[1] is None:
             return default
+        x, y, z = self._numbers(key, 3, above)
+        return x, y, z
+
+    def pair(
+        self,
+        key: str,
+        *,
+        default: tuple[float, float] | None = None,
+        above: float | None = None,
+    ) -> tuple[float, float]:
+        """Two finite numbers; NaN after a fault.
+
+        Args:
+            key: Key in this table.
+            default: Taken when absent; None makes it required.
+            above: Each value must be greater.
+
+        Returns:
+            The numbers.
+        """
+        if default is not None and self.look(key)[1] is None:
+            return default
+        x, y = self._numbers(key, 2, above)
+        return x, y
+
+    def _numbers(self, key: str, count: int, above: float | None) -> list[float]:
+        """An array of finite numbers; NaN after a fault."""
+        value = self.look(key)[1]
         entries = cast("list[object]", value) if isinstance(value, list) else []
         numbers = [number for number in map(_finite, entries) if number is not None]
         bad = above is not None and any(number <= above for number in numbers)
-        if len(entries) != 3 or len(numbers) != 3 or bad:
+        if len(entries) != count or len(numbers) != count or bad:
             bound = f", each > {above:g}" if above is not None else ""
-            self.fault(key, f"an array of 3 finite numbers{bound}")
-            return math.nan, math.nan, math.nan
-        return numbers[0], numbers[1], numbers[2]
+            self.fault(key, f"an array of {count} finite numbers{bound}")
+            return [math.nan] * count
+        return numbers
 
     def words(self, key: str, *, valid: Iterable[str] | None = None) -> tuple[str, ...]:
         """An array of different strings; empty when absent, without the bad ones after a fault.

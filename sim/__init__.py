@@ -8,21 +8,37 @@ from .readings import Readings
 from .scenario import Scenario
 from .scenario_file import load_scenario, parse_scenario, scenario_names
 from .sensing import Noise, SensorModels, ServoPolling
-from .world import FrictionLaw, Ground, World
+from .world import (
+    Box,
+    Cylinder,
+    FrictionLaw,
+    Ground,
+    ObstacleMaterial,
+    RandomField,
+    Target,
+    Wall,
+    World,
+)
 
 __all__ = [
+    "Box",
+    "Cylinder",
     "FrictionLaw",
     "Gait",
     "GaitTick",
     "Ground",
     "Noise",
+    "ObstacleMaterial",
     "PlaneGait",
+    "RandomField",
     "Readings",
     "Scenario",
     "SensorModels",
     "Serpentine",
     "SerpentineGait",
     "ServoPolling",
+    "Target",
+    "Wall",
     "Wave",
     "World",
     "load_scenario",

@@ -21,6 +21,7 @@ from .sensing import Noise, SensorModels
 from .serve.faults import BusFault
 from .toml_text import toml_text
 from .world import World
+from .world.toml import body_length, world_table
 
 CONTROL_RATE_HZ = 100
 """Rate of control and log."""
@@ -45,7 +46,7 @@ class Scenario:
         noise: What the servos' readings carry.
         sensing: How its sensors measure.
         modules: Its servos and links that differ from the robot's own.
-        seed: Of the noise.
+        seed: Of all that is drawn at random.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
         engine: Who solves the body's dynamics.
@@ -90,13 +91,14 @@ class Scenario:
 
         Args:
             duration_s: Length of the run; ``settle_s`` is cut to it.
-            seed: Of the noise.
+            seed: Of the noise, and of a random field of obstacles without a seed of its own.
 
         Returns:
             The scenario.
 
         Raises:
-            UsageError: If the length is not at least one control period, or the seed negative.
+            UsageError: If the length is not at least one control period, the seed negative, or the
+                field too small for its obstacles with this seed.
         """
         length = self.duration_s if duration_s is None else duration_s
         if not 1 / CONTROL_RATE_HZ <= length <= LONGEST_S:
@@ -105,24 +107,19 @@ class Scenario:
             )
         if seed is not None and seed < 0:
             raise UsageError(f"a seed of {seed}; it can be 0 or a positive whole number")
+        world = self.world
+        if seed is not None:
+            world = world.redrawn(seed, body_length(self.robot))
         return dataclasses.replace(
             self,
             duration_s=length,
             settle_s=min(self.settle_s, length),
             seed=self.seed if seed is None else seed,
+            world=world,
         )
 
     def toml(self) -> str:
         """The scenario as TOML, every value written out; reading it gives the same scenario."""
-        ground = self.world.ground
-        world: dict[str, Any] = {
-            "gravity": list(self.world.gravity),
-            "heading": self.world.heading,
-            "velocity": list(self.world.velocity),
-            "surface": "none" if ground is None else "flat",
-        }
-        if ground is not None:
-            world["ground"] = dataclasses.asdict(ground)
         values: dict[str, Any] = {
             "name": self.name,
             "description": self.description,
@@ -134,7 +131,7 @@ class Scenario:
             "physics_rate_hz": self.physics_rate_hz,
             "engine": self.engine,
             "gait": gait_table(self.gait),
-            "world": world,
+            "world": world_table(self.world),
             "noise": dataclasses.asdict(self.noise),
             "sensing": dataclasses.asdict(self.sensing),
             **self.modules.tables(),

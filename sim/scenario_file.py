@@ -27,7 +27,9 @@ A scenario::
     gravity = [0.0, 0.0, -9.81]     # m/s^2; tilt it for an incline
     heading = 0.0                   # rad
     velocity = [0.0, 0.0, 0.0]      # m/s, of the whole robot at the start
-    surface = "flat"                # or "none": nothing touches the robot
+    surface = "flat"                # or "none": no ground
+    slope = 0.1                     # rad, instead of gravity: tilts the ground, downhill towards
+    slope_heading = 0.0             # rad
 
     [world.ground]
     stiffness = 2000.0              # N/m
@@ -38,6 +40,15 @@ A scenario::
     law = "ellipse"                 # or "box", "transeth"; or "viscous", with drag for friction
     drag_tangential = 1.0           # N s/m, of a link, viscous law
     drag_normal = 10.0
+
+    [[world.obstacles]]             # see docs/twin-world.md for all that can stand in the way,
+    shape = "cylinder"              # for [world.field], [world.obstacle_contact] and the sensors
+    position = [1.5, 0.2]           # m
+    radius = 0.1                    # m
+
+    [world.target]
+    position = [3.6, 0.0]           # m
+    radius = 0.3                    # m
 
     [servo]                         # instead of the robot's own parameters
     stall_torque = 0.25
@@ -71,7 +82,6 @@ frequency and lag (``delay_s`` of delay blocks).
 from __future__ import annotations
 
 import tomllib
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -87,15 +97,10 @@ from .physics.engine import EngineKind
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .sensing.toml import read_noise, read_sensing
 from .serve.faults import read_faults
-from .world import FrictionLaw, Ground, World
+from .world.toml import read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
 _SHELF = Shelf("scenario", "sim", "scenarios", ScenarioError)
-
-
-class _Surface(StrEnum):
-    FLAT = "flat"
-    NONE = "none"
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -146,17 +151,18 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
     robot_name = top.text("robot")
     robot = _robot(top, robot_name, source.parent)
+    seed = top.integer("seed", at_least=0) if "seed" in top else Scenario.seed
     parts: dict[str, Any] = {
         "name": top.name("name") if "name" in top else stem,
         "description": top.text("description"),
         "robot_name": robot_name,
         "gait": read_gait(top.table("gait"), robot, max_frequency_hz=CONTROL_RATE_HZ / 4),
-        "world": _world(top.table("world")),
+        "world": read_world(top.table("world"), robot, seed),
         "noise": read_noise(top.table("noise")),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "modules": read_modules(top, robot),
         "faults": read_faults(top, robot),
-        "seed": top.integer("seed", at_least=0) if "seed" in top else Scenario.seed,
+        "seed": seed,
         "engine": (top.choice("engine", EngineKind) if "engine" in top else None)
         or Scenario.engine,
         **_times(top),
@@ -201,29 +207,3 @@ def _robot(top: Table, name: str, folder: Path) -> Robot | None:
             "robot", f"a TOML file beside the scenario, or one of {listed(robot_names(), name)}"
         )
     return None
-
-
-def _world(table: Table) -> World:
-    gravity = table.triple("gravity", default=World.gravity)
-    heading = table.number("heading", default=World.heading)
-    velocity = table.triple("velocity", default=World.velocity)
-    surface = table.choice("surface", _Surface) if "surface" in table else _Surface.FLAT
-    if surface is _Surface.NONE and "ground" in table:
-        table.fault("ground", 'leave it out: surface is "none"')
-    part = table.table("ground")
-    law = part.choice("law", FrictionLaw) if "law" in part else None
-    ground = Ground(
-        stiffness=part.number("stiffness", default=Ground.stiffness, above=0.0),
-        damping=part.number("damping", default=Ground.damping, at_least=0.0),
-        mu_tangential=part.number("mu_tangential", default=Ground.mu_tangential, at_least=0.0),
-        mu_normal=part.number("mu_normal", default=Ground.mu_normal, at_least=0.0),
-        slip_speed=part.number("slip_speed", default=Ground.slip_speed, above=0.0),
-        law=law or Ground.law,
-        drag_tangential=part.number(
-            "drag_tangential", default=Ground.drag_tangential, at_least=0.0
-        ),
-        drag_normal=part.number("drag_normal", default=Ground.drag_normal, at_least=0.0),
-    )
-    part.close()
-    table.close()
-    return World(gravity, heading, velocity, None if surface is _Surface.NONE else ground)

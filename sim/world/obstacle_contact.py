@@ -23,7 +23,15 @@ from capture.arrays import BoolArray, FloatArray, IntArray
 from ..physics.contact import normal_force
 from ..physics.vectors import cross
 from .closest import Closest, to_circles, to_rectangles
-from .obstacles import Boxes, Cylinders, Obstacle, ObstacleMaterial, columns
+from .obstacles import (
+    Boxes,
+    Cylinders,
+    Obstacle,
+    ObstacleMaterial,
+    columns,
+    into_axes,
+    out_of_axes,
+)
 
 
 class ObstacleContact(NamedTuple):
@@ -184,31 +192,19 @@ class _Square:
 
     def near(self, position: FloatArray) -> BoolArray:
         """Whether a square about the link meets the obstacle, shape (o, n)."""
-        x, y = np.abs(_into(self._axis, position - self._centre)) < self._reach
+        x, y = np.abs(into_axes(self._axis, position - self._centre)) < self._reach
         return x & y
 
     def closest(self, which: IntArray, middle: FloatArray, half: FloatArray) -> Closest:
         """Closest points of pairs."""
         axis, centre = self._shapes.axis[:, which], self._shapes.centre[:, which]
         found = to_rectangles(
-            _into(axis, middle - centre), _into(axis, half), self._shapes.half[:, which]
+            into_axes(axis, middle - centre), into_axes(axis, half), self._shapes.half[:, which]
         )
-        return found._replace(normal=_out_of(axis, found.normal))
+        return found._replace(normal=out_of_axes(axis, found.normal))
 
 
 def _forward(quaternion: FloatArray) -> FloatArray:
     """The links' x axes in the world, shape (3, p)."""
     x, y, z, w = quaternion
     return np.array([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)])
-
-
-def _into(axis: FloatArray, vector: FloatArray) -> FloatArray:
-    """World vectors in the boxes' axes."""
-    (ax, ay), (x, y) = axis, vector
-    return np.array([ax * x + ay * y, ax * y - ay * x])
-
-
-def _out_of(axis: FloatArray, vector: FloatArray) -> FloatArray:
-    """Vectors in the boxes' axes in the world."""
-    (ax, ay), (x, y) = axis, vector
-    return np.array([ax * x - ay * y, ay * x + ax * y])

@@ -170,6 +170,34 @@ def columns(obstacles: Sequence[Obstacle]) -> tuple[Cylinders, Boxes]:
     )
 
 
+def into_axes(axis: FloatArray, vector: FloatArray) -> FloatArray:
+    """Turn world vectors in plan view into axes of their own.
+
+    Args:
+        axis: Unit vectors of the x axes, shape (2, ...).
+        vector: In the world, shape (2, ...).
+
+    Returns:
+        The same vectors in these axes, shape (2, ...).
+    """
+    (ax, ay), (x, y) = axis, vector
+    return np.array([ax * x + ay * y, ax * y - ay * x])
+
+
+def out_of_axes(axis: FloatArray, vector: FloatArray) -> FloatArray:
+    """Turn vectors in axes of their own back into the world; undoes :func:`into_axes`.
+
+    Args:
+        axis: Unit vectors of the x axes, shape (2, ...).
+        vector: In these axes, shape (2, ...).
+
+    Returns:
+        The same vectors in the world, shape (2, ...).
+    """
+    (ax, ay), (x, y) = axis, vector
+    return np.array([ax * x - ay * y, ay * x + ax * y])
+
+
 def _row(values: Sequence[float]) -> FloatArray:
     return frozen(np.array(values, dtype=np.float64))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
-from .obstacles import Boxes, Cylinders, Obstacle, columns
+from .obstacles import Boxes, Cylinders, Obstacle, columns, into_axes
 
 
 class RayCaster:
@@ -101,15 +101,13 @@ def _cylinders(shapes: Cylinders, origin: FloatArray, direction: FloatArray) -> 
 
 def _boxes(shapes: Boxes, origin: FloatArray, direction: FloatArray) -> FloatArray:
     """Distances to each box, shape (b, k)."""
-    ax, ay = shapes.axis[:, :, None]
-    x = origin[0] - shapes.centre[0][:, None]
-    y = origin[1] - shapes.centre[1][:, None]
-    along = ax * x + ay * y, ax * direction[0] + ay * direction[1]
-    across = ax * y - ay * x, ax * direction[1] - ay * direction[0]
+    axis = shapes.axis[:, :, None]
+    x, y = into_axes(axis, origin[:2, None] - shapes.centre[:, :, None])
+    dx, dy = into_axes(axis, direction[:2, None])
     half_x, half_y = shapes.half[:, :, None]
     slabs = (
-        _slab(*along, -half_x, half_x),
-        _slab(*across, -half_y, half_y),
+        _slab(x, dx, -half_x, half_x),
+        _slab(y, dy, -half_y, half_y),
         _slab(origin[2], direction[2], 0.0, shapes.height[:, None]),
     )
     enter = np.maximum.reduce([np.broadcast_to(slab[0], x.shape) for slab in slabs])

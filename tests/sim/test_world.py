@@ -1,0 +1,190 @@
+"""Worlds in scenarios: obstacles, targets, slopes and fields of cylinders drawn at random."""
+
+import math
+
+import numpy as np
+import pytest
+
+from capture.errors import ScenarioError, UsageError
+from sim import Box, Cylinder, Ground, ObstacleMaterial, RandomField, Target, Wall, parse_scenario
+
+HEAD = """
+description = "a test"
+robot = "snake13"
+duration_s = 2.0
+[gait.horizontal]
+amplitude = 0.3
+frequency_hz = 0.5
+lag = 0.5
+"""
+
+WORLD = """
+[world]
+slope = 0.1
+slope_heading = 0.5
+[[world.obstacles]]
+shape = "cylinder"
+position = [1.5, 0.2]
+radius = 0.1
+height = 0.4
+[[world.obstacles]]
+shape = "box"
+position = [2.5, 0.2]
+size = [0.4, 0.2]
+heading = 0.3
+[[world.obstacles]]
+shape = "wall"
+from = [0.0, 1.0]
+to = [3.0, 1.5]
+thickness = 0.05
+[world.obstacle_contact]
+stiffness = 8000.0
+mu = 0.2
+[world.target]
+position = [3.6, 0.0]
+"""
+
+FIELD = """
+[world.target]
+position = [3.6, 0.0]
+[world.field]
+count = 12
+size = [4.0, 3.0]
+centre = [1.8, 0.0]
+radius = [0.05, 0.12]
+clear = 0.25
+gap = 0.15
+"""
+
+
+def faults_of(text):
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(HEAD + text, "x.toml")
+    return {fault.key: str(fault) for fault in caught.value.faults}
+
+
+def test_obstacles_are_read_and_written_back():
+    scenario = parse_scenario(HEAD + WORLD, "x.toml")
+    world = scenario.world
+    assert world.obstacles == (
+        Cylinder((1.5, 0.2), 0.1, 0.4),
+        Box((2.5, 0.2), (0.4, 0.2), 0.3),
+        Wall((0.0, 1.0), (3.0, 1.5), 0.05),
+    )
+    assert world.obstacle_contact == ObstacleMaterial(stiffness=8000.0, mu=0.2)
+    assert world.target == Target((3.6, 0.0))
+    assert world.ground == Ground()
+    assert parse_scenario(scenario.toml(), "y.toml") == scenario
+
+
+def test_a_slope_tilts_gravity():
+    gravity = parse_scenario(HEAD + WORLD, "x.toml").world.gravity
+    assert math.hypot(*gravity) == pytest.approx(9.81)
+    assert math.atan2(math.hypot(*gravity[:2]), -gravity[2]) == pytest.approx(0.1)
+    assert math.atan2(gravity[1], gravity[0]) == pytest.approx(0.5)
+    assert "world.gravity" in faults_of("[world]\nslope = 0.1\ngravity = [0.0, 0.0, -1.0]\n")
+    assert "world.slope_heading" in faults_of("[world]\nslope_heading = 0.1\n")
+
+
+def test_a_wall_is_a_box_along_it():
+    box = Wall((1.0, 1.0), (4.0, 5.0), 0.1, 0.5).box
+    assert box == Box((2.5, 3.0), (5.0, 0.1), math.atan2(4, 3), 0.5)
+
+
+def test_faults_are_listed_at_once():
+    found = faults_of(
+        """
+        [world.obstacle_contact]
+        stiffness = 0
+        [world.target]
+        position = [1.0]
+        [world.field]
+        count = 0
+        size = [1.0, -1.0]
+        radius = [0.2, 0.1]
+        [[world.obstacles]]
+        shape = "pyramid"
+        [[world.obstacles]]
+        shape = "cylinder"
+        position = [1.0, 1.0]
+        size = [1.0, 1.0]
+        [[world.obstacles]]
+        shape = "wall"
+        from = [1.0, 1.0]
+        to = [1.0, 1.0]
+        """
+    )
+    assert set(found) == {
+        "world.obstacle_contact.stiffness",
+        "world.target.position",
+        "world.field.count",
+        "world.field.size",
+        "world.field.radius",
+        "world.obstacles[0].shape",
+        "world.obstacles[1].radius",
+        "world.obstacles[1].size",
+        "world.obstacles[2].to",
+    }
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_a_field_keeps_its_distances(seed):
+    scenario = parse_scenario(f"seed = {seed}\n{HEAD}{FIELD}", "x.toml")
+    placed = scenario.world.obstacles
+    assert len(placed) == 12
+    at = np.array([one.position for one in placed])
+    radius = np.array([one.radius for one in placed])
+    assert ((radius >= 0.05) & (radius <= 0.12)).all()
+    assert (np.abs(at - (1.8, 0.0)) <= (2.0, 1.5)).all()
+    between = np.hypot(*(at[:, None] - at).T) - radius[:, None] - radius
+    assert between[~np.eye(12, dtype=bool)].min() >= 0.15 - 1e-12
+    assert (np.hypot(*(at - (3.6, 0.0)).T) - radius).min() >= 0.3 + 0.25 - 1e-12
+    # The robot lies from the origin along -x.
+    length = sum(link.length for link in scenario.robot.links[1:]) + 0.03
+    for x in np.linspace(-length, 0.0, 200):
+        assert (np.hypot(*(at - (x, 0.0)).T) - radius).min() >= 0.25 - 1e-9
+
+
+def test_a_field_follows_the_seed_and_is_stored_as_its_obstacles():
+    scenario = parse_scenario(HEAD + FIELD, "x.toml")
+    assert "field" not in scenario.toml()
+    assert parse_scenario(scenario.toml(), "y.toml") == scenario
+    assert scenario.world.field == RandomField(
+        12, (4.0, 3.0), (1.8, 0.0), (0.05, 0.12), clear=0.25, gap=0.15
+    )
+    again = parse_scenario(HEAD + FIELD, "z.toml")
+    assert again.world.obstacles == scenario.world.obstacles
+    other = scenario.changed(seed=9)
+    assert (
+        other.world.obstacles
+        == parse_scenario(f"seed = 9\n{HEAD}{FIELD}", "x.toml").world.obstacles
+    )
+    assert other.world.obstacles != scenario.world.obstacles
+    assert scenario.changed(duration_s=1.0).world.obstacles == scenario.world.obstacles
+    fixed = parse_scenario(f"{HEAD}{FIELD}seed = 4\n", "x.toml")
+    assert fixed.changed(seed=9).world.obstacles == fixed.world.obstacles
+
+
+def test_a_field_stands_clear_of_what_is_there_and_joins_it():
+    text = (
+        HEAD
+        + FIELD
+        + "[[world.obstacles]]\nshape = 'box'\nposition = [2.0, 0.0]\nsize = [1.0, 1.0]\n"
+    )
+    world = parse_scenario(text, "x.toml").world
+    assert world.obstacles[0] == Box((2.0, 0.0), (1.0, 1.0))
+    for one in world.obstacles[1:]:
+        x, y = (max(abs(c - m) - 0.5, 0.0) for c, m in zip(one.position, (2.0, 0.0), strict=True))
+        assert math.hypot(x, y) - one.radius >= 0.15 - 1e-12
+    redrawn = world.redrawn(5, 0.8)
+    assert redrawn.obstacles[0] == world.obstacles[0]
+    assert len(redrawn.obstacles) == len(world.obstacles) == 13
+
+
+def test_no_room_is_told():
+    text = FIELD.replace("[4.0, 3.0]", "[0.4, 0.4]")
+    assert "room for" in faults_of(text)["world.field"]
+    scenario = parse_scenario(HEAD + FIELD, "x.toml")
+    tight = RandomField(12, (0.4, 0.4))
+    with pytest.raises(UsageError, match=r"room for \d of 12"):
+        scenario.world.scattered(tight, 1, 0.8)
