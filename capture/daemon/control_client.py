@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, cast
@@ -73,9 +73,25 @@ class ControlClient:
         Raises:
             ControlError: If the recorder refuses, doesn't answer in time, or ends before it has.
         """
+        return self.ask_all([request])[0]
+
+    def ask_all(self, requests: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Send several requests at once and wait for all replies: a recorder answers once a tick.
+
+        Args:
+            requests: See :mod:`capture.daemon.control_requests`; some 100 at most, so that neither
+                side's buffer is full before the other one reads.
+
+        Returns:
+            The replies without their ``ok``, in order.
+
+        Raises:
+            ControlError: If the recorder refuses one, doesn't answer in time, or ends before.
+        """
+        lines = [json.dumps(request, allow_nan=False).encode() + b"\n" for request in requests]
         try:
-            self._socket.sendall(json.dumps(request, allow_nan=False).encode() + b"\n")
-            while b"\n" not in self._buffer:
+            self._socket.sendall(b"".join(lines))
+            while self._buffer.count(b"\n") < len(lines):
                 data = self._socket.recv(65536)
                 if not data:
                     raise ControlError(f"{self.path}: the recorder went before it had answered")
@@ -86,15 +102,21 @@ class ControlClient:
             raise ControlError(f"{self.path}: no answer in {patience_s:g} s") from error
         except OSError as error:
             raise ControlError(f"{self.path}: the recorder went: {error}") from error
-        line, _, rest = bytes(self._buffer).partition(b"\n")
+        *answers, rest = bytes(self._buffer).split(b"\n", len(lines))
         self._buffer = bytearray(rest)
+        replies = [self._read(answer) for answer in answers]
+        for reply in replies:
+            if not reply.pop("ok"):
+                raise ControlError(str(reply.get("error", "refused")))
+        return replies
+
+    def _read(self, line: bytes) -> dict[str, Any]:
+        """A reply, with its ``ok``."""
         try:
             reply = cast("dict[str, Any]", json.loads(line))
-            done = reply.pop("ok")
-        except (ValueError, AttributeError, KeyError) as error:
+            reply["ok"] = bool(reply["ok"])
+        except (ValueError, TypeError, KeyError) as error:
             raise ControlError(f"{self.path}: what answers there is no recorder") from error
-        if not done:
-            raise ControlError(str(reply.get("error", "refused")))
         return reply
 
     def close(self) -> None:
