@@ -16,7 +16,7 @@ from itertools import cycle
 
 from ..errors import LogError
 from .chunk import Block, Buffer
-from .pages import new_pages
+from .pages import keep_freed, new_pages
 from .read_ahead import Start, ahead, helpers
 from .storage import LogFile
 
@@ -65,8 +65,9 @@ def filled_arenas(
     wanted = [each for each in blocks if not each.index_at or not ids.isdisjoint(each.index_at)]
     runs = list(_runs(log_file, wanted))
     spare = 1 if threads > 1 and len(runs) > 1 else 0
-    size = max((run[-1].stop for run in runs if isinstance(run, list)), default=1)
-    arenas = [log_file.take_scratch(size), *(new_pages(size) for _ in range(spare))]
+    keep_freed(ARENA_SIZE)  # no copy of messages is larger
+    scratch = log_file.scratch
+    arenas = [scratch.pop() if scratch else new_pages(ARENA_SIZE) for _ in range(1 + spare)]
     with helpers(max(min(threads, len(wanted)), 1)) as start:
         for pieces in ahead(_begun(log_file, runs, arenas, start), spare):
             found: list[tuple[Buffer, Placed]] = []
@@ -78,7 +79,7 @@ def filled_arenas(
             if found:
                 yield found[0][0], [placed for _, placed in found]
     if len(blocks) < len(log_file.blocks):  # after a window there is often another
-        log_file.keep_scratch(arenas[0])
+        scratch[:] = [*arenas, *scratch][:2]
 
 
 def _runs(log_file: LogFile, blocks: Sequence[Block]) -> Iterator[list[Placed] | Block]:

@@ -56,11 +56,13 @@ def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
         Those that are not wholly outside, in file order.
     """
     start, stop = window_ns
-    return [
-        block
-        for block in log_file.blocks
-        if (stop is None or block.start_ns < stop) and (start is None or block.end_ns >= start)
-    ]
+    first_ns, last_ns = log_file.spans
+    inside = np.ones(len(log_file.blocks), dtype=bool)
+    if start is not None:
+        inside &= last_ns >= start
+    if stop is not None:
+        inside &= first_ns < stop
+    return [log_file.blocks[k] for k in np.flatnonzero(inside).tolist()]
 
 
 def record_batches(

@@ -69,6 +69,19 @@ class Layout:
     hull: tuple[tuple[int, int], ...]
     static: IntArray
 
+    def fits(self, message: bytes) -> bool:
+        """Whether a message surely has this layout.
+
+        Args:
+            message: Its bytes.
+
+        Returns:
+            False also where it differs in padding alone.
+        """
+        return len(message) == self.length and all(
+            message[start:stop] == self.example[start:stop] for start, stop in self.hull
+        )
+
 
 def layout_of(message_type: MessageType, message: bytes) -> Layout:
     """Find the layout of a message.

@@ -10,7 +10,7 @@ slower.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -177,11 +177,13 @@ class Request:
         channel_ids: The topic's channels.
         message_type: Their type.
         paths: Leaf paths to keep; None for all.
+        layouts: One of each length that was seen before, by length; new ones are noted.
     """
 
     channel_ids: Sequence[int]
     message_type: MessageType
     paths: Sequence[str] | None = None
+    layouts: dict[int, Layout] = field(default_factory=dict[int, Layout])
 
 
 @dataclass
@@ -284,6 +286,7 @@ class _GroupReader:
     ) -> None:
         self._type = request.message_type
         self._paths = None if request.paths is None else frozenset(request.paths)
+        self._layouts = request.layouts
         self._expected, self._reserve = expected, reserve
         self._shared = shared
         self._by_length: dict[int, list[Group]] = {}
@@ -334,7 +337,7 @@ class _GroupReader:
         while len(places):
             example = matrix[0].tobytes()
             try:
-                layout = layout_of(self._type, example)
+                layout = self._layout(example)
             except DataError as error:
                 self.unread.append(Unread(int(log_ns[0]), example, str(error)))
                 matrix, places = matrix[1:], places.take(slice(1, None))
@@ -354,6 +357,16 @@ class _GroupReader:
             rest = ~fits
             matrix, places = matrix[rest], places.take(rest)
             log_ns, order = log_ns[rest], order[rest]
+
+    def _layout(self, message: bytes) -> Layout:
+        """The layout of a message, found anew unless it is that of an earlier reading."""
+        known = self._layouts.get(len(message))
+        if known is not None and known.fits(message):
+            return known
+        found = layout_of(self._type, message)
+        if known is not None or len(self._layouts) < _MAX_LAYOUTS:
+            self._layouts[len(message)] = found
+        return found
 
     def _group(self, layout: Layout, capacity: int) -> Group:
         """A group; the first of a topic may have the times of another topic's first."""

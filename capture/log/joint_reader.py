@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import IntArray
 from ..errors import DataError, MissingChannelError
 from .columns import Messages
 from .joint_rows import JointRows, merge_rows, rows_of
@@ -145,7 +145,9 @@ class JointReader:
                 for name in series[key].names:
                     if name not in offsets.names:
                         self._warn(f"{offset_topic} has no {name}: its message stamps are used")
-        return {key: self._signals(key, series[key], times[key], window_ns, chain) for key in keys}
+        shared = {id(t_ns): t_ns for key in keys for t_ns in times[key]}
+        cuts = {each: _cut(t_ns, window_ns) for each, t_ns in shared.items()}
+        return {key: self._signals(key, series[key], times[key], cuts, chain) for key in keys}
 
     def _offset_topic(self, topic: str) -> str | None:
         name = OFFSET_TOPICS.get(topic)
@@ -198,20 +200,25 @@ class JointReader:
         key: tuple[str, str],
         series: Series,
         times: Sequence[IntArray],
-        window_ns: Window,
+        cuts: Mapping[int, tuple[slice, IntArray]],
         chain: Sequence[str],
     ) -> JointSignals:
         topic, field = key
         names = series.names
-        cut = [_cut(t, v, window_ns) for t, v in zip(times, series.values, strict=True)]
         unit = UNITS[field]
         if field == "position":
             unit = self._topics.channels[topic].metadata.get("unit", unit)
         signals = JointSignals(
-            topic, field, unit, names, tuple(t for t, _ in cut), tuple(v for _, v in cut)
+            topic,
+            field,
+            unit,
+            names,
+            tuple(cuts[id(t_ns)][1] for t_ns in times),
+            tuple(v[cuts[id(t_ns)][0]] for t_ns, v in zip(times, series.values, strict=True)),
         )
         known = [name for name in chain if name in names]
-        return signals.select(known + [name for name in names if name not in chain])
+        order = (*known, *(name for name in names if name not in chain))
+        return signals if order == names else signals.select(order)
 
     def _general_rows(self, topic: str, field: str, found: Messages) -> list[JointRows]:
         """Rows of messages without a layout, through the general decoder."""
@@ -291,11 +298,10 @@ def _covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
     return True
 
 
-def _cut(t_ns: IntArray, values: FloatArray, window_ns: Window) -> tuple[IntArray, FloatArray]:
-    """The samples in the half-open window [start, stop); views."""
+def _cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
+    """Which samples are in the half-open window [start, stop), and their times; a view."""
     start, stop = window_ns
-    first = 0 if start is None else int(np.searchsorted(t_ns, start, side="left"))
-    last = len(t_ns) if stop is None else int(np.searchsorted(t_ns, stop, side="left"))
-    if (first, last) == (0, len(t_ns)):
-        return t_ns, values
-    return t_ns[first:last], values[first:last]
+    first = 0 if start is None else int(t_ns.searchsorted(start))
+    last = len(t_ns) if stop is None else int(t_ns.searchsorted(stop))
+    inside = slice(first, last)
+    return inside, t_ns[inside]

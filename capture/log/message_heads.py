@@ -89,12 +89,15 @@ class Places:
         """Some of them.
 
         Args:
-            rows: Which, as numpy chooses.
+            rows: Which, as numpy chooses, in order.
 
         Returns:
-            Their places, taken as unevenly spaced.
+            Their places; evenly spaced if none between them is left out.
         """
-        return Places(self.data, self.at[rows])
+        at, step = self.at[rows], self.step
+        if step is not None and len(at) and int(at[-1] - at[0]) != step * (len(at) - 1):
+            step = None
+        return Places(self.data, at, step)
 
     def field(self, kind: np.dtype[Any] | str, shift: int) -> NDArray[Any]:
         """What lies at the same place in each.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +21,6 @@ from ..errors import LogError, NotALogError
 from .chunk import Block, Buffer
 from .mcap_file import McapFile
 from .message_heads import read_heads
-from .pages import new_pages
 from .part_files import PartFiles, first_part, open_parts
 from .part_names import PART_RECORD
 from .recovered import Recovered
@@ -65,7 +65,7 @@ class LogFile:
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
         self._sources: list[_Part] = []
-        self._scratch: mmap.mmap | None = None
+        self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
         first = first_part(path)
         wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
@@ -85,31 +85,17 @@ class LogFile:
         """The files that were opened, in order; a block's ``part`` counts them from 0."""
         return list(self.parts.files.values())
 
+    @cached_property
+    def spans(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """Earliest and latest log time of each block [ns], shape (n,) each."""
+        times = [(block.start_ns, block.end_ns) for block in self.blocks]
+        first, last = np.array(times, dtype=np.uint64).reshape(-1, 2).T.copy()
+        return first, last
+
     def close(self) -> None:
         """Release everything."""
-        self._scratch = None
+        self.scratch.clear()
         self.parts.close()
-
-    def take_scratch(self, size: int) -> mmap.mmap:
-        """Memory for payloads; where there is some that was used before, it costs no page faults.
-
-        Args:
-            size: How much is needed [byte].
-
-        Returns:
-            At least as much, the caller's alone until :meth:`keep_scratch` gives it back.
-        """
-        scratch, self._scratch = self._scratch, None
-        return scratch if scratch is not None and len(scratch) >= size else new_pages(size)
-
-    def keep_scratch(self, scratch: mmap.mmap) -> None:
-        """Keep memory for who reads next; the larger piece if there are two.
-
-        Args:
-            scratch: Nobody may look at it any more.
-        """
-        if self._scratch is None or len(scratch) > len(self._scratch):
-            self._scratch = scratch
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """The uncompressed bytes of a block, and where in them the message offsets count from.

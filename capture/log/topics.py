@@ -12,6 +12,7 @@ from mcap.exceptions import McapError
 from mcap.records import Schema
 
 from ..errors import DataError, MissingChannelError
+from .cdr import Layout
 from .columns import Messages, Request, message_blocks, message_bytes, read_messages
 from .rosmsg import MessageType, parse_message_type
 from .storage import LogFile
@@ -61,6 +62,7 @@ class Topics:
         self._threads = threads
         self._warn = warn
         self._types: dict[str, MessageType] = {}
+        self._layouts: dict[str, dict[int, Layout]] = {}
         self._ids: dict[str, list[int]] = {}
         for channel in log_file.channels.values():
             self._ids.setdefault(channel.topic, []).append(channel.id)
@@ -85,7 +87,12 @@ class Topics:
             DataError: If a topic's type can't be read.
         """
         requests = [
-            Request(self._channel_ids(topic), self.message_type(topic), paths)
+            Request(
+                self._channel_ids(topic),
+                self.message_type(topic),
+                paths,
+                self._layouts.setdefault(topic, {}),
+            )
             for topic, paths in wanted.items()
         ]
         found = read_messages(
