@@ -27,38 +27,62 @@ def drive(
     on: str,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     duration: float | None = None,
+    arm: bool = False,
+    recorder: Path | None = None,
     force: bool = False,
     json: bool = False,
 ) -> int:
     """Drive a gait, a plan or recorded commands on the twin or over a bus.
 
-    On the twin it runs faster than real time and is recorded like `undulog sim run`. SIGINT and
-    SIGTERM let the joints come to rest within a second, and then end the run.
+    On the twin it runs faster than real time and is recorded like `undulog sim run`. Over a bus it
+    is a control loop of 100 Hz, and a dry run: it listens, computes and sends nothing. With `--arm`
+    commands are sent, for now to the virtual robot of `undulog sim serve` only.
+
+    SIGINT and SIGTERM let the joints come to rest within a second, and then end the run.
 
     Example: `undulog drive flat --on twin -o driven.mcap`
 
     Args:
         what: Name of a shipped scenario, or a scenario's TOML file: its gait is driven. Or a plan,
             a TOML file of segments. Or a session, `.mcap`: its commands are given again.
-        on: `twin` (the world that it was made for) or `twin:SCENARIO`.
-        output: The session file to write, `.mcap`.
+        on: `twin` (the world that it was made for), `twin:SCENARIO`, or a bus,
+            `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
+        output: The session file to write, `.mcap`; over a bus it may be left out.
         duration: How long to drive in seconds, instead of what the gait or plan says.
+        arm: Send the commands.
+        recorder: Control socket of the recorder that is told the gait; by default the only one
+            that runs.
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
     from ..scenario_file import load_scenario
     from .driven import find_driven
 
-    if output is not None and output.suffix != ".mcap":
-        raise UsageError(
-            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
-        )
+    if output is not None:
+        if output.suffix != ".mcap":
+            raise UsageError(
+                f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+            )
+        refuse_existing(output, force=force)
     scheme, colon, rest = on.partition(":")
-    if scheme == _TWIN and (rest or not colon):
-        world = load_scenario(rest) if rest else None
-        driven = find_driven(what, world)
-        return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
-    raise UsageError(f"--on {on}: expected twin or twin:SCENARIO")
+    if scheme != _TWIN or (colon and not rest):
+        from .bus_cli import on_bus
+
+        return on_bus(
+            find_driven(what),
+            on,
+            duration_s=duration,
+            armed=arm,
+            output=output,
+            recorder=recorder,
+            force=force,
+            as_json=json,
+        )
+    if arm or recorder is not None:
+        raise UsageError("--arm and --recorder are for a bus; a run of the twin records itself")
+    world = load_scenario(rest) if rest else None
+    driven = find_driven(what, world)
+    return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
 
 
 def _on_twin(

@@ -1,0 +1,128 @@
+"""What the robot's computer knows, from the frames on its bus.
+
+Each value is the newest that came. One that has not come for a while is unknown again: a controller
+must not act on a distance of long ago.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from capture.arrays import FloatArray, frozen
+from capture.bus.decoding import BusDecoder, DecodedSignals, FrameTally
+from capture.log.frames import FrameArray
+from capture.robot import Quantity, Robot
+
+from ..readings import Readings
+
+OLDEST_S = 0.5
+"""A value older than this counts as unknown [s]; the slowest sensors come several times in it."""
+
+_AXES = "xyz"
+_VECTORS = (Quantity.ACCELERATION, Quantity.MAGNETIC_FIELD)
+
+
+class BusReadings:
+    """Gathers decoded frames; ask :meth:`readings` once a control tick."""
+
+    def __init__(self, robot: Robot, oldest_s: float = OLDEST_S) -> None:
+        """Know nothing yet.
+
+        Args:
+            robot: The robot; it has a bus map.
+            oldest_s: So old a value may be [s].
+
+        Raises:
+            DataError: If the robot has no bus, or not the databases that its map needs.
+        """
+        self._decoder = BusDecoder(robot)
+        self._oldest_s = oldest_s
+        self._joints = {name: i for i, name in enumerate(robot.joint_names)}
+        self._range_max = {
+            sensor.name: sensor.range_max if sensor.range_max is not None else math.inf
+            for sensor in robot.sensors
+        }
+        count = len(robot.joints)
+        self._joint_values: dict[Quantity, FloatArray] = {}
+        self._joint_times: dict[Quantity, FloatArray] = {}
+        for quantity in (Quantity.POSITION, Quantity.VELOCITY):
+            self._joint_values[quantity] = np.full(count, np.nan)
+            self._joint_times[quantity] = np.full(count, -np.inf)
+        self._ranges: dict[str, tuple[float, float]] = {}
+        self._vectors: dict[Quantity, dict[str, tuple[float, FloatArray]]] = {
+            q: {} for q in _VECTORS
+        }
+        self._last_s = -math.inf
+        self.tally = FrameTally()
+        """What became of the frames so far."""
+
+    def add(self, frames: FrameArray, time_s: float) -> None:
+        """Take frames, in the order in which they came.
+
+        Args:
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+            time_s: When they came, on the loop's clock [s].
+        """
+        samples, tally = self._decoder.decode(frames)
+        self.tally.add(tally)
+        if samples:
+            self._last_s = time_s
+        for decoded in samples:
+            self._take(decoded, time_s)
+
+    def silence_s(self, time_s: float) -> float:
+        """How long the robot has said nothing.
+
+        Args:
+            time_s: Now, on the loop's clock [s].
+
+        Returns:
+            Time since the last frame with a value [s]; inf before the first.
+        """
+        return time_s - self._last_s
+
+    def readings(self, time_s: float) -> Readings:
+        """What is known.
+
+        Args:
+            time_s: Now, on the loop's clock [s].
+
+        Returns:
+            The newest values; NaN, or absent, what has not come or is too old.
+        """
+        since_s = time_s - self._oldest_s
+        angle, velocity = (
+            frozen(np.where(self._joint_times[q] >= since_s, values, np.nan))
+            for q, values in self._joint_values.items()
+        )
+        acceleration, field = (
+            {name: vector for name, (at_s, vector) in self._vectors[q].items() if at_s >= since_s}
+            for q in _VECTORS
+        )
+        ranges = {name: value for name, (at_s, value) in self._ranges.items() if at_s >= since_s}
+        return Readings(angle, velocity, ranges, acceleration, field)
+
+    def _take(self, decoded: DecodedSignals, time_s: float) -> None:
+        """Keep the values that are known; of several of one target the last one stays."""
+        quantity, axis = decoded.signals[0].quantity, decoded.signals[0].axis
+        members: list[int] = decoded.member.tolist()
+        values: list[float] = decoded.values.tolist()
+        for member, value in zip(members, values, strict=True):
+            if math.isnan(value):
+                continue
+            target = decoded.signals[member].target
+            if quantity in self._joint_values:
+                joint = self._joints[target]
+                self._joint_values[quantity][joint] = value
+                self._joint_times[quantity][joint] = time_s
+            elif quantity is Quantity.RANGE:
+                # REP 117: a reading beyond the greatest range means that nothing is in it.
+                beyond = value > self._range_max[target]
+                self._ranges[target] = time_s, math.inf if beyond else value
+            elif quantity in _VECTORS:
+                known = self._vectors[quantity]
+                vector = known[target][1].copy() if target in known else np.full(3, np.nan)
+                vector[_AXES.index(axis)] = value
+                known[target] = time_s, frozen(vector)
