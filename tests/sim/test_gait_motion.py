@@ -1,0 +1,113 @@
+"""What the shipped gaits do to the body, against figures measured with an earlier, separate twin.
+
+That twin found (f = 0.5 Hz): caterpillar 0.039 m/s at lag pi/3 and 0.023 at pi/2; sidewinding 0.27
+to 0.32 m/s sideways; rolling half a turn a second; twist 0.05 to 0.11 m/s.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from sim import Readings, load_scenario
+from sim.gait import generator
+from sim.twin import Twin
+
+CYCLE = 200  # ticks
+
+
+class Motion(NamedTuple):
+    """Means over the last five cycles, along the mean direction from tail to head."""
+
+    speed: float
+    forward: float
+    left: float
+    turns_per_s: float
+    positions: np.ndarray
+
+
+def motion(name):
+    positions, rolls = [], []
+    with Twin(load_scenario(name)) as twin:
+        for sample in twin.samples():
+            body = sample.step.body
+            x, y, z, w = body.quaternion
+            axes = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+            rolls.append((axes * body.spin).sum(axis=0).mean())
+            positions.append(body.position)
+    positions = np.array(positions)
+    centre = positions.mean(axis=2)  # the links are alike
+    velocity = (centre[-1] - centre[-1 - 5 * CYCLE])[:2] / (5 * CYCLE / 100)
+    body = positions[-5 * CYCLE :]
+    axis = (body[:, :2, 0] - body[:, :2, -1]).mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    return Motion(
+        float(np.linalg.norm(velocity)),
+        float(velocity @ axis),
+        float(velocity @ (-axis[1], axis[0])),
+        float(np.mean(rolls[-5 * CYCLE :])) / (2 * math.pi),
+        positions,
+    )
+
+
+def commands(name):
+    scenario = load_scenario(name)
+    gait = generator(scenario.gait, scenario.robot)
+    nothing = Readings.nothing(scenario.robot)
+    return np.array([gait.step(k / 100, nothing).command for k in range(scenario.tick_count)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "speed"), [("caterpillar", 0.039), ("caterpillar-pi2", 0.023)])
+def test_a_caterpillar_creeps_straight_ahead(name, speed):
+    found = motion(name)
+    assert found.forward == pytest.approx(speed, rel=0.03)
+    assert abs(found.left) < 1e-3 * found.speed
+
+
+@pytest.mark.slow
+def test_a_sidewinder_walks_sideways():
+    found = motion("sidewinding")
+    assert 0.27 <= found.speed <= 0.32
+    assert abs(found.left) > 0.95 * found.speed
+    assert abs(found.turns_per_s) < 0.02  # it walks, it doesn't roll
+
+
+@pytest.mark.slow
+def test_rolling_turns_once_a_cycle_and_slips_a_little():
+    found = motion("rolling")
+    assert abs(found.turns_per_s) == pytest.approx(0.5, rel=0.01)
+    assert abs(found.left) > 0.99 * found.speed
+    # A straight cylinder would roll at 2 pi r f; an arc has to slip.
+    assert 0.8 < found.speed / (2 * math.pi * 0.025 * 0.5) < 1.0
+
+
+@pytest.mark.slow
+def test_a_helix_rolls_and_screws():
+    found = motion("twist")
+    assert 0.05 <= found.speed <= 0.11
+    assert abs(found.turns_per_s) == pytest.approx(0.5, rel=0.02)
+    assert abs(found.forward) > 0.2 * found.speed  # obliquely, unlike rolling
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["horizontal", "vertical", "combined"])
+def test_waves_of_the_papers_equations_go_head_first_and_straight(name):
+    found = motion(name)
+    assert found.forward > 0.04
+    assert abs(found.left) < 0.01 * found.speed
+
+
+@pytest.mark.parametrize("name", ["delay-blocks", "oscillators", "oscillators-one-way"])
+def test_other_generators_settle_into_the_wave_of_flat(name):
+    found, flat = commands(name), commands("flat")
+    assert np.abs(found[100] - flat[100]).max() > 0.05
+    settled = round(load_scenario(name).settle_s * 100)
+    np.testing.assert_allclose(found[settled:], flat[settled:], atol=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["delay-blocks", "oscillators"])
+def test_the_same_wave_moves_the_body_alike_whatever_made_it(name):
+    assert motion(name).forward == pytest.approx(motion("flat").forward, rel=1e-3)

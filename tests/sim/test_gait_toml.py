@@ -1,0 +1,231 @@
+"""The [gait] table: read strictly, every fault at once, and written back whole."""
+
+import math
+import tomllib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture import load_robot
+from capture.errors import ScenarioError
+from capture.robot import Plane
+from capture.strict_table import Faults, Table
+from sim import PlaneGait, Readings, Serpentine, Wave, parse_scenario
+from sim.gait import (
+    DelayBlocks,
+    DelayLine,
+    OscillatorChain,
+    OscillatorChains,
+    OscillatorKind,
+    generator,
+)
+from sim.gait.toml import gait_table, read_gait
+from sim.toml_text import toml_text
+
+ROBOT = load_robot("snake13")  # 6 joints in each plane
+
+positive = st.floats(1e-3, 25.0)
+angle = st.floats(-10.0, 10.0)
+common = {
+    "amplitude": st.floats(1e-3, 2.0),
+    "frequency_hz": positive,
+    "wave": st.sampled_from(Wave),
+    "offset": angle,
+    "phase": angle,
+}
+
+
+def numbers(count, most=100.0):
+    one = st.floats(-most, most)
+    return one | st.lists(one, min_size=count, max_size=count).map(tuple)
+
+
+def planes(part):
+    return st.dictionaries(st.sampled_from(Plane), part, min_size=1).map(
+        lambda found: {plane: found[plane] for plane in Plane if plane in found}
+    )
+
+
+rate = st.floats(1e-3, 100.0)
+chain = {
+    **common,
+    "lag": st.floats(0.0, 7.0),
+    "forward": numbers(5),
+    "backward": numbers(5),
+    "detuning": numbers(6),
+    "start_phase": numbers(6),
+    "approach_rate": rate,
+    "feedback": st.floats(0.0, 100.0),
+    "feedback_bias": numbers(6),
+}
+ramp = st.floats(0.0, 10.0)
+gaits = st.one_of(
+    st.builds(Serpentine, planes(st.builds(PlaneGait, **common, lag=st.floats(0.0, 7.0))), ramp),
+    st.builds(
+        DelayBlocks, planes(st.builds(DelayLine, **common, delay_s=st.floats(0.0, 10.0))), ramp
+    ),
+    st.builds(
+        OscillatorChains,
+        planes(
+            st.builds(OscillatorChain, **chain)
+            | st.builds(
+                OscillatorChain, **chain, oscillator=st.just(OscillatorKind.HOPF), attraction=rate
+            )
+        ),
+    ),
+)
+
+
+def read(text, robot=ROBOT):
+    faults = Faults()
+    gait = read_gait(Table(tomllib.loads(text), "gait", faults), robot, max_frequency_hz=25.0)
+    return gait, {fault.key: str(fault) for fault in faults.all()}
+
+
+@given(gait=gaits)
+@settings(max_examples=200, deadline=None)
+def test_whatever_is_written_reads_back_the_same(gait):
+    assert read(toml_text(gait_table(gait))) == (gait, {})
+
+
+@given(gait=gaits)
+@settings(max_examples=30, deadline=None)
+def test_whatever_can_be_read_can_be_run(gait):
+    run = generator(gait, ROBOT)
+    lower, upper = ROBOT.limits()
+    for k in range(3):
+        tick = run.step(k / 100, Readings.nothing(ROBOT))
+        assert len(tick.values) == len(run.names)
+        assert ((tick.command >= lower) & (tick.command <= upper)).all()
+
+
+def test_the_defaults_are_those_of_the_manual():
+    gait, faults = read(
+        'kind = "oscillators"\n[vertical]\namplitude = 0.3\nfrequency_hz = 0.5\nlag = 0.5\n'
+    )
+    assert not faults
+    assert gait.planes == {Plane.VERTICAL: OscillatorChain(0.3, 0.5, 0.5)}
+    one = gait.planes[Plane.VERTICAL]
+    assert (one.oscillator, one.forward, one.backward) == ("phase", 5.0, 5.0)
+    assert (one.approach_rate, one.attraction, one.feedback) == (4.0, 5.0, 0.0)
+    gait, _ = read(
+        'kind = "delay-blocks"\n[vertical]\namplitude = 0.3\nfrequency_hz = 0.5\ndelay_s = 0.1\n'
+    )
+    assert gait == DelayBlocks({Plane.VERTICAL: DelayLine(0.3, 0.5, 0.1)}, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            """
+            kind = "delay-blocks"
+            ramp_s = -1
+            [horizontal]
+            amplitude = -0.1
+            frequency_hz = 26
+            delay_s = 11
+            lag = 0.5
+            """,
+            {
+                "gait.ramp_s",
+                "gait.horizontal.amplitude",
+                "gait.horizontal.frequency_hz",
+                "gait.horizontal.delay_s",
+                "gait.horizontal.lag",
+            },
+        ),
+        (
+            """
+            kind = "oscillators"
+            ramp_s = 1.0
+            [horizontal]
+            amplitude = 0
+            frequency_hz = 0.5
+            lag = -1
+            oscillator = "phase"
+            attraction = 1.0
+            forward = [1, 2, 3]
+            backward = [1, 2, 101, 4, nan]
+            detuning = "fast"
+            start_phase = [0, 0, 0, 0, 0, "x"]
+            approach_rate = 0
+            feedback = 1.0
+            feedback_bia = 0.1
+            """,
+            {
+                "gait.ramp_s",
+                "gait.horizontal.amplitude",
+                "gait.horizontal.lag",
+                "gait.horizontal.attraction",
+                "gait.horizontal.forward",
+                "gait.horizontal.backward[2]",
+                "gait.horizontal.backward[4]",
+                "gait.horizontal.detuning",
+                "gait.horizontal.start_phase[5]",
+                "gait.horizontal.approach_rate",
+                "gait.horizontal.feedback_bia",
+            },
+        ),
+        ('kind = "serpentin"\n[horizontal]\nlag = 1.0', {"gait.kind"}),
+        ('kind = "oscillators"', {"gait.horizontal"}),
+        ('kind = "oscillators"\nhorizontal = 3', None),
+    ],
+)
+def test_all_faults_are_listed_at_once(text, expected):
+    _, faults = read(text)
+    if expected is None:
+        assert "a table" in faults["gait.horizontal"]
+    else:
+        assert set(faults) == expected
+
+
+def test_faults_say_what_would_be_right():
+    _, faults = read('kind = "oscilators"')
+    assert "did you mean oscillators?" in faults["gait.kind"]
+    text = 'kind = "oscillators"\n[vertical]\namplitude = 0.3\nfrequency_hz = 1\nlag = 0\n'
+    _, faults = read(text + "forward = [1, 2]\nbackward = -200\nfeedback_bias = true")
+    assert "an array of 2" in faults["gait.vertical.forward"]
+    assert "a number, or an array of 5" in faults["gait.vertical.forward"]
+    assert ">= -100 and <= 100" in faults["gait.vertical.backward"]
+    assert "a finite number" in faults["gait.vertical.feedback_bias"]
+
+
+def test_a_plane_that_the_robot_lacks():
+    text = 'kind = "delay-blocks"\n[vertical]\namplitude = 0.3\nfrequency_hz = 1\ndelay_s = 0\n'
+    _, faults = read(text, load_robot("snake13-planar"))
+    assert "snake13-planar has no vertical joints" in faults["gait.vertical"]
+
+
+def test_a_whole_scenario_names_the_gaits_faults_among_others():
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(
+            """
+            description = "x"
+            robot = "snake13"
+            duration_s = -1
+            [gait]
+            kind = "oscillators"
+            [gait.horizontal]
+            amplitude = 0.3
+            frequency_hz = 0.5
+            lag = 0.5
+            detuning = [1.0]
+            """,
+            "x.toml",
+        )
+    found = {fault.key for fault in caught.value.faults}
+    assert found == {"duration_s", "gait.horizontal.detuning"}
+
+
+def test_a_scenario_of_each_kind_reads_back():
+    head = 'description = "x"\nrobot = "snake13"\nduration_s = 1\n[gait]\n'
+    wave = "[gait.horizontal]\namplitude = 0.3\nfrequency_hz = 0.5\n"
+    for kind, rest in (
+        ("serpentine", "lag = 0.5"),
+        ("delay-blocks", "delay_s = 0.1"),
+        ("oscillators", f"lag = 0.5\nstart_phase = [0, 1, 0, 0, 0, {math.pi}]"),
+    ):
+        scenario = parse_scenario(f'{head}kind = "{kind}"\n{wave}{rest}', "x.toml")
+        assert parse_scenario(scenario.toml(), "y.toml").gait == scenario.gait
