@@ -1,0 +1,99 @@
+"""Readings from the bus: frames that the shared encoder packs, decoded into what a gait is told."""
+
+import math
+
+import numpy as np
+import pytest
+
+from capture import load_robot
+from capture.bus.encoding import BusEncoder
+from capture.log.frames import DIR_TX, empty_frames
+from capture.robot import Direction, Quantity
+from sim.drive.readings_from_bus import BusReadings
+
+
+@pytest.fixture
+def robot():
+    return load_robot("snake25")
+
+
+@pytest.fixture
+def encode(robot):
+    return BusEncoder(robot, Direction.RX).encode
+
+
+def joint(quantity, value, name="joint03"):
+    return {(name, quantity, ""): value}
+
+
+def test_nothing_is_known_before_the_first_frame(robot):
+    known = BusReadings(robot)
+    readings = known.readings(0.0)
+    assert np.isnan(readings.angle).all()
+    assert np.isnan(readings.velocity).all()
+    assert readings.ranges == readings.acceleration == readings.magnetic_field == {}
+    assert known.silence_s(3.0) == math.inf
+
+
+def test_each_sensor_has_its_newest_value(robot, encode):
+    known = BusReadings(robot)
+    first = joint(Quantity.POSITION, 0.1) | joint(Quantity.VELOCITY, -1.0)
+    first |= {("ir01", Quantity.RANGE, ""): 0.5, ("sonar", Quantity.RANGE, ""): 2.0}
+    for axis, specific_force in (("x", 1.0), ("y", 2.0), ("z", 9.0)):
+        first["accelerometer", Quantity.ACCELERATION, axis] = specific_force
+    for axis, field in (("x", 2e-5), ("y", 1e-5)):
+        first["compass", Quantity.MAGNETIC_FIELD, axis] = field
+    known.add(encode(first), 1.0)
+    known.add(encode(joint(Quantity.POSITION, 0.2)), 1.01)
+    readings = known.readings(1.01)
+    assert readings.angle[2] == pytest.approx(0.2, abs=1e-4)
+    assert readings.velocity[2] == pytest.approx(-1.0, abs=1e-3)
+    assert np.isnan(np.delete(readings.angle, 2)).all()
+    assert readings.ranges == pytest.approx({"ir01": 0.5, "sonar": 2.0}, abs=6e-4)
+    np.testing.assert_allclose(readings.acceleration["accelerometer"], [1, 2, 9], atol=5e-3)
+    np.testing.assert_allclose(
+        readings.magnetic_field["compass"], [2e-5, 1e-5, math.nan], atol=1e-8
+    )
+    assert known.silence_s(1.5) == pytest.approx(0.49)
+    assert known.tally.decoded == 6
+
+
+def test_nothing_in_range_is_infinitely_far_and_unknown_is_not_a_value(robot, encode):
+    known = BusReadings(robot)
+    known.add(encode({("ir01", Quantity.RANGE, ""): 0.5}), 0.0)
+    known.add(encode({("ir02", Quantity.RANGE, ""): math.inf}), 0.1)  # shares a frame with ir01
+    assert known.readings(0.1).ranges == {"ir01": pytest.approx(0.5), "ir02": math.inf}
+
+
+def test_what_has_not_come_for_long_is_unknown_again(robot, encode):
+    known = BusReadings(robot, oldest_s=0.3)
+    known.add(encode(joint(Quantity.POSITION, 0.1) | {("ir01", Quantity.RANGE, ""): 0.5}), 0.0)
+    known.add(encode(joint(Quantity.POSITION, 0.3, "joint04")), 0.2)
+    assert not math.isnan(known.readings(0.3).angle[2])
+    later = known.readings(0.31)
+    assert math.isnan(later.angle[2])
+    assert later.angle[3] == pytest.approx(0.3, abs=1e-4)
+    assert later.ranges == {}
+
+
+def test_what_was_handed_out_does_not_change_later(robot, encode):
+    known = BusReadings(robot)
+    values = {("accelerometer", Quantity.ACCELERATION, "x"): 1.0}
+    known.add(encode(values | joint(Quantity.POSITION, 0.1)), 0.0)
+    before = known.readings(0.0)
+    known.add(encode(dict.fromkeys(values, 5.0) | joint(Quantity.POSITION, 0.4)), 0.01)
+    assert before.angle[2] == pytest.approx(0.1, abs=1e-4)
+    assert before.acceleration["accelerometer"][0] == pytest.approx(1.0, abs=5e-3)
+    with pytest.raises(ValueError, match="read-only"):
+        before.angle[2] = 0.0
+
+
+def test_frames_of_others_are_counted_and_say_nothing(robot):
+    frames = empty_frames(2)
+    frames["id_flags"] = [0x101, 0x7FF]  # a command, and an identifier that nobody knows
+    frames["dlc"] = 2
+    frames["dir"] = [0, DIR_TX]
+    known = BusReadings(robot)
+    known.add(frames, 0.0)
+    assert known.silence_s(1.0) == math.inf
+    assert (known.tally.frames, known.tally.decoded) == (2, 0)
