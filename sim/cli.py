@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
@@ -16,9 +20,11 @@ if TYPE_CHECKING:
     from .record import Recording
     from .scenario import Scenario
 
+_UNWRAPPED = 1000  # columns: one scenario a line, for grep and the like
+
 
 def list_scenarios(*, json: bool = False) -> None:
-    """List the shipped scenarios: name, robot, duration, and what each is about.
+    """List the shipped scenarios by robot: name, duration, and what each is about.
 
     Example: `undulog sim list`
 
@@ -31,9 +37,8 @@ def list_scenarios(*, json: bool = False) -> None:
     if json:
         emit_json([_described(scenario) for scenario in scenarios])
         return
-    width = max(len(scenario.name) for scenario in scenarios)
-    for one in scenarios:
-        print(f"{one.name:{width}}  {one.robot.name:8}  {one.duration_s:5g} s  {one.description}")
+    columns = get_terminal_size().columns if sys.stdout.isatty() else _UNWRAPPED
+    print("\n".join(_listed(scenarios, columns)))
 
 
 def run(
@@ -87,6 +92,23 @@ def run(
     else:
         print("\n".join(_told(chosen, recording, factor)))
     return 0 if recording.complete else 1
+
+
+def _listed(scenarios: Sequence[Scenario], columns: int) -> list[str]:
+    """Lines that list scenarios, by robot, the descriptions wrapped to the terminal."""
+    name_width = max(len(one.name) for one in scenarios)
+    by_robot: dict[str, list[Scenario]] = {}
+    for one in scenarios:
+        by_robot.setdefault(one.robot.name, []).append(one)
+    lines = [f"{len(scenarios)} scenarios of {len(by_robot)} robots"]
+    for robot, chosen in sorted(by_robot.items(), key=lambda item: -len(item[1])):
+        lines += ["", f"{robot}, {len(chosen[0].robot.joints)} joints:"]
+        for one in chosen:
+            start = f"  {one.name:{name_width}} {one.duration_s:5g} s  "
+            wide = max(columns, len(start) + 40)
+            indent = " " * len(start)
+            lines += wrap(one.description, wide, initial_indent=start, subsequent_indent=indent)
+    return lines
 
 
 def _described(scenario: Scenario) -> dict[str, Any]:
