@@ -88,8 +88,9 @@ class ClockEstimate:
 class SourceClock:
     """Maps one source's device times to the session's clock, as the samples come.
 
-    Mapped times never go back and never lie after the arrival. Where the estimate falls, times
-    run at half speed until they meet it, so that samples keep their order and stay apart.
+    Mapped times never lie after the arrival, and go back only where the device's own do, by as
+    much: a sample that took longer than its neighbours comes late and keeps its time. Where the
+    estimate falls, times run at half speed until they meet it, so that samples stay apart.
     """
 
     def __init__(self) -> None:
@@ -97,6 +98,7 @@ class SourceClock:
         self._envelope = Envelope()
         self._own = False
         self._device = self._host = 0  # of the last sample
+        self._front = 0  # the latest device time so far
         self._pair: tuple[int, int] | None = None
         self._last = -(2**62)  # the last mapped time
         self._floor = -(2**62)  # what the next may not fall below, at half speed
@@ -219,7 +221,8 @@ class SourceClock:
     def _take(self, device: IntArray, host: IntArray) -> int:
         """Let the envelope know samples up to a jump; how many that are."""
         stop = len(device)
-        back = np.diff(device, prepend=self._device) < -JUMP_NS
+        front = np.maximum(np.maximum.accumulate(device), self._front)
+        back = device - front < -JUMP_NS
         if back.any():
             stop = int(back.argmax())
             if stop == 0:
@@ -264,13 +267,14 @@ class SourceClock:
     def _restart(self, device: int, host: int, envelope: Envelope) -> None:
         self._envelope = envelope
         self._origin = device, host - device
-        self._device, self._host = device, host
+        self._device, self._front, self._host = device, device, host
         self._bucket_ends = host + BUCKET_NS
         self._floor = self._last - device // 2
 
     def _place(self, device: IntArray, host: IntArray) -> IntArray:
-        """Map samples on the line, in order and not after their arrival."""
-        line = self._envelope.line
+        """Map samples on the line, in the device's order and not after their arrival."""
+        line, own = self._envelope.line, device
+        device = np.maximum(np.maximum.accumulate(device), self._front)
         x = device - self._origin[0]
         lag = np.floor(line.offset_ns + line.rate * x).astype(np.int64)
         mapped = device + (self._origin[1] + lag)
@@ -278,9 +282,9 @@ class SourceClock:
         floor = np.maximum(mapped - half, self._floor)
         mapped = np.minimum(np.maximum.accumulate(floor) + half, host)
         mapped = np.maximum(np.maximum.accumulate(mapped), self._last)
-        self._last = int(mapped[-1])
+        self._last, self._front = int(mapped[-1]), int(device[-1])
         self._floor = self._last - int(half[-1])
-        return mapped
+        return mapped - (device - own)
 
     def _count_delays(self) -> None:
         if not self._delays:
