@@ -4,18 +4,20 @@ The robot's clock starts with its process and runs with the computer's monotonic
 due at start + k periods; deadlines are anchored at the start, so no pause accumulates. A twin that
 needs longer than a period for a period is behind, and catches up where it can. Where it can't,
 simulated time stands still and the ticks that follow are due later: samples then have a gap on the
-robot's clock, which a recording shows and its health check tells.
+robot's clock, which a recording shows and its health check tells. Samples that are on their way by
+then come after the gap, so that no time on the bus ever goes back.
 """
 
 from __future__ import annotations
 
 import time
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 
 PATIENCE_NS = 100_000_000
 """So far behind the twin may be [ns] and still try to catch up."""
 
+_ON_THEIR_WAY = 5  # ticks: no sample arrives later than that
 _NS = 1_000_000_000
 
 
@@ -42,6 +44,7 @@ class Pacer:
     Attributes:
         period_ns: Control period [ns].
         tally: How well the ticks kept to it.
+        epoch_ns: The robot's clock at zero [Unix ns].
     """
 
     def __init__(self, period_ns: int, *, fast: bool = False) -> None:
@@ -56,6 +59,7 @@ class Pacer:
         self.tally = PaceTally()
         self._fast = fast
         self._zero_ns = time.monotonic_ns()
+        self.epoch_ns = time.time_ns()
         self._present_ns = 0
         self._from_tick = [0]  # where simulated time stood still, and tick 0 as seen from there on
         self._start_ns = [0]
@@ -114,8 +118,10 @@ class Pacer:
         tally.worst_s = max(tally.worst_s, late_ns / _NS)
         if late_ns < PATIENCE_NS:
             return 0.0
-        self._from_tick.append(tick)
-        self._start_ns.append(_whole_us(self._start_ns[-1] + late_ns))
+        start_ns = _whole_us(self._start_ns[-1] + late_ns)
+        first = max(tick - _ON_THEIR_WAY, 0)
+        place = bisect_left(self._from_tick, first)
+        self._from_tick[place:], self._start_ns[place:] = [first], [start_ns]
         tally.stood_still_s += late_ns / _NS
         return late_ns / _NS
 

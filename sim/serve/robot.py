@@ -176,7 +176,7 @@ class VirtualRobot:
             self._bus.mark(0)  # nothing is told before it: a controller in lockstep may speak
             self._begin()
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
-            self._serve(wait_s)
+            (self._idle if self._lockstep else self._serve)(wait_s)
         if self._twin is not None and tick:
             self._report(self._twin.sensed, tick)
             self._bus.mark(tick)
