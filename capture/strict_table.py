@@ -264,6 +264,22 @@ class Table:
             return at_least
         return value
 
+    def flag(self, key: str, *, default: bool) -> bool:
+        """True or false; the default after a fault.
+
+        Args:
+            key: Key in this table.
+            default: Taken when absent.
+
+        Returns:
+            The truth value.
+        """
+        value = self.look(key)[1]
+        if value is None or isinstance(value, bool):
+            return default if value is None else value
+        self.fault(key, "true or false")
+        return default
+
     def triple(
         self,
         key: str,

@@ -17,12 +17,13 @@ from importlib.metadata import version
 
 import numpy as np
 
+from capture.log.sensor_channels import open_sensor
 from capture.log.writer import SessionWriter
 from capture.robot.kinematics import rotation_from_quaternion
 
 from .physics.ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario
-from .sensing.contract import JointSample, SensorSample
+from .sensing.contract import JointSample, RangeSample, SensorSample
 from .stability import warnings
 from .twin import Sample, Twin
 from .urdf import frame_origins, urdf
@@ -89,6 +90,8 @@ class SessionLog:
         self._transforms = writer.transforms(
             "/tf", parent="world", children=[link.name for link in robot.links]
         )
+        sensors = robot.sensors if scenario.sensing.enabled else ()
+        self._sensors = {one.name: open_sensor(writer, one) for one in sensors}
         self._mode = writer.string("/gait/mode")
         self._events = writer.log("/rosout")
         self._lower, self._upper = robot.limits()
@@ -147,6 +150,11 @@ class SessionLog:
         for sample in samples:
             if isinstance(sample, JointSample):
                 self._write_joints(sample)
+            else:
+                ranged = isinstance(sample, RangeSample)
+                values = np.array([sample.distance]) if ranged else sample.vector
+                t_ns = self._epoch_ns + round(sample.time_s * 1e9)
+                self._sensors[sample.name](values, t_ns, self._t_ns)
 
     def _write_joints(self, sample: JointSample) -> None:
         t_ns, now_ns = self._epoch_ns + sample.cycle * _TICK_NS, self._t_ns

@@ -21,6 +21,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..log.channels import JointStateChannel
+from ..log.sensor_channels import open_sensor
 from ..log.writer import SessionWriter
 from ..robot import BusSignal, Quantity, Robot, Sensor, SensorKind
 from ..units import SESSION_UNIT
@@ -373,7 +374,7 @@ class _SensorTopic:
         if not any(len(rows) for _, rows, _, _ in pieces):
             return []
         if self._write is None:
-            self._write = _open_sensor(self._writer, self._sensor)
+            self._write = open_sensor(self._writer, self._sensor)
         write, topic = self._write, self._sensor.topic
         if len(pieces) == 1 and self._sensor.kind in _SCALAR:
             _, _, t_ns, row = pieces[0]
@@ -399,22 +400,3 @@ def _side_by_side(pieces: Sequence[_Piece]) -> tuple[IntArray, FloatArray]:
         t_ns[at] = own_t
         values[at, column] = own_values
     return t_ns, values
-
-
-def _open_sensor(writer: SessionWriter, sensor: Sensor) -> Callable[[FloatArray, int, int], None]:
-    """Open a sensor's topic; returns what writes a row of values, sample time and log time."""
-    if sensor.kind is SensorKind.ACCELEROMETER:
-        imu = writer.imu(sensor.topic, frame=sensor.name)
-        return lambda row, t_ns, log_ns: imu.write(t_ns, row, log_time_ns=log_ns)
-    if sensor.kind is SensorKind.COMPASS:
-        compass = writer.magnetic_field(sensor.topic, frame=sensor.name)
-        return lambda row, t_ns, log_ns: compass.write(t_ns, row, log_time_ns=log_ns)
-    distance = writer.range(
-        sensor.topic,
-        frame=sensor.name,
-        min_range=sensor.range_min or 0.0,
-        max_range=sensor.range_max or 0.0,
-        field_of_view=sensor.field_of_view or 0.0,
-        infrared=sensor.kind is SensorKind.IR,
-    )
-    return lambda row, t_ns, log_ns: distance.write(t_ns, float(row[0]), log_time_ns=log_ns)

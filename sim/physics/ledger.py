@@ -23,7 +23,7 @@ from capture.robot import Robot
 from .contact import into_link_axes
 from .servo import Servos
 from .steps import Step, Steps
-from .vectors import cross
+from .vectors import into_frames
 
 JOINT_TERMS = (
     "mechanical_net",
@@ -162,7 +162,7 @@ class Ledger:
             Energies [J], as :data:`STORED_TERMS`, shape (5,).
         """
         body, rotors, servos = step.body, step.rotors, self._servos
-        spin = _into_link_frames(body.quaternion, body.spin)
+        spin = into_frames(body.quaternion, body.spin)
         twist = servos.twist(body.angle, rotors.angle)
         depth = _pressed(step.contact.depth)
         return np.array(
@@ -204,10 +204,3 @@ def _middle(series: FloatArray) -> FloatArray:
 def _pressed(depth: FloatArray) -> FloatArray:
     """Compression of the ground: its depth where positive."""
     return np.maximum(depth, 0.0)
-
-
-def _into_link_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
-    """World vectors in the links' own frames, component first: v - 2w (u x v) + 2 u x (u x v)."""
-    u, w = quaternion[:3], quaternion[3]
-    turned = cross(u, vector)
-    return vector - 2.0 * w * turned + 2.0 * cross(u, turned)

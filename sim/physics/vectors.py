@@ -18,3 +18,33 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
         a x b, shape (3, n).
     """
     return a[_NEXT] * b[_LAST] - a[_LAST] * b[_NEXT]
+
+
+def into_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+    """World vectors in frames of their own: v - 2 w (u x v) + 2 u x (u x v).
+
+    Args:
+        quaternion: Orientations of the frames, u and w, shape (4, n).
+        vector: In the world, shape (3, n).
+
+    Returns:
+        The same vectors in the frames, shape (3, n).
+    """
+    u, w = quaternion[:3], quaternion[3]
+    turned = cross(u, vector)
+    return vector - 2.0 * w * turned + 2.0 * cross(u, turned)
+
+
+def out_of_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+    """Vectors in frames of their own in the world; undoes :func:`into_frames`.
+
+    Args:
+        quaternion: Orientations of the frames, u and w, shape (4, n).
+        vector: In the frames, shape (3, n).
+
+    Returns:
+        The same vectors in the world, shape (3, n).
+    """
+    u, w = quaternion[:3], quaternion[3]
+    turned = cross(u, vector)
+    return vector + 2.0 * w * turned + 2.0 * cross(u, turned)

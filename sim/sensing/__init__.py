@@ -1,5 +1,21 @@
 """The robot's sensors: what they measure, when, and how wrongly."""
 
-from .model import Noise, SensorModels, ServoPolling
+from .model import (
+    AccelerometerModel,
+    CompassModel,
+    InfraredModel,
+    Noise,
+    SensorModels,
+    ServoPolling,
+    SonarModel,
+)
 
-__all__ = ["Noise", "SensorModels", "ServoPolling"]
+__all__ = [
+    "AccelerometerModel",
+    "CompassModel",
+    "InfraredModel",
+    "Noise",
+    "SensorModels",
+    "ServoPolling",
+    "SonarModel",
+]

@@ -8,12 +8,11 @@ hold the same columns.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple, Protocol, TypeAlias
 
 from capture.arrays import FloatArray
 
-from ..physics.steps import Step
+from ..physics.steps import Steps
 from ..readings import Readings
 
 
@@ -78,7 +77,7 @@ class Sensing(Protocol):
         """What the robot's computer knows by now."""
         ...
 
-    def observe(self, steps: Sequence[Step]) -> list[SensorSample]:
+    def observe(self, steps: Steps) -> list[SensorSample]:
         """Take in one control period.
 
         Args:

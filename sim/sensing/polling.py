@@ -15,14 +15,13 @@ step.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from capture.arrays import FloatArray, IntArray, frozen
 
-from ..physics.steps import Step
+from ..physics.steps import Steps
 from .contract import JointSample
 from .model import Noise, ServoPolling
 from .quantise import quantised
@@ -77,7 +76,7 @@ class JointPolling:
         self._next = 0  # the cycle to be told next
         self._told = np.full(joint_count, np.nan)
 
-    def observe(self, steps: Sequence[Step]) -> list[JointSample]:
+    def observe(self, steps: Steps) -> list[JointSample]:
         """Take in one control period.
 
         Args:
@@ -86,10 +85,11 @@ class JointPolling:
         Returns:
             The cycle that started one control period before it, once there is one.
         """
-        motion = np.array([(step.body.angle, step.body.rate) for step in steps])
-        drive = [(step.drive.torque, step.drive.current, step.drive.voltage) for step in steps[:-1]]
+        body, drive = steps.stacked.body, steps.stacked.drive
+        motion = np.stack([body.angle, body.rate], axis=1)
+        acting = np.stack([drive.torque, drive.current, drive.voltage], axis=1)[:-1]
         self._first += len(self._kept) == self._kept.maxlen
-        self._kept.append(_Period(motion, np.array(drive)))
+        self._kept.append(_Period(motion, acting))
         return [self._sample()] if self._next < self._ended else []
 
     def flush(self) -> list[JointSample]:

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from typing import Protocol
 
-from ..physics.steps import Step
+from capture.arrays import FloatArray
+from capture.robot import Sensor, SensorKind
+
+from ..physics.steps import Steps
 from ..readings import Readings
 from ..scenario import CONTROL_RATE_HZ, Scenario
-from .contract import JointSample, SensorSample
+from ..world.rays import RayCaster
+from .accelerometer import Accelerometer
+from .compass import Compass
+from .contract import JointSample, RangeSample, SensorSample, VectorSample
+from .ir import Infrared
 from .polling import JointPolling
+from .sonar import Sonar
+
+
+class _Kind(Protocol):
+    """All sensors of one kind."""
+
+    def observe(self, steps: Steps, start: int) -> list[RangeSample] | list[VectorSample]:
+        """Measure during one control period, whose first step has a number."""
+        ...
 
 
 class Senses:
@@ -29,23 +45,33 @@ class Senses:
             dt=1.0 / scenario.physics_rate_hz,
             seed=scenario.seed,
         )
+        self._kinds = _kinds(scenario) if scenario.sensing.enabled else []
+        self._accelerometers = frozenset(
+            one.name for one in scenario.robot.sensors if one.kind is SensorKind.ACCELEROMETER
+        )
         self._readings = Readings.nothing(scenario.robot)
+        self._start = 0  # number of the next period's first step
 
     @property
     def readings(self) -> Readings:
         """What the robot's computer knows by now."""
         return self._readings
 
-    def observe(self, steps: Sequence[Step]) -> list[SensorSample]:
+    def observe(self, steps: Steps) -> list[SensorSample]:
         """Take in one control period.
 
         Args:
             steps: Its physics steps from its start to its end, both included.
 
         Returns:
-            The samples that arrive by the end of the period.
+            The samples that arrive by the end of the period, in the order of their times; the
+            servos' cycle, which is older, comes last.
         """
-        return self._known([*self._polling.observe(steps)])
+        start = self._start
+        self._start += len(steps) - 1
+        measured = [one for kind in self._kinds for one in kind.observe(steps, start)]
+        measured.sort(key=lambda one: one.time_s)  # stable: in the order of kinds at one time
+        return self._known([*measured, *self._polling.observe(steps)])
 
     def flush(self) -> list[SensorSample]:
         """End the run.
@@ -57,9 +83,47 @@ class Senses:
 
     def _known(self, samples: list[SensorSample]) -> list[SensorSample]:
         """Take samples into the readings; returns them."""
+        ranges: dict[str, float] = {}
+        acceleration: dict[str, FloatArray] = {}
+        magnetic_field: dict[str, FloatArray] = {}
+        known = self._readings
         for sample in samples:
             if isinstance(sample, JointSample):
-                self._readings = dataclasses.replace(
-                    self._readings, angle=sample.position, velocity=sample.velocity
-                )
+                known = dataclasses.replace(known, angle=sample.position, velocity=sample.velocity)
+            elif isinstance(sample, RangeSample):
+                ranges[sample.name] = sample.distance
+            elif sample.name in self._accelerometers:
+                acceleration[sample.name] = sample.vector
+            else:
+                magnetic_field[sample.name] = sample.vector
+        if samples:
+            self._readings = dataclasses.replace(
+                known,
+                ranges={**known.ranges, **ranges},
+                acceleration={**known.acceleration, **acceleration},
+                magnetic_field={**known.magnetic_field, **magnetic_field},
+            )
         return samples
+
+
+def _kinds(scenario: Scenario) -> list[_Kind]:
+    """The sensors that the robot has, by kind."""
+    robot, world, models = scenario.robot, scenario.world, scenario.sensing
+    dt, seed = 1.0 / scenario.physics_rate_hz, scenario.seed
+    caster = RayCaster(world.obstacles, ground=world.ground is not None)
+
+    def having(kind: SensorKind) -> tuple[Sensor, ...]:
+        return tuple(one for one in robot.sensors if one.kind is kind)
+
+    kinds: list[_Kind] = []
+    if sensors := having(SensorKind.IR):
+        kinds.append(Infrared(models.ir, sensors, robot, caster, dt=dt, seed=seed))
+    if sensors := having(SensorKind.SONAR):
+        kinds.append(Sonar(models.sonar, sensors, robot, caster, dt=dt, seed=seed))
+    if sensors := having(SensorKind.ACCELEROMETER):
+        kinds.append(
+            Accelerometer(models.accelerometer, sensors, robot, world.gravity, dt=dt, seed=seed)
+        )
+    if sensors := having(SensorKind.COMPASS):
+        kinds.append(Compass(models.compass, sensors, robot, dt=dt, seed=seed))
+    return kinds

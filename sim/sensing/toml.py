@@ -7,7 +7,15 @@ import dataclasses
 from capture.robot import Robot
 from capture.strict_table import Table
 
-from .model import Noise, SensorModels, ServoPolling
+from .model import (
+    AccelerometerModel,
+    CompassModel,
+    InfraredModel,
+    Noise,
+    SensorModels,
+    ServoPolling,
+    SonarModel,
+)
 
 
 def read_noise(table: Table) -> Noise:
@@ -36,9 +44,16 @@ def read_sensing(table: Table, robot: Robot | None, period_s: float) -> SensorMo
     Returns:
         The models, with defaults where nothing is given.
     """
-    servo = _servo(table.table("servo"), robot, period_s)
+    models = SensorModels(
+        servo=_servo(table.table("servo"), robot, period_s),
+        ir=_infrared(table.table("ir")),
+        sonar=_sonar(table.table("sonar")),
+        accelerometer=_accelerometer(table.table("accelerometer")),
+        compass=_compass(table.table("compass")),
+        enabled=table.flag("enabled", default=SensorModels.enabled),
+    )
     table.close()
-    return SensorModels(servo)
+    return models
 
 
 def _servo(table: Table, robot: Robot | None, period_s: float) -> ServoPolling:
@@ -56,3 +71,57 @@ def _servo(table: Table, robot: Robot | None, period_s: float) -> ServoPolling:
         table.fault("slot_s", f"less than {period_s / len(robot.joints):g}, for {longest}")
     table.close()
     return servo
+
+
+def _infrared(table: Table) -> InfraredModel:
+    default = InfraredModel
+    model = InfraredModel(
+        hold_s=table.number("hold_s", default=default.hold_s, above=0.0),
+        noise_v=table.number("noise_v", default=default.noise_v, at_least=0.0),
+        adc_bits=table.integer("adc_bits", at_least=1) if "adc_bits" in table else default.adc_bits,
+        adc_v=table.number("adc_v", default=default.adc_v, above=0.0),
+        peak=table.number("peak", default=default.peak, above=0.0),
+    )
+    table.close()
+    return model
+
+
+def _sonar(table: Table) -> SonarModel:
+    default = SonarModel
+    model = SonarModel(
+        rate_hz=table.number("rate_hz", default=default.rate_hz, above=0.0),
+        noise=table.number("noise", default=default.noise, at_least=0.0),
+        resolution=table.number("resolution", default=default.resolution, at_least=0.0),
+        rays=table.integer("rays", at_least=1) if "rays" in table else default.rays,
+    )
+    table.close()
+    return model
+
+
+def _accelerometer(table: Table) -> AccelerometerModel:
+    default = AccelerometerModel
+    model = AccelerometerModel(
+        rate_hz=table.number("rate_hz", default=default.rate_hz, above=0.0),
+        noise=table.number("noise", default=default.noise, at_least=0.0),
+        resolution=table.number("resolution", default=default.resolution, at_least=0.0),
+    )
+    table.close()
+    return model
+
+
+def _compass(table: Table) -> CompassModel:
+    default = CompassModel
+    model = CompassModel(
+        rate_hz=table.number("rate_hz", default=default.rate_hz, above=0.0),
+        noise=table.number("noise", default=default.noise, at_least=0.0),
+        resolution=table.number("resolution", default=default.resolution, at_least=0.0),
+        horizontal_field=table.number(
+            "horizontal_field", default=default.horizontal_field, above=0.0
+        ),
+        inclination=table.number(
+            "inclination", default=default.inclination, at_least=-1.57, at_most=1.57
+        ),
+        north=table.number("north", default=default.north),
+    )
+    table.close()
+    return model

@@ -1,11 +1,11 @@
 """Polled joints against motions known in closed form."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sim.physics.steps import Steps
 from sim.sensing.model import Noise, ServoPolling
 from sim.sensing.polling import JointPolling
 
@@ -15,14 +15,17 @@ DT, N, JOINTS = 1e-3, 10, 4
 def periods(count, angle, rate, drive):
     """Control periods of steps; ``drive`` is what acts from the step's start to its end."""
 
-    def step(k):
-        t = k * DT
-        body = SimpleNamespace(angle=angle(t), rate=rate(t))
-        torque, current, voltage = drive(k)
-        held = SimpleNamespace(torque=torque, current=current, voltage=voltage)
-        return SimpleNamespace(body=body, drive=held)
+    def period(p):
+        steps = range(N * p, N * p + N + 1)
+        motion = [np.array([value(k * DT) for k in steps]) for value in (angle, rate)]
+        torque, current, voltage = np.array([drive(k) for k in steps]).transpose(1, 0, 2)
+        whole = Steps.empty(N + 1, JOINTS + 1, JOINTS)
+        body, held = whole.stacked.body, whole.stacked.drive
+        body.angle[:], body.rate[:] = motion
+        held.torque[:], held.current[:], held.voltage[:] = torque, current, voltage
+        return whole
 
-    return [[step(N * p + i) for i in range(N + 1)] for p in range(count)]
+    return [period(p) for p in range(count)]
 
 
 def polling(servos=None, noise=None, seed=1):

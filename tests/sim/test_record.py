@@ -100,10 +100,17 @@ def test_the_channels_are_those_of_the_contract(session):
         "/tf": None,
         "/robot_description": None,
         "/rosout": None,
+        **{f"/ir/{i + 1:02d}": "m" for i in range(15)},
+        "/sonar": "m",
+        "/imu": None,
+        "/compass": "T",
     }
     counts = {topic: channel.count for topic, channel in session.channels.items()}
     assert counts["/joint_states"] == counts["/gait"] == counts["/odom"] == 61
     assert counts["/tf"] == 13  # 20 Hz
+    assert counts["/imu"] == 60
+    assert counts["/sonar"] == counts["/compass"] == 12
+    assert {counts[f"/ir/{i + 1:02d}"] for i in range(15)} <= {15, 16}  # every 38 ms
 
 
 def test_joints_come_back_exactly(session, run, scenario):

@@ -1,0 +1,121 @@
+"""Accelerometers: the specific force at their mount, f = R^T (dv/dt - g), in their own frame.
+
+At rest that is gravity's opposite: +9.81 m/s^2 upwards. A sample is the mean over one sampling
+period and carries the time of that period's middle. The velocity is the mount point's, so spin and
+lever arm are in it; within a physics step the force is turned into the sensor's frame as the mean
+of the frames at its ends has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.robot import Robot, Sensor
+
+from ..physics.steps import Steps
+from ..physics.vectors import cross, into_frames, out_of_frames
+from .contract import VectorSample
+from .model import AccelerometerModel
+from .mount import Mounts
+from .quantise import quantised
+
+STREAM = 5
+"""Number of the random stream that the sensors' noise is drawn from."""
+
+
+class Accelerometer:
+    """A robot's accelerometers, mostly one."""
+
+    def __init__(
+        self,
+        model: AccelerometerModel,
+        sensors: Sequence[Sensor],
+        robot: Robot,
+        gravity: Sequence[float],
+        *,
+        dt: float,
+        seed: int,
+    ) -> None:
+        """Start before the first control period.
+
+        Args:
+            model: How they measure.
+            sensors: The sensors.
+            robot: Who carries them.
+            gravity: Acceleration of gravity in the world [m/s^2], length 3.
+            dt: Physics step [s].
+            seed: Of the noise.
+        """
+        self._names = [one.name for one in sensors]
+        self._mounts = Mounts(sensors, robot)
+        self._gravity = np.array(gravity)
+        self._model = model
+        self._axes = measured(sensors)
+        self._dt = dt
+        self._count = max(1, round(1.0 / (model.rate_hz * dt)))
+        self._summed = np.zeros((len(sensors), 3))
+        self._steps = 0  # in the sum
+        self._random = np.random.default_rng([seed, STREAM])
+
+    def observe(self, steps: Steps, start: int) -> list[VectorSample]:
+        """Measure during one control period.
+
+        Args:
+            steps: Its physics steps, both ends included.
+            start: Number of the first one since the start of the run.
+
+        Returns:
+            The samples whose sampling periods end with it or in it, in order of time.
+        """
+        samples: list[VectorSample] = []
+        force = self._specific_force(steps)
+        done = 0
+        while done < len(force):
+            taken = force[done : done + self._count - self._steps]
+            self._summed += taken.sum(axis=0)
+            self._steps += len(taken)
+            done += len(taken)
+            if self._steps == self._count:
+                time_s = (start + done - self._count / 2) * self._dt
+                samples += self._told(self._summed / self._count, time_s)
+                self._summed[:] = 0.0
+                self._steps = 0
+        return samples
+
+    def _specific_force(self, steps: Steps) -> FloatArray:
+        """Mean specific force of each step in the carrying links' frames, shape (t, k, 3)."""
+        body = steps.stacked.body
+        sums: list[FloatArray] = []
+        for link, mount in zip(self._mounts.link, self._mounts.position, strict=True):
+            quaternion = body.quaternion[:, :, link].T  # (4, t + 1)
+            arm = out_of_frames(quaternion, np.broadcast_to(mount[:, None], (3, len(steps))))
+            velocity = body.velocity[:, :, link].T + cross(body.spin[:, :, link].T, arm)
+            force = np.diff(velocity) / self._dt - self._gravity[:, None]
+            sums.append(
+                into_frames(quaternion[:, :-1], force) + into_frames(quaternion[:, 1:], force)
+            )
+        return 0.5 * np.array(sums).transpose(2, 0, 1)
+
+    def _told(self, force: FloatArray, time_s: float) -> list[VectorSample]:
+        force = (force[:, None] @ self._mounts.rotation)[:, 0]  # into the sensors' frames
+        force += self._model.noise * self._random.standard_normal(force.shape)
+        told = self._axes * quantised(force, self._model.resolution)
+        return [
+            VectorSample(name, time_s, vector)
+            for name, vector in zip(self._names, told, strict=True)
+        ]
+
+
+def measured(sensors: Sequence[Sensor]) -> FloatArray:
+    """Which axes sensors measure, as factors.
+
+    Args:
+        sensors: The sensors.
+
+    Returns:
+        1 for an axis that a sensor measures and NaN for another, shape (k, 3).
+    """
+    return np.array([[1.0 if axis in one.axes else np.nan for axis in "xyz"] for one in sensors])

@@ -1,0 +1,111 @@
+"""Where the sensors of a robot are and which way they look, and when each is due."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from capture.arrays import FloatArray, IntArray, frozen
+from capture.robot import Robot, Sensor
+
+from ..physics.engine import BodyState
+from ..physics.vectors import out_of_frames
+
+
+def rotation_from_rpy(rpy: Sequence[float]) -> FloatArray:
+    """Rotation by roll, pitch and yaw about fixed axes, as URDF has it: Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        rpy: Roll, pitch, yaw [rad].
+
+    Returns:
+        Shape (3, 3), columns are the turned frame's axes.
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+class Mounts:
+    """Sensors on the links of a robot.
+
+    Attributes:
+        link: Number of the link that carries each, shape (k,).
+        position: Mount points in the links' frames [m], shape (k, 3).
+        rotation: Sensor frames in the links' frames, shape (k, 3, 3).
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], robot: Robot) -> None:
+        """Look the links up.
+
+        Args:
+            sensors: Some of the robot's.
+            robot: The robot.
+        """
+        numbers = {link.name: i for i, link in enumerate(robot.links)}
+        self.link: IntArray = frozen(np.array([numbers[one.link] for one in sensors], np.int64))
+        self.position = frozen(np.array([one.position for one in sensors]).reshape(-1, 3))
+        self.rotation = frozen(
+            np.array([rotation_from_rpy(one.rpy) for one in sensors]).reshape(-1, 3, 3)
+        )
+
+    def poses(
+        self, body: BodyState, step: IntArray, which: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Where some sensors are at some steps.
+
+        Args:
+            body: The body at all steps, a leading axis of time.
+            step: Steps, shape (p,).
+            which: Sensors, shape (p,).
+
+        Returns:
+            Mount points in the world [m], shape (3, p), and orientations of the carrying links,
+            shape (4, p).
+        """
+        link = self.link[which]
+        quaternion = body.quaternion[step, :, link].T
+        arm = out_of_frames(quaternion, self.position[which].T)
+        return body.position[step, :, link].T + arm, quaternion
+
+
+class Schedule:
+    """Sensors that each measure at a rate of their own, in whole physics steps."""
+
+    def __init__(self, period_s: float, phases_s: Sequence[float], dt: float) -> None:
+        """Start at step zero.
+
+        Args:
+            period_s: From one measurement of a sensor to its next [s], rounded to whole steps.
+            phases_s: When each sensor measures first [s], rounded likewise.
+            dt: Physics step [s].
+        """
+        self.period = max(1, round(period_s / dt))
+        self._next = np.rint(np.array(phases_s, dtype=np.float64) / dt).astype(np.int64)
+
+    def due(self, stop: int) -> tuple[IntArray, IntArray]:
+        """The measurements before a step that were not asked for yet.
+
+        Args:
+            stop: The first step that is not asked for.
+
+        Returns:
+            Steps and sensors, in order of time, each of shape (p,).
+        """
+        steps: list[IntArray] = []
+        sensors: list[IntArray] = []
+        while len(due := np.flatnonzero(self._next < stop)):
+            steps.append(self._next[due])
+            sensors.append(due)
+            self._next[due] += self.period
+        if not steps:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        step, sensor = np.concatenate(steps), np.concatenate(sensors)
+        order = np.argsort(step, kind="stable")
+        return step[order], sensor[order]
