@@ -1,11 +1,14 @@
 """An hour of the 25-joint snake, written and read: size, load time, memory, window, peers.
 
-Every figure is a ratio to a named peer on the same file, or a size, and is held against its bar.
-Times are processor time of this process, one thread each, the file in the page cache, the median
-of several runs in turn; other processes disturb the ratios less than the times.
+Every figure is a ratio to a named peer on the same file, or a size, and is held against its bar;
+the file is in the page cache, and the median of several runs in turn counts.
 
 Load: all joint, time, power and sensor columns in one pass, against decompressing each chunk of
-the file (they lie in all of them) and dropping it, with the same zstandard library.
+the file (they lie in all of them) and dropping it, with the same zstandard library. One thread
+each, and processor time, which other processes disturb less.
+
+Window and JointStates: wall-clock time with as many threads as a session has by default, as who
+asks for them waits for it; with one thread it is printed beside. The peer has one thread.
 
 Run: python bench/one_hour.py [--minutes 60] [--runs 3] [--folder DIR]
 """
@@ -19,7 +22,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +35,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from capture import Session
 from capture.console import progress
+from capture.log.read_ahead import threads_or_default
 from capture.log.signals import JointSignals
 
 Loaded = tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]
@@ -39,6 +44,7 @@ MIB = 1 << 20
 HOUR_S = 3600
 PEER_S = 30
 """Seconds of the session that the slow peer reads."""
+LATER_WINDOWS = 7
 
 AXES = ("x", "y", "z")
 
@@ -78,53 +84,73 @@ def inflate_all_s(path: Path) -> float:
     return time.process_time() - start
 
 
-def load(path: Path) -> Loaded:
+def load(path: Path, threads: int | None) -> Loaded:
     """All columns but those of the bus and of what is only looked at."""
-    with Session.open(path) as session:
+    with Session.open(path, threads=threads) as session:
         return session.columns(JOINT_TOPICS, sensor_fields(session))
 
 
 def load_frames(path: Path) -> object:
     """All raw frames."""
-    with Session.open(path) as session:
+    with Session.open(path, threads=1) as session:
         return session.frames(BUS)
 
 
-def rates(path: Path, window: tuple[int, int]) -> tuple[float, float]:
-    """Seconds a message of our reader (all of the session) and of the peer (a window of it)."""
+def wall_s(work: Callable[[], object]) -> float:
+    """Wall-clock time of a piece of work [s]; what it gives is dropped within that time."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def message_times(
+    path: Path, window: tuple[int, int], threads: Sequence[int], runs: int
+) -> tuple[list[float], float]:
+    """Seconds a message of our reader, all of the session, and of the peer, a window of it.
+
+    Args:
+        path: The session.
+        window: What the peer reads [Unix ns], half-open.
+        threads: For each reading of ours how many it has.
+        runs: How often all read, in turn.
+
+    Returns:
+        Wall-clock times [s]: ours, one a number of threads, and the peer's.
+    """
     topics = [*JOINT_TOPICS, "/joint_sample_offset", "/joint_command_offset"]  # ours needs them too
     with Session.open(path) as session:
         count = sum(session.channels[topic].count for topic in topics)
-    ours = statistics.median(cpu_s(lambda: _joints(path)) for _ in range(3)) / count
     read = 0
-    start = time.process_time()
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for _ in reader.iter_decoded_messages(
-            topics=topics, starting_at=window[0], ending_before=window[1]
-        ):
-            read += 1
-    return ours, (time.process_time() - start) / read
+
+    def ours(number: int) -> None:
+        with Session.open(path, threads=number) as session:
+            session.joint_columns(JOINT_TOPICS)
+
+    def peer() -> None:
+        nonlocal read
+        with path.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            messages = reader.iter_decoded_messages(
+                topics=topics, starting_at=window[0], ending_before=window[1]
+            )
+            read = sum(1 for _ in messages)
+
+    took = [
+        [wall_s(partial(ours, number)) for number in threads] + [wall_s(peer)] for _ in range(runs)
+    ]
+    *each, theirs = (statistics.median(times) for times in zip(*took, strict=True))
+    return [seconds / count for seconds in each], theirs / read
 
 
-def _joints(path: Path) -> object:
-    with Session.open(path) as session:
-        return session.joint_columns(JOINT_TOPICS)
-
-
-def window_ms(path: Path, start_s: int) -> tuple[float, float]:
+def window_ms(path: Path, start_s: int, threads: int) -> tuple[float, float]:
     """Ten seconds of joint states from an open session: wall-clock, first and later windows."""
     took: list[float] = []
-    with Session.open(path) as session:
-        for k in range(8):
+    with Session.open(path, threads=threads) as session:
+        for k in range(LATER_WINDOWS + 1):
             start_ns = EPOCH_NS + (start_s + 11 * k) * 10**9
-            begin = time.perf_counter()
-            session.joint_columns(
-                {"/joint_states": ["position", "velocity", "effort"]},
-                start_ns=start_ns,
-                stop_ns=start_ns + 10 * 10**9,
-            )
-            took.append((time.perf_counter() - begin) * 1e3)
+            window = {"start_ns": start_ns, "stop_ns": start_ns + 10 * 10**9}
+            fields = {"/joint_states": ["position", "velocity", "effort"]}
+            took.append(wall_s(partial(session.joint_columns, fields, **window)) * 1e3)
     return took[0], statistics.median(took[1:])
 
 
@@ -133,11 +159,11 @@ def memory(path: Path) -> dict[str, int]:
     clear = Path("/proc/self/clear_refs")
     load_some = path.with_name("warm.mcap")
     write_session(load_some, 2, can=True)
-    load(load_some)  # what is imported late is imported now
+    load(load_some, None)  # what is imported late is imported now
     load_some.unlink()
     clear.write_text("5")  # the high-water mark begins anew
     before = _status("VmRSS")
-    found = load(path)
+    found = load(path, None)
     peak = _status("VmHWM")
     arrays = sum(_sizes(found).values())
     return {"arrays": arrays, "over": peak - before - arrays - path.stat().st_size}
@@ -186,30 +212,41 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
         verdict("an hour with raw frames", path.stat().st_size * part / 1e6, 850, "MB"),
         verdict("an hour without", without.stat().st_size * part / 1e6, 550, "MB"),
     ]
-    load(path)  # memory that was never used costs more the first time, file pages too
+    load(path, 1)  # memory that was never used costs more the first time, file pages too
     inflated: list[float] = []
     loaded: list[float] = []
     frames: list[float] = []
     for _ in range(runs):
         inflated.append(inflate_all_s(path))
-        loaded.append(cpu_s(lambda: load(path)))
+        loaded.append(cpu_s(lambda: load(path, 1)))
         frames.append(cpu_s(lambda: load_frames(path)))
     reference = statistics.median(inflated)
-    print(f"      decompress each chunk and drop it: {reference:.2f} s")
+    print(f"      decompress each chunk and drop it, one thread: {reference:.2f} s")
     ratio = statistics.median(loaded) / reference
-    good.append(verdict("load joint, time, power and sensor columns", ratio, 2.0, "x that"))
-    print(f"      load the raw frames: {statistics.median(frames) / reference:.2f} x that")
+    what = "load joint, time, power and sensor columns, one thread"
+    good.append(verdict(what, ratio, 2.0, "x that"))
+    print(
+        f"      load the raw frames, one thread: {statistics.median(frames) / reference:.2f} x that"
+    )
+    threads = threads_or_default(None)
     command = [sys.executable, __file__, "--memory", str(path)]
     told = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     print(f"      arrays: {told['arrays'] / 1e6:.0f} MB")
-    good.append(verdict("beyond arrays and mapped file", told["over"] / MIB, 64, "MiB"))
-    first, later = window_ms(path, seconds // 3)
-    print(f"      first window of an open session: {first:.1f} ms")
-    good.append(verdict("ten seconds of joint states", later, 10, "ms"))
+    what = f"beyond arrays and mapped file, {threads} threads"
+    good.append(verdict(what, told["over"] / MIB, 64, "MiB"))
+    _, alone = window_ms(path, seconds // 3, 1)
+    first, later = window_ms(path, seconds // 3, threads)
+    print(f"      first window of an open session: {first:.1f} ms; later, 1 thread: {alone:.1f} ms")
+    good.append(verdict(f"ten seconds of joint states, {threads} threads", later, 10, "ms"))
     middle = EPOCH_NS + seconds // 2 * 10**9
-    ours, peer = rates(path, (middle, middle + min(PEER_S, seconds // 2) * 10**9))
-    print(f"      JointState: ours {ours * 1e6:.2f} us a message, peer {peer * 1e6:.1f} us")
-    good.append(verdict("mcap + mcap-ros2-support", peer / ours, 50, "x our time", most=False))
+    part = middle, middle + min(PEER_S, seconds // 2) * 10**9
+    (one, ours), peer = message_times(path, part, (1, threads), runs)
+    print(
+        f"      JointState: ours {ours * 1e6:.2f} us a message, 1 thread {one * 1e6:.2f} us "
+        f"({peer / one:.0f} times as fast as the peer), peer {peer * 1e6:.1f} us"
+    )
+    what = f"mcap + mcap-ros2-support, ours with {threads} threads"
+    good.append(verdict(what, peer / ours, 50, "x our time", most=False))
     return all(good)
 
 
