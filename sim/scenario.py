@@ -13,6 +13,8 @@ from typing import Any
 from capture.errors import UsageError
 from capture.robot import Robot
 
+from .control.parameters import Controller
+from .control.toml import controller_table
 from .gait import GaitParameters
 from .gait.toml import gait_table
 from .modules import Modules
@@ -51,6 +53,7 @@ class Scenario:
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
         engine: Who solves the body's dynamics.
         faults: What goes wrong on its bus, where it is served on one.
+        controller: What changes the gait by what the sensors say; None: nothing does.
     """
 
     name: str
@@ -69,6 +72,7 @@ class Scenario:
     physics_rate_hz: int = 1000
     engine: EngineKind = EngineKind.BULLET
     faults: tuple[BusFault, ...] = ()
+    controller: Controller | None = None
 
     @property
     def epoch_ns(self) -> int:
@@ -136,6 +140,8 @@ class Scenario:
             "sensing": dataclasses.asdict(self.sensing),
             **self.modules.tables(),
         }
+        if self.controller is not None:
+            values["controller"] = controller_table(self.controller)
         if self.faults:
             values["faults"] = [fault.as_table() for fault in self.faults]
         return toml_text(values)

@@ -86,11 +86,12 @@ from pathlib import Path
 from typing import Any
 
 from capture.errors import Fault, ScenarioError
-from capture.robot import Robot
+from capture.robot import Plane, Robot
 from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed
 
+from .control.toml import read_controller
 from .gait.toml import read_gait
 from .modules import read_modules
 from .physics.engine import EngineKind
@@ -167,6 +168,13 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         or Scenario.engine,
         **_times(top),
     }
+    if "controller" in top:
+        parts["controller"] = read_controller(
+            top.table("controller"),
+            robot,
+            horizontal=Plane.HORIZONTAL in parts["gait"].planes,
+            target=parts["world"].target is not None,
+        )
     top.close()
     if (found := faults.all()) or robot is None:
         raise ScenarioError(source, found)

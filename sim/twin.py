@@ -16,7 +16,8 @@ import numpy as np
 from capture.arrays import FloatArray
 from capture.errors import SimulationError
 
-from .gait import Gait, GaitTick, generator
+from .control.build import build_gait
+from .gait import Gait, GaitTick
 from .physics.ledger import Ledger
 from .physics.plant import Plant
 from .physics.steps import Step, Steps
@@ -76,7 +77,7 @@ class Twin:
         """
         robot, world = scenario.robot, scenario.world
         self.scenario = scenario
-        self.gait: Gait = gait or generator(scenario.gait, robot)
+        self.gait: Gait = gait or build_gait(scenario)
         self.sensed: list[SensorSample] = []
         self._sensing = Senses(scenario)
         self._plant = Plant(scenario)

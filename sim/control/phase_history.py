@@ -63,43 +63,63 @@ class PhaseHistory:
             back[:, k] = np.interp(at, self._phases, values[:, k])
         return back
 
+    def least(self) -> FloatArray:
+        """The least value of each entry within the span.
 
-class PeriodHeading:
-    """Mean heading over one gait period: what is left when the undulation is taken out."""
+        Returns:
+            Minima, shape (k,).
+        """
+        first = bisect_left(self._phases, self._phases[-1] - self._span)
+        return np.array(self._values[first:], dtype=np.float64).min(axis=0)
 
-    def __init__(self) -> None:
-        """Start with nothing."""
-        self._integral = PhaseHistory(TURN)
-        self._start: float | None = None
-        self._last = (0.0, np.zeros(2))
-        self._sum = np.zeros(2)
 
-    def step(self, phase: float, heading: float) -> float:
+class PathHeading:
+    """Which way the path goes: the heading with the undulation taken out, brought up to date.
+
+    The mean over one gait period has no undulation, but it is half a period old. What the head has
+    turned since is known from its own offset, d psi / d Phi = -c Y in a steady bend, so that
+
+        h(Phi) = mean(psi) - c / 2 pi * integral of Y(Phi') (Phi' - Phi + 2 pi) d Phi'
+
+    over the last period, Phi - 2 pi <= Phi' <= Phi.
+    """
+
+    def __init__(self, turn_gain: float) -> None:
+        """Start with nothing.
+
+        Args:
+            turn_gain: c, how much the path turns for each radian of offset and of phase.
+        """
+        self._turn_gain = turn_gain
+        self._rows: list[tuple[float, float, float]] = []
+
+    def step(self, phase: float, heading: float, offset: float) -> float:
         """Take in a heading.
 
         Args:
-            phase: The gait's phase [rad], never less than in the call before.
-            heading: What the compass says [rad], any turn; NaN is left out.
+            phase: The gait's phase Phi [rad], never less than in the call before.
+            heading: psi, as a compass gives it [rad], any turn; NaN is left out.
+            offset: Y of the head from here on [rad].
 
         Returns:
-            Circular mean over the last period, over what there is before the first has passed;
-            NaN before the first heading.
+            h [rad], on the turn that continues the one before; until a period has passed it is
+            taken over what there is; NaN before the first heading.
         """
-        vector = np.array([math.cos(heading), math.sin(heading)])
         if math.isfinite(heading):
-            if self._start is None:
-                self._start, self._last = phase, (phase, vector)
-            before, last = self._last
-            self._sum = self._sum + 0.5 * (phase - before) * (vector + last)
-            self._last = phase, vector
-            self._integral.add(phase, self._sum)
-        elif self._start is None:
+            if self._rows:
+                last = self._rows[-1][1]
+                heading = last + math.remainder(heading - last, TURN)
+            self._rows.append((phase, heading, offset))
+            old = bisect_left(self._rows, phase - TURN, key=lambda row: row[0])
+            del self._rows[:old]
+        if not self._rows:
             return math.nan
-        covered = min(self._last[0] - self._start, TURN)
-        if covered <= 0.0:
-            return math.atan2(self._last[1][1], self._last[1][0])
-        x, y = self._sum - self._integral.back(np.array([covered]))[0]
-        return math.atan2(y, x)
+        at, psi, bent = np.array(self._rows).T
+        span = at[-1] - at[0]
+        if span <= 0.0:
+            return float(psi[-1])
+        turned = self._turn_gain * np.trapezoid(bent * (at - at[0]), at)
+        return float((np.trapezoid(psi, at) - turned) / span)
 
 
 class BodyWave:

@@ -12,7 +12,8 @@ from capture.errors import DataError, PlanError, UsageError
 from capture.robot import Plane, Robot
 from capture.shipped import Shelf
 
-from ..gait import Gait, generator
+from ..control.build import build_gait
+from ..gait import Gait
 from ..scenario import Scenario
 from ..scenario_file import load_scenario, parse_scenario
 from .command_session import CommandReplay, RecordedCommands
@@ -105,7 +106,7 @@ def find_driven(word: str, world: Scenario | None = None) -> Driven:
 
 def _gait(scenario: Scenario) -> Driven:
     def make(robot: Robot) -> Gait:
-        return generator(scenario.gait, robot)
+        return build_gait(dataclasses.replace(scenario, robot=robot))
 
     return Driven(
         kind="gait",

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sim.control.filters import LowPass, NearMemory, SideLatch
 from sim.control.laws import amplitude, bend, frequency
-from sim.control.phase_history import TURN, BodyWave, PeriodHeading, PhaseHistory
+from sim.control.phase_history import TURN, BodyWave, PathHeading, PhaseHistory
 
 DISTANCES = np.linspace(0.0, 3.0, 31)
 
@@ -111,30 +111,49 @@ def test_phase_history_gives_back_a_linear_function_exactly(steps, back):
     np.testing.assert_allclose(got, [2.0 * at - 1.0, -at], rtol=1e-9, atol=1e-9)
 
 
-def test_period_heading_takes_the_undulation_out_across_the_cut_at_pi():
-    """The circular mean of pi + 0.6 sin(phase) over a period is pi, whatever omega does."""
-    mean, phase, got = PeriodHeading(), 0.0, []
-    for tick in range(1200):
-        omega = math.pi if tick < 600 else 1.3 * math.pi
-        phase += 0.01 * omega
-        heading = math.pi + 0.6 * math.sin(phase)
-        got.append(mean.step(phase, math.remainder(heading, TURN)))
-    error = np.abs([math.remainder(h - math.pi, TURN) for h in got])
-    assert error[200:].max() < 1e-3
-    assert error[:200].max() > 0.1  # not yet a period
+def swing(turn_rate, periods=6, gain=1.6):
+    """Headings of a head that swings by 0.6 rad while its path turns, and what is made of them."""
+    path, rows = PathHeading(gain), []
+    for phase in np.arange(0.0, periods * TURN, 0.03):
+        bent = 0.0 if phase < 2 * TURN else -turn_rate / gain
+        way = math.pi + turn_rate * max(phase - 2 * TURN, 0.0)
+        told = math.remainder(way + 0.6 * math.sin(phase), TURN)
+        rows.append((phase, way, path.step(phase, told, bent)))
+    return np.array(rows).T
 
 
-def test_period_heading_of_a_steady_turn_is_half_a_period_old():
-    mean = PeriodHeading()
-    got = [mean.step(0.05 * k, 0.1 * 0.05 * k) for k in range(400)][-1]
-    assert got == pytest.approx(0.1 * (0.05 * 399 - math.pi), abs=1e-3)
+@pytest.mark.parametrize("turn_rate", [0.0, 0.2, -0.3])
+def test_path_heading_has_neither_the_swing_nor_half_a_period_of_delay(turn_rate):
+    """Across the cut at pi, and while a turn begins: without the model it would be pi c Y late."""
+    phase, way, told = swing(turn_rate)
+    error = np.abs([math.remainder(e, TURN) for e in told - way])
+    assert error[phase > TURN].max() < 0.005  # the trapezoidal rule, and a sample more or less
+    assert error[phase < TURN].max() > 0.1  # not yet a period
 
 
-def test_period_heading_waits_for_the_compass_and_outlasts_it():
-    mean = PeriodHeading()
-    assert math.isnan(mean.step(0.0, math.nan))
-    assert mean.step(0.1, 0.7) == pytest.approx(0.7)
-    assert mean.step(0.2, math.nan) == pytest.approx(0.7)
+def test_path_heading_goes_on_over_a_full_turn():
+    phase, way, told = swing(0.3, periods=12)
+    assert way[-1] - way[0] > 2 * TURN
+    steps = np.diff(told[phase > TURN])
+    assert np.abs(steps).max() < 0.05
+
+
+def test_path_heading_waits_for_a_heading_and_outlasts_it():
+    path = PathHeading(1.6)
+    assert math.isnan(path.step(0.0, math.nan, 0.0))
+    assert path.step(0.1, 0.7, 0.0) == pytest.approx(0.7)
+    assert path.step(0.2, math.nan, 0.0) == pytest.approx(0.7)
+
+
+@given(st.lists(st.floats(0.05, 0.5), min_size=2, max_size=60), st.floats(0.5, 3.0))
+def test_least_is_the_least_within_the_span(steps, span):
+    history, random = PhaseHistory(span), np.random.default_rng(1)
+    phases = np.cumsum(steps)
+    values = random.uniform(0, 1, (len(phases), 3))
+    for phase, value in zip(phases, values, strict=True):
+        history.add(phase, value)
+    recent = phases >= phases[-1] - span
+    np.testing.assert_array_equal(history.least(), values[recent].min(axis=0))
 
 
 def test_the_body_bends_where_the_head_did_also_when_omega_changes():

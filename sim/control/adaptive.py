@@ -1,0 +1,127 @@
+"""A gait under a controller: the generator's wave, changed by what the robot's sensors say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.robot import Plane, Robot
+
+from ..gait import WALK, GaitTick, Generator, Modulation
+from ..readings import Readings
+from .course import Course
+from .distances import Distances
+from .layout import layout
+from .lookout import Lookout
+from .moment import Moment
+from .parameters import Controller
+from .phase_history import BodyWave
+from .reactions import Haste, Shrinking, Steering
+from .reckoning import Reckoning
+
+AVOID, HASTEN, SHRINK, TURN = "avoid", "hasten", "shrink", "turn"
+_MODE_HOLD_S = 0.5
+_TURNING = 0.05
+"""Offsets of the head above this are turns [rad]."""
+
+
+class AdaptiveGait:
+    """Wraps a generator; steers, shrinks and hastens it once a tick, before it goes on.
+
+    Modes, the first that applies: ``avoid`` an obstacle ahead, ``hasten`` since one is near the
+    tail, ``shrink`` beside a wall, ``turn`` to the course, ``walk``. A mode lasts 0.5 s at least,
+    so that the log's changes of mode are few.
+    """
+
+    def __init__(
+        self, generator: Generator, controller: Controller, course: Course, robot: Robot
+    ) -> None:
+        """Wrap a generator that has not been stepped yet.
+
+        Args:
+            generator: Makes the wave; it must drive the horizontal plane.
+            controller: What to react to, and how.
+            course: Where to go.
+            robot: The robot.
+        """
+        roles = layout(robot)
+        self._generator = generator
+        self._robot = robot
+        self._course = course
+        self._distances = Distances(roles.fold_m, controller.near_hold_s)
+        self._reckoning = Reckoning(controller.calibration, robot)
+        self._lookout = Lookout(controller.lookout, roles, robot)
+        self._steering = Steering(controller.head)
+        self._shrinking = Shrinking(controller.side, roles, robot) if controller.side else None
+        self._haste = Haste(controller.tail, roles) if controller.tail else None
+        parts = (self._steering, self._shrinking, self._haste, course)
+        self._parts = [part for part in parts if part is not None]
+        self._horizontal = robot.joint_indices(Plane.HORIZONTAL)
+        self._phase_at = generator.names.index(f"{Plane.HORIZONTAL}.phase")
+        self._lag_at = generator.names.index(f"{Plane.HORIZONTAL}.lag")
+        self._wave: BodyWave | None = None
+        self._phase = 0.0
+        self._time_s = 0.0
+        self._mode = WALK
+        self._mode_since_s = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values: the generator's, then what the controller meant."""
+        own = (name for part in self._parts for name in part.names)
+        return (*self._generator.names, *own)
+
+    def step(self, time_s: float, readings: Readings) -> GaitTick:
+        """React to what the sensors say, and go on.
+
+        Args:
+            time_s: Time since the start [s], never less than in the call before.
+            readings: What the robot has told by then.
+
+        Returns:
+            Commands and values.
+        """
+        if self._wave is None:  # the first tick tells phase and lag; from the next on it reacts
+            tick = self._generator.step(time_s, readings)
+            lag = float(tick.values[self._lag_at])
+            self._wave = BodyWave(len(self._horizontal), lag)
+            return self._told(tick, time_s)
+        elapsed_s, phase = time_s - self._time_s, self._phase
+        pose = self._reckoning.step(elapsed_s, phase, self._steering.offset, readings)
+        now = Moment(time_s, elapsed_s, phase, pose, readings)
+        self._distances.step(time_s, readings.ranges)
+        head = self._steering.step(now, self._lookout.step(now), self._course.step(now))
+        unchanged = Modulation.none(len(self._robot.joints))
+        offset = unchanged.offset.copy()
+        offset[self._horizontal] = self._wave.step(now.phase, head)
+        change = Modulation(
+            amplitude_factor=self._shrinking.step(now, self._distances)
+            if self._shrinking is not None
+            else unchanged.amplitude_factor,
+            offset=offset,
+            frequency_factor=self._haste.step(now, self._distances)
+            if self._haste is not None
+            else unchanged.frequency_factor,
+        )
+        self._generator.modulate(change)
+        return self._told(self._generator.step(time_s, readings), time_s)
+
+    def _told(self, tick: GaitTick, time_s: float) -> GaitTick:
+        """The generator's tick, with what the controller meant."""
+        self._phase, self._time_s = float(tick.values[self._phase_at]), time_s
+        values = np.concatenate((tick.values, *(part.values for part in self._parts)))
+        return GaitTick(tick.command, values, self._choose_mode(time_s), tick.clamped)
+
+    def _choose_mode(self, time_s: float) -> str:
+        """One word for the tick, at least for a while."""
+        wanted = WALK
+        if self._steering.avoiding:
+            wanted = AVOID
+        elif self._haste is not None and self._haste.hastening:
+            wanted = HASTEN
+        elif self._shrinking is not None and self._shrinking.shrinking:
+            wanted = SHRINK
+        elif abs(self._steering.values[0]) > _TURNING:
+            wanted = TURN
+        if wanted != self._mode and time_s - self._mode_since_s >= _MODE_HOLD_S:
+            self._mode, self._mode_since_s = wanted, time_s
+        return self._mode

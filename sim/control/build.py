@@ -1,0 +1,47 @@
+"""From a scenario to its gait: the generator alone, or under the scenario's controller."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..gait import Gait, generator
+from .adaptive import AdaptiveGait
+from .course import Course, RandomCourse, StraightOn, TargetCourse
+from .parameters import RandomTurns, TargetHeading
+from .reckoning import turned
+
+if TYPE_CHECKING:
+    from ..scenario import Scenario
+
+
+def build_gait(scenario: Scenario) -> Gait:
+    """The gait that a scenario asks for, on the twin or on a bus.
+
+    Args:
+        scenario: Gait, controller and robot; of its world and its sensors only what the robot is
+            told beforehand: where the target lies from its start, and which way north is there.
+
+    Returns:
+        The gait, at time zero.
+    """
+    robot, controller = scenario.robot, scenario.controller
+    if controller is None:
+        return generator(scenario.gait, robot)
+    apart = controller.side is not None
+    wave = generator(scenario.gait, robot, per_joint=apart)
+    return AdaptiveGait(wave, controller, _course(scenario), robot)
+
+
+def _course(scenario: Scenario) -> Course:
+    controller, target = scenario.controller, scenario.world.target
+    course = controller.course if controller is not None else None
+    if isinstance(course, RandomTurns):
+        return RandomCourse(course, scenario.seed)
+    if controller is not None and isinstance(course, TargetHeading) and target is not None:
+        north = scenario.sensing.compass.north
+        x, y = turned(np.array(target.position), -north).tolist()
+        radius_m = controller.calibration.turn_radius_m
+        return TargetCourse(course, (x, y), radius_m, scenario.robot)
+    return StraightOn()

@@ -1,0 +1,92 @@
+"""What is in the way, from the echoes of one sweep of the head.
+
+The head of a snake that undulates swings by half a radian and more, so most of the time its
+sensors look past what is in the way. What each of them saw during the last gait period is kept,
+as a point on the ground, while the robot moves on.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.robot import Robot
+
+from .layout import Layout, bearing
+from .moment import Moment
+from .parameters import Lookout as Parameters
+from .reckoning import turned
+
+
+class InTheWay(NamedTuple):
+    """Obstacles ahead.
+
+    Attributes:
+        nearest: The nearest one in the robot's way [m]; +inf where there is none.
+        left: The nearest one left of the middle of the way [m], likewise.
+        right: Right of it [m], likewise.
+    """
+
+    nearest: float
+    left: float
+    right: float
+
+
+class Lookout:
+    """Keeps echoes while the robot moves on."""
+
+    def __init__(self, parameters: Parameters, layout: Layout, robot: Robot) -> None:
+        """Start with nothing seen.
+
+        Args:
+            parameters: How wide the way is, and how long echoes are kept.
+            layout: Who looks where.
+            robot: The robot.
+        """
+        self._parameters = parameters
+        self._mounts = [
+            (s.name, np.array(s.position[:2]), bearing(s))
+            for s in robot.sensors
+            if s.name in layout.head
+        ]
+        self._last: dict[str, float] = {}
+        self._seen: list[tuple[float, FloatArray]] = []
+
+    def step(self, now: Moment) -> InTheWay:
+        """Look, and forget what is old.
+
+        Args:
+            now: The tick.
+
+        Returns:
+            What is in the way: echoes within 45 degrees of it and not beside it.
+        """
+        self._look(now)
+        kept_s = now.time_s - self._parameters.memory_s
+        self._seen = [(time_s, point) for time_s, point in self._seen if time_s > kept_s]
+        points = np.array([point for _, point in self._seen]).reshape(-1, 2) - now.pose.place
+        ahead, left = turned(points.T, -now.pose.way)
+        beside = np.abs(left)
+        chosen = (ahead > beside) & (beside < self._parameters.half_width_m)
+        distance, left = np.hypot(ahead, left)[chosen], left[chosen]
+        return InTheWay(
+            nearest=float(distance.min(initial=math.inf)),
+            left=float(distance[left > 0.0].min(initial=math.inf)),
+            right=float(distance[left <= 0.0].min(initial=math.inf)),
+        )
+
+    def _look(self, now: Moment) -> None:
+        """Add the echoes that are new."""
+        pose = now.pose
+        for name, mount, angle in self._mounts:
+            read = now.readings.ranges.get(name, math.nan)
+            if read == self._last.get(name):
+                continue  # the sensor has not measured anew
+            self._last[name] = read
+            if math.isfinite(read):
+                ray = np.array([math.cos(angle), math.sin(angle)])
+                point = pose.place + turned(mount + read * ray, pose.heading)
+                self._seen.append((now.time_s, point))
