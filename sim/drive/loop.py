@@ -127,6 +127,7 @@ def control(
     last = round(duration_s * CONTROL_RATE_HZ)
     while not gait.at_rest:
         tick, received = pace.next()
+        tick = min(tick, last)  # where ticks are left out, the last one may be among them
         time_s = tick / CONTROL_RATE_HZ
         for frames in received:
             known.add(frames, time_s)
