@@ -1,60 +1,67 @@
 """Is the physics step short enough for the stiff parts of a scenario?
 
-Each part is taken alone, as a spring or damper between two free masses stepped by the
-semi-implicit Euler rule, which is stable for omega dt < 2 (spring) and c dt / m < 2 (damper). The
-coupled robot has other bounds, so this ranks suspects; it proves nothing. Too small a smoothing of
-Coulomb friction does not blow up, since that is bounded: it makes the robot tremble.
+The straight robot, at rest on level ground, is a linear system M z'' + C z' + K z = 0 of springs
+and dampers: gears, motors, ground. Its motions in the horizontal plane (sideways, yaw, roll) and in
+the vertical one (along, up, pitch) are independent. Stepped by the semi-implicit Euler rule, a
+motion loses its stability when it turns its sign at every step, z -> -z; put into the rule, that is
+
+    (2 dt C + dt^2 K) v = 4 s M v   with s = 1.
+
+So the largest s is the share of the stability range that is used, exactly so for this linear
+system. A bent robot is stiffer. The servos' control loops are left out: they are slow.
+
+Coulomb's frictions are dampers while they are smooth, but they are bounded: too small a smoothing
+makes the robot tremble, and does not blow it up.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.robot import Plane, Robot
+
+from .physics.servo import COULOMB_SPEED, Servos
 from .scenario import Scenario
 from .world import FrictionLaw
 
+_BOUNDED = ("world.ground.slip_speed", "servo.coulomb_friction")
+_ACROSS, _TURN, _OTHER, _BASE = range(4)
+"""The base has three coordinates: its shift across the body, its turn, and, as the third, its roll
+(horizontal plane) or its shift along the body (vertical plane)."""
 
-def stability_numbers(scenario: Scenario) -> dict[str, float]:
-    """How much of its stability range each stiff part uses, alone.
+
+class Use(NamedTuple):
+    """How the motion of one plane that is closest to its bound uses its stability range.
+
+    Attributes:
+        share: Used of the range: beyond 1 the motion is unstable.
+        parts: What each parameter adds to that.
+    """
+
+    share: float
+    parts: dict[str, float]
+
+    @property
+    def stiffest(self) -> str:
+        """The parameter that adds most."""
+        return max(self.parts, key=self.parts.__getitem__)
+
+
+def stability(scenario: Scenario, *, friction: bool = True) -> dict[Plane, Use]:
+    """How much of their stability range the motions of the straight robot use.
 
     Args:
         scenario: The scenario.
+        friction: Count Coulomb's frictions, whose forces are bounded.
 
     Returns:
-        Name of the parameter to the share used: above about 1 the part is unstable.
+        The motion closest to its bound, by plane.
     """
-    dt = 1.0 / scenario.physics_rate_hz
-    robot, ground = scenario.robot, scenario.world.ground
-    shares: dict[str, float] = {}
-    if ground is not None:
-        mass = min(link.mass for link in robot.links)
-        # A sideways force at the contact point, r below the centre, also rolls the link.
-        roll = max(1 + part.mass * part.radius**2 / part.inertia[0] for part in robot.links)
-        shares["world.ground.stiffness"] = ground.stiffness * dt**2 / mass / 4
-        shares["world.ground.damping"] = ground.damping * dt / mass / 2
-        if ground.law is FrictionLaw.VISCOUS:
-            for name in ("drag_tangential", "drag_normal"):
-                shares[f"world.ground.{name}"] = getattr(ground, name) * roll * dt / mass / 2
-        else:
-            mu = max(ground.mu_normal, ground.mu_tangential)
-            g = math.hypot(*scenario.world.gravity)
-            shares["world.ground.slip_speed"] = mu * g * roll * dt / ground.slip_speed / 2
-    # Links turn about a joint with the inertia about their ends.
-    link = min(min(part.inertia) + part.mass * part.length**2 / 4 for part in robot.links)
-    for joint in robot.joints:
-        servo = joint.servo
-        compliance = 1 / servo.rotor_inertia + 2 / link
-        springs = servo.gear_stiffness * dt**2 * compliance / 4
-        dampers = servo.gear_damping * dt * compliance / 2
-        motor = servo.viscous_friction + servo.torque_constant**2 / servo.resistance_ohm
-        own = {
-            "gear_stiffness": springs,
-            "gear_damping": dampers,
-            "rotor_inertia": motor * dt / servo.rotor_inertia / 2,
-        }
-        for name, share in own.items():
-            shares[f"servo.{name}"] = max(share, shares.get(f"servo.{name}", 0.0))
-    return shares
+    return {plane: _use(scenario, plane, friction=friction) for plane in Plane}
 
 
 def warnings(scenario: Scenario) -> tuple[str, ...]:
@@ -64,12 +71,12 @@ def warnings(scenario: Scenario) -> tuple[str, ...]:
         scenario: The scenario.
 
     Returns:
-        One sentence for each parameter beyond its stability range.
+        One sentence for each plane whose motion is unstable.
     """
     return tuple(
-        f"{_verdict(name, share, scenario)}: expect vibration or failure"
-        for name, share in stability_numbers(scenario).items()
-        if share > 1.0
+        f"{_verdict(use, scenario)}: expect vibration or failure"
+        for use in stability(scenario).values()
+        if use.share > 1.0
     )
 
 
@@ -82,14 +89,117 @@ def likely_cause(scenario: Scenario) -> str:
     Returns:
         A clause for an error message.
     """
-    shares = stability_numbers(scenario)
-    shares.pop("world.ground.slip_speed", None)  # Coulomb friction is bounded
-    name, share = max(shares.items(), key=lambda item: item[1])
-    if share < 0.5:
+    use = max(stability(scenario, friction=False).values(), key=lambda use: use.share)
+    if use.share < 0.5:
         return "no parameter is too stiff for the step: look at the gait and the start"
-    return f"likely cause: {_verdict(name, share, scenario)}; soften it or raise physics_rate_hz"
+    return f"likely cause: {_verdict(use, scenario)}; soften it or raise physics_rate_hz"
 
 
-def _verdict(name: str, share: float, scenario: Scenario) -> str:
+def _verdict(use: Use, scenario: Scenario) -> str:
     step_ms = 1e3 / scenario.physics_rate_hz
-    return f"{name} is too stiff for steps of {step_ms:g} ms ({share:.2g} of its stability range)"
+    return (
+        f"{use.stiffest} is too stiff for steps of {step_ms:g} ms "
+        f"({use.share:.2g} of the stability range)"
+    )
+
+
+def _use(scenario: Scenario, plane: Plane, *, friction: bool) -> Use:
+    robot = scenario.robot
+    servos = Servos([joint.servo for joint in robot.joints if joint.plane is plane])
+    shift, turn = _chain(robot, plane)
+    parts = {
+        part.name: part.rows.T @ (part.strength[:, np.newaxis] * part.rows) / 4
+        for part in (*_servo_parts(scenario, servos), *_ground_parts(scenario, plane, shift, turn))
+        if friction or part.name not in _BOUNDED
+    }
+    mass = _mass(robot, plane, servos, shift, turn)
+    total = np.sum([*parts.values(), 0.0 * mass], axis=0)
+    root = np.linalg.inv(np.linalg.cholesky(mass))
+    shares, motions = np.linalg.eigh(root @ total @ root.T)
+    worst = root.T @ motions[:, -1]  # worst' M worst = 1
+    return Use(
+        float(shares[-1]), {name: float(worst @ part @ worst) for name, part in parts.items()}
+    )
+
+
+def _chain(robot: Robot, plane: Plane) -> tuple[FloatArray, FloatArray]:
+    """Small motions of the links across the straight body, by coordinate.
+
+    The coordinates are those of the base, then the joints of the plane, then their rotors.
+
+    Returns:
+        Shift of the centres [m] and turn [rad] a unit of each coordinate, each of shape (n, d).
+    """
+    joints = robot.joint_indices(plane)
+    half = np.array([[link.length / 2] for link in robot.links])
+    turn = np.zeros((len(half), _BASE + 2 * len(joints)))
+    turn[:, _TURN] = 1.0
+    for k, j in enumerate(joints, _BASE):
+        turn[j + 1 :, k] = 1.0
+    shift = np.zeros_like(turn)
+    shift[:, _ACROSS] = 1.0
+    shift[1:] -= np.cumsum(half[:-1] * turn[:-1] + half[1:] * turn[1:], axis=0)
+    return shift, turn
+
+
+def _mass(
+    robot: Robot, plane: Plane, servos: Servos, shift: FloatArray, turn: FloatArray
+) -> FloatArray:
+    mass = np.array([[link.mass] for link in robot.links])
+    roll, pitch, yaw = np.array([link.inertia for link in robot.links]).T[:, :, np.newaxis]
+    flat = plane is Plane.HORIZONTAL
+    matrix = shift.T @ (mass * shift) + turn.T @ ((yaw if flat else pitch) * turn)
+    matrix[_OTHER, _OTHER] = (roll if flat else mass).sum()
+    rotors = np.arange(len(matrix) - len(servos.inertia), len(matrix))
+    matrix[rotors, rotors] = servos.inertia
+    return matrix
+
+
+class _Part(NamedTuple):
+    """Springs or dampers of one kind: 2 dt c or dt^2 k of each, and what stretches it."""
+
+    name: str
+    strength: FloatArray  # shape (k,)
+    rows: FloatArray  # shape (k, d)
+
+
+def _servo_parts(scenario: Scenario, servos: Servos) -> Iterator[_Part]:
+    dt, m = 1.0 / scenario.physics_rate_hz, len(servos.inertia)
+    rotor = np.eye(m, _BASE + 2 * m, _BASE + m)
+    twist = rotor - np.eye(m, _BASE + 2 * m, _BASE)
+    yield _Part("servo.gear_stiffness", dt**2 * servos.gear_stiffness, twist)
+    yield _Part("servo.gear_damping", 2 * dt * servos.gear_damping, twist)
+    motor = servos.viscous + servos.torque_constant**2 / servos.resistance
+    yield _Part("servo.rotor_inertia", 2 * dt * motor, rotor)
+    yield _Part("servo.coulomb_friction", 2 * dt * servos.coulomb / COULOMB_SPEED, rotor)
+
+
+def _ground_parts(
+    scenario: Scenario, plane: Plane, shift: FloatArray, turn: FloatArray
+) -> Iterator[_Part]:
+    dt, robot, ground = 1.0 / scenario.physics_rate_hz, scenario.robot, scenario.world.ground
+    if ground is None:
+        return
+    one = np.ones(len(robot.links))
+    # The contact points lie r below the centres: roll and pitch move them too.
+    radius = np.array([[link.radius] for link in robot.links])
+    slip, other = (
+        (shift, radius) if plane is Plane.HORIZONTAL else (radius * turn, one[:, np.newaxis])
+    )
+    slip = slip.copy()
+    slip[:, [_OTHER]] = other
+    if plane is Plane.HORIZONTAL:
+        mu, drag, name = ground.mu_normal, ground.drag_normal, "world.ground.drag_normal"
+    else:
+        mu, drag, name = (
+            ground.mu_tangential,
+            ground.drag_tangential,
+            "world.ground.drag_tangential",
+        )
+        yield _Part("world.ground.stiffness", dt**2 * ground.stiffness * one, shift)
+        yield _Part("world.ground.damping", 2 * dt * ground.damping * one, shift)
+    if ground.law is FrictionLaw.VISCOUS:
+        yield _Part(name, 2 * dt * drag * one, slip)
+    else:
+        load = np.array([link.mass for link in robot.links]) * max(-scenario.world.gravity[2], 0.0)
+        yield _Part("world.ground.slip_speed", 2 * dt * mu * load / ground.slip_speed, slip)

@@ -1,0 +1,114 @@
+"""The bound on the physics step, against what the twin then does."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from capture.errors import SimulationError
+from capture.robot import Plane
+from sim import FrictionLaw, Ground, PlaneGait, Serpentine, World, load_scenario, scenario_names
+from sim.stability import likely_cause, stability, warnings
+from sim.twin import Twin
+
+IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
+
+
+def restless(scenario):
+    """Fastest joint or link in the last tenth of a run; infinite where the run fails."""
+    try:
+        with Twin(scenario) as twin:
+            last = list(twin.samples())[-round(10 * scenario.duration_s) :]
+    except SimulationError:
+        return np.inf
+    bodies = [sample.step.body for sample in last]
+    return float(max(np.abs(np.concatenate((b.rate, *b.velocity))).max() for b in bodies))
+
+
+@pytest.fixture
+def nudged(make_scenario, make_robot):
+    """A robot that is told to bend each joint a little, each in its own way, and to stay so."""
+
+    def build(links, *, planar=True, rate_hz=1000, world=None, plane=Plane.HORIZONTAL, **servo):
+        # Weak and without Coulomb friction: the servos neither hold the motion nor drive it.
+        servo = {"coulomb_friction": 0.0, "stall_torque": 1e-2} | servo
+        wave = PlaneGait(amplitude=1e-4, frequency_hz=0.01, lag=1.0)
+        return make_scenario(
+            make_robot(links, planar=planar, **servo),
+            gait=Serpentine({plane: wave}, 0.0),
+            world=world or IN_SPACE,
+            physics_rate_hz=rate_hz,
+            duration_s=1.0,
+        )
+
+    return build
+
+
+def largest(scenario):
+    return max(use.share for use in stability(scenario).values())
+
+
+@pytest.mark.parametrize("links", [2, 3, 7])
+@pytest.mark.parametrize("planar", [True, False], ids=["planar", "alternating"])
+def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
+    # k_g and c_g in proportion, and the motor's damping small: so is the share.
+    one = largest(nudged(links, planar=planar))
+
+    def scaled(share):
+        gear = {"gear_stiffness": 40.0 * share / one, "gear_damping": 0.05 * share / one}
+        return nudged(links, planar=planar, **gear)
+
+    assert largest(scaled(0.97)) == pytest.approx(0.97, abs=1e-3)
+    assert restless(scaled(0.97)) < 1e-3
+    assert not restless(scaled(1.03)) < 1.0
+    assert likely_cause(scaled(1.03)).startswith("likely cause: servo.gear_damping is too stiff")
+
+
+@pytest.mark.parametrize("links", [2, 5])
+@pytest.mark.parametrize(
+    ("ground", "name"),
+    [
+        (Ground(stiffness=4e5, damping=0.0, mu_normal=0.0, mu_tangential=0.0), "stiffness"),
+        (Ground(damping=200.0, mu_normal=0.0, mu_tangential=0.0), "damping"),
+        (Ground(law=FrictionLaw.VISCOUS, drag_normal=75.0), "drag_normal"),
+        (Ground(law=FrictionLaw.VISCOUS, drag_tangential=100.0), "drag_tangential"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name, links):
+    # Thrown flat on the ground with a little speed all ways.
+    def scaled(share, one=1.0):
+        field = {name: getattr(ground, name) * share / one}
+        world = World(velocity=(1e-4, 1e-4, -1e-4), ground=dataclasses.replace(ground, **field))
+        gear = {"gear_stiffness": 1.0, "gear_damping": 1e-4}
+        return nudged(links, planar=False, world=world, **gear)
+
+    one = largest(scaled(1.0))
+    calm, wild = scaled(0.95, one), scaled(1.05, one)
+    assert largest(calm) == pytest.approx(0.95, abs=0.01)
+    assert restless(calm) < 1e-3
+    assert not restless(wild) < 3e-3  # not much where the links leave the ground
+    assert any(text.startswith(f"world.ground.{name} is too stiff") for text in warnings(wild))
+
+
+@pytest.mark.parametrize(
+    ("links", "planar", "rate_hz", "stable"),
+    [
+        (2, True, 1000, False),
+        (2, True, 2000, True),
+        (4, False, 1000, False),
+        (4, False, 2000, True),
+        (4, True, 2000, True),
+        (5, True, 2000, False),
+    ],
+)
+def test_the_default_robot_on_the_default_ground(nudged, links, planar, rate_hz, stable):
+    servo = {"stall_torque": 1.5, "coulomb_friction": 0.03}
+    scenario = nudged(links, planar=planar, rate_hz=rate_hz, world=World(), **servo)
+    assert bool(warnings(scenario)) is not stable
+    assert (restless(scenario) < 1e-4) is stable
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_shipped_scenarios_are_within_the_bound(name):
+    assert not warnings(load_scenario(name))
