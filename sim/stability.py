@@ -90,7 +90,7 @@ def likely_cause(scenario: Scenario) -> str:
         A clause for an error message.
     """
     use = max(stability(scenario, friction=False).values(), key=lambda use: use.share)
-    if use.share < 0.5:
+    if use.share <= 1.0:
         return "no parameter is too stiff for the step: look at the gait and the start"
     return f"likely cause: {_verdict(use, scenario)}; soften it or raise physics_rate_hz"
 
