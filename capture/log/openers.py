@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,18 +24,18 @@ from .recorder_channels import DiagnosticsChannel, TimeReferenceChannel
 from .schemas import message_type
 
 
-class ChannelOpeners:
+class ChannelOpeners(ABC):
     """Opens channels, at any time; a subclass says where their messages go."""
 
     def __init__(self) -> None:
         """Start without channels."""
         self._logs: dict[str, LogChannel] = {}
 
+    @abstractmethod
     def _sender(
         self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
     ) -> Send:
         """Register a channel; returns what writes one message of it."""
-        raise NotImplementedError
 
     def joint_state(
         self,
