@@ -29,15 +29,7 @@ class Listener(Protocol):
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Hear of a message.
-
-        Args:
-            channel_id: Its channel.
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-            payload: Its bytes.
-        """
+        """Hear of a message; the arguments are those of :meth:`MessageSink.write`."""
         ...
 
 
@@ -77,18 +69,7 @@ class TappedSink:
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Take one message.
-
-        Args:
-            channel_id: Its channel.
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-            payload: Its bytes.
-
-        Raises:
-            LogWriteError: If the sink can't keep it.
-        """
+        """See :meth:`MessageSink.write`."""
         self._write(channel_id, log_time_ns, publish_time_ns, sequence, payload)
         for offer in self._offers:
             offer(channel_id, log_time_ns, publish_time_ns, sequence, payload)

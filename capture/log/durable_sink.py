@@ -174,14 +174,7 @@ class DurableSink:
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Accept one message: when this returns, the death of the process doesn't lose it.
-
-        Args:
-            channel_id: Its channel.
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-            payload: Its bytes.
+        """See :meth:`MessageSink.write`; from then on the death of the process doesn't lose it.
 
         Raises:
             LogWriteError: If it can't be kept: the disk is full or fails. It was not accepted;

@@ -57,18 +57,7 @@ class McapSink:
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Write one message.
-
-        Args:
-            channel_id: Its channel.
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-            payload: Its bytes.
-
-        Raises:
-            LogWriteError: If the file can't be written.
-        """
+        """See :meth:`MessageSink.write`."""
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
 
     def close(self, last: tuple[Metadata, ...]) -> None:

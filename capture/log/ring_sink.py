@@ -114,18 +114,7 @@ class RingSink:
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Keep one message, and let go of what has become too old.
-
-        Args:
-            channel_id: Its channel.
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-            payload: Its bytes.
-
-        Raises:
-            LogWriteError: If the ring is closed.
-        """
+        """See :meth:`MessageSink.write`; what has become too old is let go."""
         if not self._open:
             raise LogWriteError(self._path, "the ring is closed")
         messages = self._messages
