@@ -1,0 +1,189 @@
+"""Accelerometer and compass against gravity, turning frames and the earth's field."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.robot import Sensor, SensorKind
+from sim.physics.steps import Steps
+from sim.sensing.accelerometer import Accelerometer
+from sim.sensing.compass import Compass
+from sim.sensing.model import AccelerometerModel, CompassModel
+from sim.sensing.mount import rotation_from_rpy
+
+DT, PERIOD, G = 1e-3, 10, 9.81
+GRAVITY = (0.0, 0.0, -G)
+EXACT = AccelerometerModel(noise=0.0, resolution=0.0)
+FIELD = CompassModel(noise=0.0, resolution=0.0)
+
+
+@pytest.fixture(scope="module")
+def robot(make_robot):
+    return make_robot(2)
+
+
+def accelerometer(position=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0)):
+    kind = SensorKind.ACCELEROMETER
+    return Sensor("accelerometer", kind, "link01", position, rpy, axes=("x", "y", "z"))
+
+
+def magnetometer(rpy=(0.0, 0.0, 0.0), axes=("x", "y")):
+    return Sensor("compass", SensorKind.COMPASS, "link01", (0.0, 0.0, 0.0), rpy, axes=axes)
+
+
+def periods(count, motion):
+    """Control periods; ``motion(t)`` gives position, velocity, orientation and spin of link 1."""
+    for p in range(count):
+        steps = Steps.empty(PERIOD + 1, 2, 1)
+        body = steps.stacked.body
+        for k in range(PERIOD + 1):
+            position, velocity, turn, spin = motion((p * PERIOD + k) * DT)
+            body.position[k] = np.array(position)[:, None]
+            body.velocity[k] = np.array(velocity)[:, None]
+            body.quaternion[k] = turn.as_quat()[:, None]
+            body.spin[k] = np.array(spin)[:, None]
+        yield p * PERIOD, steps
+
+
+def told(kind, count, motion):
+    return [
+        sample for start, steps in periods(count, motion) for sample in kind.observe(steps, start)
+    ]
+
+
+def at_rest(*euler):
+    turn = Rotation.from_euler("ZYX", euler)
+    return lambda t: ((0, 0, 0), (0, 0, 0), turn, (0, 0, 0))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 35.0])
+def test_a_tilted_block_at_rest_feels_gravitys_opposite(robot, degrees):
+    tilt = math.radians(degrees)
+    kind = Accelerometer(EXACT, [accelerometer()], robot, GRAVITY, dt=DT, seed=1)
+    samples = told(kind, 3, at_rest(0.7, tilt, 0.0))
+    assert [sample.time_s for sample in samples] == pytest.approx([0.005, 0.015, 0.025])
+    for sample in samples:
+        # Nose down by the tilt: the x axis points down by sin(tilt).
+        expected = (-G * math.sin(tilt), 0.0, G * math.cos(tilt))
+        np.testing.assert_allclose(sample.vector, expected, atol=1e-12)
+
+
+def test_free_fall_feels_nothing_and_thrust_feels_itself(robot):
+    kind = Accelerometer(EXACT, [accelerometer()], robot, GRAVITY, dt=DT, seed=1)
+    fall = told(kind, 2, lambda t: ((0, 0, 0), (0, 0, -G * t), Rotation.identity(), (0, 0, 0)))
+    np.testing.assert_allclose([one.vector for one in fall], 0.0, atol=1e-9)
+    kind = Accelerometer(EXACT, [accelerometer()], robot, GRAVITY, dt=DT, seed=1)
+    thrust = told(kind, 2, lambda t: ((0, 0, 0), (3.0 * t, 0, 0), Rotation.identity(), (0, 0, 0)))
+    np.testing.assert_allclose([one.vector for one in thrust], [(3.0, 0, G)] * 2, atol=1e-9)
+
+
+def test_a_turning_mount_feels_the_centripetal_force(robot):
+    # Spinning about z at 6 rad/s, 0.03 m off the axis: w^2 r towards the axis.
+    w = 6.0
+    kind = Accelerometer(EXACT, [accelerometer((0.03, 0.01, 0.0))], robot, GRAVITY, dt=DT, seed=1)
+    samples = told(
+        kind, 10, lambda t: ((0, 0, 0), (0, 0, 0), Rotation.from_rotvec((0, 0, w * t)), (0, 0, w))
+    )
+    for sample in samples:
+        np.testing.assert_allclose(
+            sample.vector, (-w * w * 0.03, -w * w * 0.01, G), rtol=1e-4, atol=1e-9
+        )
+
+
+def test_a_swinging_mount_feels_the_tangential_force_too(robot):
+    # Angle a sin(n t): w' r across. The mean over 10 ms around the stamp.
+    a, n, r = 0.5, 2 * math.pi, 0.05
+    kind = Accelerometer(EXACT, [accelerometer((r, 0.0, 0.0))], robot, GRAVITY, dt=DT, seed=1)
+
+    def motion(t):
+        turn = Rotation.from_rotvec((0, 0, a * math.sin(n * t)))
+        return (0, 0, 0), (0, 0, 0), turn, (0, 0, a * n * math.cos(n * t))
+
+    for sample in told(kind, 100, motion):
+        rate, change = a * n * math.cos(n * sample.time_s), -a * n * n * math.sin(n * sample.time_s)
+        expected = (-rate * rate * r, change * r, G)
+        np.testing.assert_allclose(sample.vector, expected, atol=2e-3)
+
+
+def test_the_sensor_frame_is_turned_in_the_links(robot):
+    rpy = (0.3, -0.2, 1.1)
+    np.testing.assert_allclose(
+        rotation_from_rpy(rpy), Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-15
+    )
+    kind = Accelerometer(EXACT, [accelerometer(rpy=rpy)], robot, GRAVITY, dt=DT, seed=1)
+    found = told(kind, 1, at_rest(0.4, 0.1, -0.3))[0].vector
+    frame = Rotation.from_euler("ZYX", (0.4, 0.1, -0.3)) * Rotation.from_euler("xyz", rpy)
+    np.testing.assert_allclose(found, frame.inv().apply((0, 0, G)), atol=1e-12)
+
+
+def test_slower_sampling_means_over_its_own_period(robot):
+    model = dataclasses.replace(EXACT, rate_hz=40.0)
+    kind = Accelerometer(model, [accelerometer()], robot, GRAVITY, dt=DT, seed=1)
+    thrust = told(kind, 10, lambda t: ((0, 0, 0), (t * t, 0, 0), Rotation.identity(), (0, 0, 0)))
+    assert [one.time_s for one in thrust] == pytest.approx([0.0125, 0.0375, 0.0625, 0.0875])
+    # v = t^2: the mean acceleration around t is 2 t.
+    np.testing.assert_allclose(
+        [one.vector[0] for one in thrust], [2 * one.time_s for one in thrust], atol=1e-9
+    )
+
+
+def test_the_accelerometer_has_noise_and_steps(robot):
+    noisy = dataclasses.replace(EXACT, noise=0.05)
+    kind = Accelerometer(noisy, [accelerometer()], robot, GRAVITY, dt=DT, seed=1)
+    values = np.array([one.vector for one in told(kind, 3000, at_rest(0.0, 0.0, 0.0))])
+    np.testing.assert_allclose(values.std(axis=0), 0.05, rtol=0.05)
+    np.testing.assert_allclose(values.mean(axis=0), (0, 0, G), atol=4e-3)
+    steps = dataclasses.replace(noisy, resolution=0.04)
+    kind = Accelerometer(steps, [accelerometer()], robot, GRAVITY, dt=DT, seed=1)
+    values = np.array([one.vector for one in told(kind, 100, at_rest(0.0, 0.0, 0.0))]) / 0.04
+    np.testing.assert_allclose(values, np.rint(values), atol=1e-9)
+
+
+def heading(sample):
+    return math.atan2(-sample.vector[1], sample.vector[0])
+
+
+@pytest.mark.parametrize("degrees", [-170.0, -45.0, 0.0, 30.0, 120.0])
+def test_a_level_compass_tells_its_heading(robot, degrees):
+    kind = Compass(FIELD, [magnetometer()], robot, dt=DT, seed=1)
+    sample = told(kind, 1, at_rest(math.radians(degrees), 0.0, 0.0))[0]
+    assert math.degrees(heading(sample)) == pytest.approx(degrees, abs=1e-9)
+    assert math.hypot(*sample.vector[:2]) == pytest.approx(20e-6)
+    assert math.isnan(sample.vector[2])  # it has two axes
+
+
+def test_a_degree_of_roll_turns_the_heading_by_two_degrees(robot):
+    kind = Compass(FIELD, [magnetometer()], robot, dt=DT, seed=1)
+    sample = told(kind, 1, at_rest(0.0, 0.0, math.radians(1.0)))[0]
+    assert math.degrees(abs(heading(sample))) == pytest.approx(2.1, abs=0.05)
+    assert math.degrees(heading(sample)) == pytest.approx(math.tan(math.radians(65.0)), abs=0.01)
+    # Pointing east the same roll mixes the vertical field into the axis along the field's level
+    # part: the heading stays.
+    kind = Compass(FIELD, [magnetometer()], robot, dt=DT, seed=1)
+    east = told(kind, 1, at_rest(-math.pi / 2, 0.0, math.radians(1.0)))[0]
+    assert math.degrees(heading(east)) == pytest.approx(-90.0, abs=0.01)
+
+
+def test_north_can_be_turned_and_a_third_axis_sees_the_dip(robot):
+    model = dataclasses.replace(FIELD, north=0.5)
+    kind = Compass(model, [magnetometer(axes=("x", "y", "z"))], robot, dt=DT, seed=1)
+    sample = told(kind, 1, at_rest(0.5, 0.0, 0.0))[0]
+    level = 20e-6
+    np.testing.assert_allclose(
+        sample.vector, (level, 0.0, -level * math.tan(math.radians(65))), atol=1e-15
+    )
+
+
+def test_the_compass_has_its_rate_noise_and_steps(robot):
+    kind = Compass(CompassModel(resolution=0.0), [magnetometer()], robot, dt=DT, seed=1)
+    samples = told(kind, 5000, at_rest(0.3, 0.0, 0.0))
+    assert len(samples) == 1000
+    np.testing.assert_allclose(np.diff([one.time_s for one in samples]), 0.05, atol=1e-12)
+    values = np.array([one.vector[:2] for one in samples])
+    np.testing.assert_allclose(values.std(axis=0), 2e-7, rtol=0.1)
+    kind = Compass(CompassModel(), [magnetometer()], robot, dt=DT, seed=1)
+    steps = np.array([one.vector[:2] for one in told(kind, 50, at_rest(0.3, 0.0, 0.0))]) / 1e-7
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)

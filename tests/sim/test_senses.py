@@ -1,0 +1,269 @@
+"""All sensors together: order of arrival, readings, scenarios, and how a session holds them."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from capture import Session
+from capture.errors import ScenarioError
+from sim import Cylinder, Readings, Wall, load_scenario, parse_scenario
+from sim.record import record
+from sim.sensing.contract import JointSample, RangeSample, VectorSample
+from sim.twin import Twin
+
+SCENARIO = """
+description = "a test"
+robot = "snake25"
+duration_s = 0.6
+[gait.horizontal]
+amplitude = 0.3
+frequency_hz = 0.5
+lag = 0.5
+[world]
+heading = 0.2
+[[world.obstacles]]
+shape = "cylinder"
+position = [0.9, 0.1]
+radius = 0.1
+[sensing.servo]
+slot_s = 3e-4
+resolution = 1.5e-3
+"""
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return parse_scenario(SCENARIO, "x.toml")
+
+
+@pytest.fixture(scope="module")
+def run(scenario):
+    with Twin(scenario) as twin:
+        samples = [(sample, twin._sensing.readings) for sample in twin.samples()]
+        return samples, twin.flush()
+
+
+def test_nothing_is_told_before_it_was_measured_or_twice(run):
+    seen = {}
+    for sample, _ in run[0]:
+        cycles = [told.cycle for told in sample.sensed if isinstance(told, JointSample)]
+        assert cycles == ([sample.tick - 2] if sample.tick >= 2 else [])
+        for told in sample.sensed:
+            if isinstance(told, JointSample):
+                continue
+            assert sample.time_s - 0.01 <= told.time_s + 1e-9 < sample.time_s + 1e-9
+            assert told.time_s > seen.get(told.name, -1.0)
+            seen[told.name] = told.time_s
+        times = [told.time_s for told in sample.sensed if not isinstance(told, JointSample)]
+        assert times == sorted(times)
+    assert len(seen) == 18
+    assert [told.cycle for told in run[1]] == [59, 60]
+
+
+def test_the_readings_hold_the_newest_value_of_each_sensor(run, scenario):
+    newest = {}
+    assert run[0][0][1].angle.tolist() == pytest.approx([math.nan] * 25, nan_ok=True)
+    for sample, readings in run[0]:
+        for told in sample.sensed:
+            newest["joints" if isinstance(told, JointSample) else told.name] = told
+        for name, told in newest.items():
+            if isinstance(told, JointSample):
+                np.testing.assert_array_equal(readings.angle, told.position)
+                np.testing.assert_array_equal(readings.velocity, told.velocity)
+            elif isinstance(told, RangeSample):
+                assert readings.ranges[name] == told.distance
+            elif name == "compass":
+                np.testing.assert_array_equal(readings.magnetic_field[name], told.vector)
+            else:
+                np.testing.assert_array_equal(readings.acceleration[name], told.vector)
+    last = run[0][-1][1]
+    assert len(last.ranges) == 16
+    # The head looks at the cylinder, 0.2 rad off to the left.
+    assert last.ranges["sonar"] == pytest.approx(0.9 - 0.1 - 0.03, abs=0.06)
+    field = last.magnetic_field["compass"]
+    assert math.atan2(-field[1], field[0]) == pytest.approx(0.2, abs=0.1)
+
+
+def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_path):
+    path = tmp_path / "senses.mcap"
+    record(scenario, path)
+    told = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
+    topics = {one.name: one.topic for one in scenario.robot.sensors}
+    with Session.open(path) as session:
+        for name, topic in topics.items():
+            mine = [(tick, one) for tick, one in told if getattr(one, "name", "") == name]
+            found = list(session.messages(topic))
+            assert len(found) == len(mine) > 5
+            for (tick, one), (log_ns, message) in zip(mine, found, strict=True):
+                assert log_ns == scenario.epoch_ns + tick * 10_000_000
+                stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                assert stamp == scenario.epoch_ns + round(one.time_s * 1e9)
+                assert message.header.frame_id == name
+                if isinstance(one, VectorSample):
+                    vector = (
+                        message.magnetic_field
+                        if topic == "/compass"
+                        else message.linear_acceleration
+                    )
+                    np.testing.assert_array_equal([vector.x, vector.y, vector.z], one.vector)
+                else:
+                    assert message.range == np.float32(one.distance)
+        assert session.warnings == []
+
+
+def test_without_its_sensors_a_robot_has_its_servos_only(scenario):
+    mute = dataclasses.replace(
+        scenario, sensing=dataclasses.replace(scenario.sensing, enabled=False)
+    )
+    with Twin(mute) as twin:
+        told = [one for sample in twin.samples() for one in sample.sensed]
+    assert {type(one) for one in told} == {JointSample}
+    assert parse_scenario(mute.toml(), "y.toml") == mute
+
+
+def test_sensors_do_not_change_the_motion(scenario, run):
+    mute = dataclasses.replace(
+        scenario, sensing=dataclasses.replace(scenario.sensing, enabled=False)
+    )
+    with Twin(mute) as twin:
+        last = list(twin.samples())[-1]
+    np.testing.assert_array_equal(last.step.body.position, run[0][-1][0].step.body.position)
+
+
+def test_a_robot_without_sensors_has_none(make_scenario):
+    with Twin(make_scenario(duration_s=0.05, world=None)) as twin:
+        for sample in twin.samples():
+            assert all(isinstance(one, JointSample) for one in sample.sensed)
+    nothing = Readings.nothing(make_scenario().robot)
+    assert nothing.ranges == {}
+
+
+def test_seeds_change_the_noise_and_only_that(scenario):
+    def told(seed):
+        with Twin(scenario.changed(seed=seed, duration_s=0.1)) as twin:
+            samples = list(twin.samples())
+        values = [one.vector for s in samples for one in s.sensed if isinstance(one, VectorSample)]
+        return np.nan_to_num(values), samples[-1].step.body.angle
+
+    (first, angle), (again, _), (other, same) = told(1), told(1), told(2)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    np.testing.assert_array_equal(angle, same)
+
+
+SENSING = """
+[sensing]
+enabled = true
+[sensing.servo]
+slot_s = 3e-4
+resolution = 1e-3
+dead_band = 2e-3
+command_resolution = 5e-3
+[sensing.ir]
+hold_s = 0.04
+noise_v = 0.01
+adc_bits = 10
+adc_v = 5.0
+peak = 0.1
+[sensing.sonar]
+rate_hz = 10
+noise = 0.01
+resolution = 0.02
+rays = 7
+[sensing.accelerometer]
+rate_hz = 50
+noise = 0.1
+resolution = 0.05
+[sensing.compass]
+rate_hz = 8
+noise = 1e-7
+resolution = 2e-7
+horizontal_field = 2.1e-5
+inclination = 1.1
+north = 0.3
+"""
+
+
+def test_every_key_is_read_and_written_back():
+    text = SCENARIO.split("[sensing", maxsplit=1)[0]
+    scenario = parse_scenario(text + SENSING, "x.toml")
+    assert dataclasses.asdict(scenario.sensing) == {
+        "servo": {
+            "slot_s": 3e-4,
+            "resolution": 1e-3,
+            "dead_band": 2e-3,
+            "command_resolution": 5e-3,
+        },
+        "ir": {"hold_s": 0.04, "noise_v": 0.01, "adc_bits": 10, "adc_v": 5.0, "peak": 0.1},
+        "sonar": {"rate_hz": 10, "noise": 0.01, "resolution": 0.02, "rays": 7},
+        "accelerometer": {"rate_hz": 50, "noise": 0.1, "resolution": 0.05},
+        "compass": {
+            "rate_hz": 8,
+            "noise": 1e-7,
+            "resolution": 2e-7,
+            "horizontal_field": 2.1e-5,
+            "inclination": 1.1,
+            "north": 0.3,
+        },
+        "enabled": True,
+    }
+    assert parse_scenario(scenario.toml(), "y.toml") == scenario
+
+
+def test_faults_are_listed_at_once():
+    text = SCENARIO.split("[sensing", maxsplit=1)[0]
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(
+            text
+            + """
+            [sensing]
+            enabled = "yes"
+            gyro = 1
+            [sensing.servo]
+            slot_s = 4e-4
+            dead_band = -1
+            [sensing.ir]
+            hold_s = 0
+            adc_bits = 0
+            [sensing.sonar]
+            rays = 0.5
+            [sensing.compass]
+            inclination = 65
+            """,
+            "x.toml",
+        )
+    assert {fault.key for fault in caught.value.faults} == {
+        "sensing.enabled",
+        "sensing.gyro",
+        "sensing.servo.slot_s",  # 25 turns of 0.4 ms are a whole control period
+        "sensing.servo.dead_band",
+        "sensing.ir.hold_s",
+        "sensing.ir.adc_bits",
+        "sensing.sonar.rays",
+        "sensing.compass.inclination",
+    }
+
+
+def test_a_twin_between_walls_sees_them():
+    flat = load_scenario("flat").changed(duration_s=0.1)
+    sensing = dataclasses.replace(
+        flat.sensing, ir=dataclasses.replace(flat.sensing.ir, noise_v=0.0)
+    )
+    walls = (
+        Wall((-3.0, 0.5), (3.0, 0.5)),
+        Wall((-3.0, -0.7), (3.0, -0.7)),
+        Cylinder((9.0, 9.0), 1.0),
+    )
+    world = dataclasses.replace(flat.world, obstacles=walls)
+    with Twin(dataclasses.replace(flat, world=world, sensing=sensing)) as twin:
+        for _ in twin.samples():
+            pass
+        ranges = twin._sensing.readings.ranges
+    # The sensors on the sides sit 0.025 m off the axis, the walls' faces are 0.49 and 0.69 m off.
+    for name in ("ir04", "ir06", "ir08", "ir10", "ir12"):
+        assert ranges[name] == pytest.approx(0.465, abs=2e-3)
+    for name in ("ir05", "ir07", "ir09", "ir11", "ir13"):
+        assert ranges[name] == pytest.approx(0.665, abs=2e-3)
+    assert ranges["ir01"] == math.inf
