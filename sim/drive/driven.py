@@ -32,10 +32,12 @@ class Driven:
         world: The scenario that it was made for, None where that isn't known.
         duration_s: How long it lasts.
         planes: The planes that it needs.
-        make: Builds the gait, at time zero, for a robot.
+        make: Builds the gait, at time zero, for a robot; in a world if that is given, else in the
+            one that it was made for.
         facts: What a session's metadata says of it.
         attachments: File name to TOML text that explains it.
-        own_gait: Whether ``world.gait`` is what is driven, so that a run's scenario says it all.
+        own_gait: Whether gait and controller of ``world`` are what is driven: a run's scenario then
+            says it all.
     """
 
     kind: str
@@ -44,7 +46,7 @@ class Driven:
     world: Scenario | None
     duration_s: float
     planes: tuple[Plane, ...]
-    make: Callable[[Robot], Gait]
+    make: Callable[[Robot, Scenario | None], Gait]
     facts: Mapping[str, str]
     attachments: Mapping[str, bytes]
     own_gait: bool = False
@@ -57,7 +59,7 @@ class Driven:
             duration_s: Length of the run; its own if None.
 
         Returns:
-            The world, with the length and, if it is a scenario's gait, that gait.
+            The world, with the length and, if it is a scenario's gait, that gait and controller.
 
         Raises:
             UsageError: If no world is known, or its robot lacks a plane.
@@ -74,7 +76,8 @@ class Driven:
                     "none"
                 )
         if self.own_gait and self.world is not None:
-            where = dataclasses.replace(where, gait=self.world.gait)
+            own = self.world
+            where = dataclasses.replace(where, gait=own.gait, controller=own.controller)
         return where.changed(duration_s=self.duration_s if duration_s is None else duration_s)
 
 
@@ -105,8 +108,8 @@ def find_driven(word: str, world: Scenario | None = None) -> Driven:
 
 
 def _gait(scenario: Scenario) -> Driven:
-    def make(robot: Robot) -> Gait:
-        return build_gait(dataclasses.replace(scenario, robot=robot))
+    def make(robot: Robot, world: Scenario | None) -> Gait:
+        return build_gait(world or dataclasses.replace(scenario, robot=robot))
 
     return Driven(
         kind="gait",
@@ -131,7 +134,7 @@ def _plan(text: str, source: Path) -> Driven:
         world=plan.scenario,
         duration_s=plan.duration_s,
         planes=tuple(plan.start),
-        make=lambda robot: PlanGait(plan, robot),
+        make=lambda robot, _: PlanGait(plan, robot),
         facts={"driven": "plan", "driven.by": plan.name},
         attachments={"plan.toml": text.encode()},
     )
@@ -157,7 +160,7 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
         world=scenario,
         duration_s=replay.duration_s,
         planes=(),
-        make=lambda robot: CommandReplay(recorded, robot),
+        make=lambda robot, _: CommandReplay(recorded, robot),
         facts=facts,
         attachments={},
     )

@@ -43,7 +43,7 @@ def drive_twin(
         OutputExistsError: If the file is there and ``force`` is not given.
         LogWriteError: If the file can't be written.
     """
-    gait = FadingGait(driven.make(scenario.robot), scenario.robot)
+    gait = FadingGait(driven.make(scenario.robot, scenario), scenario.robot)
     ended = StopRequest()
 
     def after(sample: Sample) -> None:

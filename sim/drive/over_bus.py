@@ -107,8 +107,8 @@ def bus_plan(
     Raises:
         UsageError: If the address is none, the robot has no bus, or the duration is too short.
     """
-    address = parse_address(on)
-    if address.scheme != "can":
+    address = parse_address(on) if ":" in on else None
+    if address is None or address.scheme != "can":
         raise UsageError(f"--on {on}: expected twin, twin:SCENARIO or can:INTERFACE:CHANNEL")
     if driven.robot.bus is None:
         raise UsageError(
@@ -142,7 +142,7 @@ def drive_bus(
     """
     clock = SessionClock()
     robot = plan.driven.robot
-    gait = FadingGait(plan.driven.make(robot), robot)
+    gait = FadingGait(plan.driven.make(robot, None), robot)
     with ExitStack() as opened:
         virtual = _virtual_robot(plan, clock) if plan.armed else None
         link: Link = virtual or _listening(plan, clock)

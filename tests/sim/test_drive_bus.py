@@ -103,7 +103,7 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, ca
         measured = over_bus.joints("/joint_states")
     # The robot did what the twin does with commands rounded to the bus, and said so, rounded.
     with Twin(
-        weak(0.3), Rounded(find_driven("weak-servo-pi3").make(load_robot("snake25")))
+        weak(0.3), Rounded(find_driven("weak-servo-pi3").make(load_robot("snake25"), None))
     ) as twin:
         samples = [one for sample in twin.samples() for one in sample.sensed]
     cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])
