@@ -96,7 +96,8 @@ def test_a_helix_rolls_and_screws():
 def test_waves_of_the_papers_equations_go_head_first_and_straight(name):
     found = motion(name)
     assert found.forward > 0.04
-    assert abs(found.left) < 0.01 * found.speed
+    # Half a cycle later one wave alone is its own mirror image, two waves at once are not.
+    assert abs(found.left) < (0.02 if name == "combined" else 1e-3) * found.speed
 
 
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators", "oscillators-one-way"])
