@@ -5,10 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -48,13 +49,14 @@ def run(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     duration: float | None = None,
     seed: int | None = None,
+    kernels: Literal["numpy", "numba", "auto"] = "numpy",
     force: bool = False,
     json: bool = False,
 ) -> int:
     """Simulate a scenario and record it as a session, faster than real time.
 
-    The same scenario and seed give the same file, byte for byte. SIGINT and SIGTERM end the run
-    between two samples and leave a whole file.
+    The same scenario, seed and kernels give the same file, byte for byte. SIGINT and SIGTERM end
+    the run between two samples and leave a whole file.
 
     Example: `undulog sim run weak-servo-pi3 -o weak.mcap`
 
@@ -63,9 +65,12 @@ def run(
         output: The session file to write, `.mcap`.
         duration: Simulated length in seconds, instead of the scenario's.
         seed: Seed of the sensor noise, instead of the scenario's.
+        kernels: What computes the forces: `numba` is faster and rounds otherwise; `auto` takes it
+            where it is installed.
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
+    from .physics.engine import Kernels
     from .record import record
     from .scenario_file import load_scenario
 
@@ -75,6 +80,7 @@ def run(
         )
     chosen = load_scenario(scenario).changed(duration_s=duration, seed=seed)
     refuse_existing(output, force=force)
+    compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
     start = time.monotonic()
     with interruptible() as stop, progress(chosen.name, chosen.duration_s) as bar:
         recording = record(
@@ -82,6 +88,7 @@ def run(
             output,
             force=force,
             stop=stop,
+            kernels=Kernels.NUMBA if compiled else Kernels.NUMPY,
             on_sample=lambda sample: bar.update(
                 sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
             ),

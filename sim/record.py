@@ -13,6 +13,7 @@ from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain
 
 from .gait import Gait
+from .physics.engine import Kernels
 from .physics.ledger import TERMS
 from .scenario import Scenario
 from .session_log import SessionLog, session_facts
@@ -76,6 +77,7 @@ def record(
     force: bool = False,
     stop: StopRequest | None = None,
     on_sample: Callable[[Sample], None] | None = None,
+    kernels: Kernels = Kernels.NUMPY,
 ) -> Recording:
     """Run a scenario into a session file.
 
@@ -89,6 +91,7 @@ def record(
         force: Replace an existing file.
         stop: Looked at between samples.
         on_sample: Told of each sample after it was written, e.g. to show progress.
+        kernels: What computes the force laws.
 
     Returns:
         What was recorded.
@@ -101,14 +104,17 @@ def record(
     sample: Sample | None = None
     session_id = scenario.session_id if driver is None else driver.session_id(scenario)
     with (
-        Twin(scenario, None if driver is None else driver.gait) as twin,
+        Twin(scenario, None if driver is None else driver.gait, kernels=kernels) as twin,
         SessionWriter(
             path,
             session_id=session_id,
             epoch_ns=scenario.epoch_ns,
             robot=scenario.robot,
             clock={"twin": ClockDomain.SIMULATED},
-            metadata={**session_facts(scenario), **(driver.facts if driver is not None else {})},
+            metadata={
+                **session_facts(scenario, kernels),
+                **(driver.facts if driver is not None else {}),
+            },
             force=force,
         ) as writer,
     ):

@@ -21,6 +21,7 @@ from capture.log.sensor_channels import open_sensor
 from capture.log.writer import SessionWriter
 from capture.robot.kinematics import rotation_from_quaternion
 
+from .physics.engine import Kernels
 from .physics.ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario
 from .sensing.contract import JointSample, RangeSample, SensorSample
@@ -35,11 +36,12 @@ _TF_EVERY = 5  # ticks: 20 Hz, a view aid
 _TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
 
 
-def session_facts(scenario: Scenario) -> Mapping[str, str]:
+def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mapping[str, str]:
     """What the session's metadata says about the run.
 
     Args:
         scenario: The scenario.
+        kernels: What computes the force laws.
 
     Returns:
         Names to text: scenario, seed, times, the joints' sampling, and versions.
@@ -52,8 +54,9 @@ def session_facts(scenario: Scenario) -> Mapping[str, str]:
         "physics_rate_hz": str(scenario.physics_rate_hz),
         "joint_sampling": _sampling(scenario.sensing.servo.slot_s),
         "engine": scenario.engine,
+        "kernels": kernels,
         scenario.engine.package: version(scenario.engine.package),
-        "numpy": version("numpy"),
+        **{name: version(name) for name in ("numpy", kernels)},
         "python": platform.python_version(),
     }
 

@@ -18,6 +18,7 @@ from capture.errors import SimulationError
 
 from .control.build import build_gait
 from .gait import Gait, GaitTick
+from .physics.engine import Kernels
 from .physics.ledger import Ledger
 from .physics.plant import Plant
 from .physics.steps import Step, Steps
@@ -40,7 +41,8 @@ class Sample(NamedTuple):
         step: Body, ground, rotors and servos at this instant.
         sensed: The sensors' samples that have arrived since the tick before; the newest ones
             arrive after the run, by :meth:`Twin.flush`.
-        energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (19,).
+        energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (22,).
+        contact_s: For how long each link has touched an obstacle so far [s], shape (n,).
     """
 
     tick: int
@@ -48,6 +50,7 @@ class Sample(NamedTuple):
     step: Step
     sensed: list[SensorSample]
     energy: FloatArray
+    contact_s: FloatArray
 
     @property
     def time_s(self) -> float:
@@ -65,27 +68,36 @@ class Twin:
             gait that speaks over a bus hands them out first.
     """
 
-    def __init__(self, scenario: Scenario, gait: Gait | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        gait: Gait | None = None,
+        *,
+        kernels: Kernels = Kernels.NUMPY,
+    ) -> None:
         """Set the robot on the ground, straight, its servos at rest, in vertical balance.
 
         Args:
             scenario: What to run.
             gait: Who commands the joints; the scenario's own gait if None.
+            kernels: What computes the force laws.
 
         Raises:
             UsageError: If the engine cannot hold the robot.
+            ImportError: If the engine or the kernels are not installed.
         """
         robot, world = scenario.robot, scenario.world
         self.scenario = scenario
         self.gait: Gait = gait or build_gait(scenario)
         self.sensed: list[SensorSample] = []
         self._sensing = Senses(scenario)
-        self._plant = Plant(scenario)
+        self._plant = Plant(scenario, kernels)
         self._ledger = Ledger(
             robot,
             self._plant.servos,
             gravity=np.array(world.gravity),
             stiffness=world.ground.stiffness if world.ground is not None else 0.0,
+            obstacle_stiffness=world.obstacle_contact.stiffness,
             dt=self._plant.dt,
             start=self._plant.now,
         )
@@ -128,7 +140,8 @@ class Twin:
             gait = gait._replace(command=quantised(gait.command, resolution))
             self._plant.command(gait.command)
             step = self._plant.now
-            yield Sample(tick, gait, step, self.sensed, self._ledger.read(step))
+            energy, contact_s = self._ledger.read(step), self._ledger.contact_s
+            yield Sample(tick, gait, step, self.sensed, energy, contact_s)
 
     def flush(self) -> list[SensorSample]:
         """End the run, wherever it stands: sensor samples that have not arrived yet.
@@ -148,10 +161,10 @@ class Twin:
         Raises:
             SimulationError: If there is one.
         """
-        speed = np.abs(steps.stacked.body.velocity).max(axis=1)
-        sound = speed <= MAX_SPEED  # false for NaN
-        if not sound.all():
-            k, link = map(int, np.argwhere(~sound)[0])
+        speed = np.abs(steps.stacked.body.velocity)
+        if not speed.max() <= MAX_SPEED:  # true for NaN
+            speed = speed.max(axis=1)
+            k, link = map(int, np.argwhere(~(speed <= MAX_SPEED))[0])
             raise SimulationError(
                 f"the twin failed at {start_s + k * self._plant.dt:.3f} s: "
                 f"{self.scenario.robot.links[link].name} moves at {speed[k, link]:g} m/s, more "

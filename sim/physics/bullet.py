@@ -142,12 +142,16 @@ class BulletEngine:
         """Free the physics world."""
         pybullet.disconnect(physicsClientId=self._client)
 
-    def read(self) -> BodyState:
-        """The present state, in arrays of its own.
+    def read(self, into: BodyState | None = None) -> BodyState:
+        """The present state.
+
+        Args:
+            into: Arrays to be filled in; new ones by default.
 
         Returns:
-            Positions and velocities of links and joints.
+            Positions and velocities of links and joints, in these arrays.
         """
+        state = into or BodyState.empty(len(self._joints) + 1, len(self._joints))
         client = self._client
         position, turn = pybullet.getBasePositionAndOrientation(self._body, client)
         velocity, spin = pybullet.getBaseVelocity(self._body, client)
@@ -155,10 +159,13 @@ class BulletEngine:
         links = pybullet.getLinkStates(self._body, self._joints, 1, 1, client)
         rows = [_pack_link(*link[0], *link[1], *link[6], *link[7]) for link in links]
         rows.insert(0, _pack_link(*position, *turn, *velocity, *spin))
-        fields = _components(rows)
+        fields = np.frombuffer(b"".join(rows)).reshape(-1, 13).T
+        state.position[...], state.quaternion[...] = fields[:3], fields[3:7]
+        state.velocity[...], state.spin[...] = fields[7:10], fields[10:]
         joints = pybullet.getJointStates(self._body, self._joints, client)
-        angle, rate = _components([_pack_joint(*joint[:2]) for joint in joints])
-        return BodyState(fields[:3], fields[3:7], fields[7:10], fields[10:], angle, rate)
+        packed = b"".join([_pack_joint(*joint[:2]) for joint in joints])
+        state.angle[...], state.rate[...] = np.frombuffer(packed).reshape(-1, 2).T
+        return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
         """Apply forces to the links during the next step; calls add up.
@@ -187,9 +194,3 @@ class BulletEngine:
             physicsClientId=self._client,
         )
         pybullet.stepSimulation(self._client)
-
-
-def _components(rows: list[bytes]) -> FloatArray:
-    """Packed rows of k numbers as an array of shape (k, number of rows)."""
-    table = np.frombuffer(b"".join(rows)).reshape(len(rows), -1)
-    return np.ascontiguousarray(table.T)

@@ -11,6 +11,8 @@ from enum import StrEnum
 from importlib import import_module
 from typing import NamedTuple, Protocol, cast
 
+import numpy as np
+
 from capture.arrays import FloatArray
 from capture.robot import Robot
 
@@ -25,6 +27,17 @@ class EngineKind(StrEnum):
     def package(self) -> str:
         """Name of its package in the package index."""
         return {EngineKind.BULLET: "pybullet", EngineKind.MUJOCO: "mujoco"}[self]
+
+
+class Kernels(StrEnum):
+    """What computes the force laws, and the body's kinematics where that pays.
+
+    Results of the two agree within rounding, not bit by bit, so the default does not depend on what
+    is installed.
+    """
+
+    NUMPY = "numpy"
+    NUMBA = "numba"
 
 
 class BodyState(NamedTuple):
@@ -46,15 +59,33 @@ class BodyState(NamedTuple):
     angle: FloatArray
     rate: FloatArray
 
+    @classmethod
+    def empty(cls, link_count: int, joint_count: int) -> BodyState:
+        """Arrays to be filled in.
+
+        Args:
+            link_count: n.
+            joint_count: m.
+
+        Returns:
+            A state without meaning.
+        """
+        position, velocity, spin = np.empty((3, 3, link_count))
+        quaternion, (angle, rate) = np.empty((4, link_count)), np.empty((2, joint_count))
+        return cls(position, quaternion, velocity, spin, angle, rate)
+
 
 class Engine(Protocol):
     """A robot's links and joints in a physics world of their own."""
 
-    def read(self) -> BodyState:
+    def read(self, into: BodyState | None = None) -> BodyState:
         """The present state.
 
+        Args:
+            into: Arrays to be filled in; new ones by default.
+
         Returns:
-            Positions and velocities of links and joints, in arrays of their own.
+            Positions and velocities of links and joints, in these arrays.
         """
         ...
 
@@ -118,11 +149,12 @@ _TYPES = {
 }
 
 
-def engine_type(kind: EngineKind) -> EngineType:
+def engine_type(kind: EngineKind, kernels: Kernels = Kernels.NUMPY) -> EngineType:
     """Import an engine.
 
     Args:
         kind: Which one.
+        kernels: What computes the body's kinematics where the engine leaves it to us.
 
     Returns:
         What builds it.
@@ -131,4 +163,6 @@ def engine_type(kind: EngineKind) -> EngineType:
         ImportError: If its package is not installed; the front door says which extra brings it.
     """
     module, name = _TYPES[kind]
+    if kind is EngineKind.BULLET and kernels is Kernels.NUMBA:
+        module, name = "sim.physics.compiled_bullet", "CompiledBulletEngine"
     return cast(EngineType, getattr(import_module(module), name))

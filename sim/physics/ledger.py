@@ -8,7 +8,8 @@ and rotors follow, what is left over is a boundary term that does not grow.
 Two balances close over any stretch of time::
 
     mechanical_net = friction_tangential + friction_normal + contact_damping
-                     + change of (kinetic + potential + contact_spring)
+                     + obstacle_friction + obstacle_damping
+                     + change of (kinetic + potential + contact_spring + obstacle_spring)
     electrical_net = mechanical_net + copper + viscous + coulomb + gear_damping
                      + change of (rotor_kinetic + gear_spring)
 """
@@ -23,7 +24,7 @@ from capture.robot import Robot
 from .contact import into_link_axes
 from .servo import Servos
 from .steps import Step, Steps
-from .vectors import into_frames
+from .vectors import cross, into_frames
 
 JOINT_TERMS = (
     "mechanical_net",
@@ -42,13 +43,19 @@ electrical work at the motors (signed, its positive part), and the four losses o
 GROUND_TERMS = ("friction_tangential", "friction_normal", "contact_damping")
 """What the ground takes [J], cumulative."""
 
-STORED_TERMS = ("kinetic", "potential", "contact_spring", "rotor_kinetic", "gear_spring")
-"""Energies stored at the instant [J]."""
+OBSTACLE_TERMS = ("obstacle_friction", "obstacle_damping")
+"""What the obstacles take [J], cumulative."""
+
+STORED_TERMS = (
+    *("kinetic", "potential", "contact_spring", "obstacle_spring"),
+    *("rotor_kinetic", "gear_spring"),
+)
+"""Energies stored at the instant [J]: those of the body and its contacts, those of the servos."""
 
 RESIDUAL_TERMS = ("mechanical_residual", "electrical_residual")
 """Left side minus right side of the two balances since the start [J]: the ledger's own error."""
 
-TERMS = JOINT_TERMS + GROUND_TERMS + STORED_TERMS + RESIDUAL_TERMS
+TERMS = JOINT_TERMS + GROUND_TERMS + OBSTACLE_TERMS + STORED_TERMS + RESIDUAL_TERMS
 """All terms, in the order of :meth:`Ledger.read`."""
 
 
@@ -63,7 +70,7 @@ def joint_flows(steps: Steps, servos: Servos, dt: float) -> FloatArray:
     Returns:
         Energies [J], rows as :data:`JOINT_TERMS`, shape (9, m).
     """
-    body, _, rotors, drive = steps.stacked
+    body, _, rotors, drive, _ = steps.stacked
     rate, speed = _middle(body.rate), _middle(rotors.speed)
     acting = rotors.speed[:-1]  # friction acts with the speed at the start of the step
     mechanical = rate * drive.torque[:-1]
@@ -105,6 +112,34 @@ def ground_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
     return -dt * np.array([along, across, (damping * velocity[:, 2]).sum()])
 
 
+def obstacle_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
+    """Energies that the obstacles take during consecutive steps.
+
+    Args:
+        steps: k + 1 steps; the last one closes the one before it.
+        stiffness: Of the obstacles [N/m]; their springs store energy, the rest is lost.
+        dt: Step [s].
+
+    Returns:
+        Energies [J], as :data:`OBSTACLE_TERMS`, shape (2,).
+    """
+    taken = np.zeros(len(OBSTACLE_TERMS))
+    for k, contact in enumerate(steps.obstacles[:-1]):
+        if not len(contact.link):
+            continue
+        here, after = steps[k].body, steps[k + 1].body
+        link, normal = contact.link, contact.normal
+        arm = contact.point - here.position[:, link]
+        spin = 0.5 * (here.spin + after.spin)[:, link]
+        velocity = 0.5 * (here.velocity + after.velocity)[:, link] + cross(spin, arm)
+        press = (contact.force * normal).sum(axis=0)
+        friction = contact.force - press * normal
+        parting = (normal * velocity).sum(axis=0)
+        damping = (press - stiffness * contact.depth) * parting
+        taken -= dt * np.array([(friction * velocity).sum(), damping.sum()])
+    return taken
+
+
 class Ledger:
     """Adds up flows and reads off stored energies."""
 
@@ -115,6 +150,7 @@ class Ledger:
         *,
         gravity: FloatArray,
         stiffness: float,
+        obstacle_stiffness: float,
         dt: float,
         start: Step,
     ) -> None:
@@ -125,6 +161,7 @@ class Ledger:
             servos: Its servos.
             gravity: Acceleration of gravity in the world [m/s^2], shape (3,).
             stiffness: Of the ground [N/m], 0 where there is none.
+            obstacle_stiffness: Of the obstacles [N/m].
             dt: Step [s].
             start: The state at which all flows are zero.
         """
@@ -133,15 +170,23 @@ class Ledger:
         self._inertia = np.array([link.inertia for link in robot.links]).T
         self._gravity = gravity
         self._stiffness = stiffness
+        self._obstacle_stiffness = obstacle_stiffness
         self._dt = dt
         self._joints = np.zeros((len(JOINT_TERMS), len(robot.joints)))
         self._ground = np.zeros(len(GROUND_TERMS))
+        self._obstacles = np.zeros(len(OBSTACLE_TERMS))
+        self._contact_s = np.zeros(len(robot.links))
         self._start = self.stored(start)
 
     @property
     def joints(self) -> FloatArray:
         """Cumulative flows of each joint [J], rows as :data:`JOINT_TERMS`, shape (9, m)."""
         return self._joints.copy()
+
+    @property
+    def contact_s(self) -> FloatArray:
+        """For how long each link has touched an obstacle so far [s], shape (n,)."""
+        return self._contact_s.copy()
 
     def book(self, steps: Steps) -> None:
         """Add the flows of consecutive steps.
@@ -151,6 +196,10 @@ class Ledger:
         """
         self._joints += joint_flows(steps, self._servos, self._dt)
         self._ground += ground_flows(steps, self._stiffness, self._dt)
+        if any(len(contact.link) for contact in steps.obstacles):
+            self._obstacles += obstacle_flows(steps, self._obstacle_stiffness, self._dt)
+            for contact in steps.obstacles[:-1]:
+                self._contact_s[np.unique(contact.link)] += self._dt
 
     def stored(self, step: Step) -> FloatArray:
         """Energies stored at one instant.
@@ -159,18 +208,20 @@ class Ledger:
             step: The instant.
 
         Returns:
-            Energies [J], as :data:`STORED_TERMS`, shape (5,).
+            Energies [J], as :data:`STORED_TERMS`, shape (6,).
         """
         body, rotors, servos = step.body, step.rotors, self._servos
         spin = into_frames(body.quaternion, body.spin)
         twist = servos.twist(body.angle, rotors.angle)
         depth = _pressed(step.contact.depth)
+        dent = step.obstacles.depth
         return np.array(
             [
                 0.5
                 * (self._mass @ (body.velocity**2).sum(axis=0) + (self._inertia * spin**2).sum()),
                 -(self._gravity @ body.position) @ self._mass,
                 0.5 * self._stiffness * (depth @ depth),
+                0.5 * self._obstacle_stiffness * (dent @ dent),
                 0.5 * servos.inertia @ rotors.speed**2,
                 0.5 * servos.gear_stiffness @ twist**2,
             ]
@@ -183,17 +234,17 @@ class Ledger:
             step: The instant, up to which all steps are booked.
 
         Returns:
-            Energies [J], as :data:`TERMS`, shape (19,).
+            Energies [J], as :data:`TERMS`, shape (22,).
         """
         joints = self._joints.sum(axis=1)
         stored = self.stored(step)
         change = stored - self._start
         net, electrical, losses = joints[0], joints[3], joints[5:].sum()
         residuals = (
-            net - self._ground.sum() - change[:3].sum(),
-            electrical - net - losses - change[3:].sum(),
+            net - self._ground.sum() - self._obstacles.sum() - change[:4].sum(),
+            electrical - net - losses - change[4:].sum(),
         )
-        return np.concatenate((joints, self._ground, stored, residuals))
+        return np.concatenate((joints, self._ground, self._obstacles, stored, residuals))
 
 
 def _middle(series: FloatArray) -> FloatArray:

@@ -68,21 +68,26 @@ class MujocoEngine:
     def close(self) -> None:
         """Nothing to do: the physics world is freed with this object."""
 
-    def read(self) -> BodyState:
+    def read(self, into: BodyState | None = None) -> BodyState:
         """The present state.
 
+        Args:
+            into: Arrays to be filled in; new ones by default.
+
         Returns:
-            Positions and velocities of links and joints, in arrays of their own.
+            Positions and velocities of links and joints, in these arrays.
         """
         data = self._data  # its first body is the world
-        position = data.xipos[1:].T.copy()
-        turn = data.xquat[1:, _SCALAR_LAST].T.copy()
-        spin = data.cvel[1:, :3].T.copy()
+        state = into or BodyState.empty(len(data.xipos) - 1, len(data.qpos) - 7)
+        state.position[...] = data.xipos[1:].T
+        state.quaternion[...] = data.xquat[1:, _SCALAR_LAST].T
+        state.spin[...] = data.cvel[1:, :3].T
         # The velocity that each link, carried on, would have at the robot's centre of mass.
         carried = data.cvel[1:, 3:].T
-        arm = position - data.subtree_com[1, :, np.newaxis]
-        velocity = carried + cross(spin, arm)
-        return BodyState(position, turn, velocity, spin, data.qpos[7:].copy(), data.qvel[6:].copy())
+        arm = state.position - data.subtree_com[1, :, np.newaxis]
+        state.velocity[...] = carried + cross(state.spin, arm)
+        state.angle[...], state.rate[...] = data.qpos[7:], data.qvel[6:]
+        return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
         """Apply forces to the links during the next step; calls add up.

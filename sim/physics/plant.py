@@ -1,16 +1,15 @@
-"""Body, ground and servos, stepped together while the commands are held."""
+"""Body, ground, obstacles and servos, stepped together while the commands are held."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 import numpy as np
 
 from capture.arrays import FloatArray
 
 from ..scenario import CONTROL_RATE_HZ, Scenario
-from .contact import contact_law
-from .engine import engine_type
+from ..world.obstacle_contact import obstacle_law
+from .engine import Kernels, engine_type
+from .laws import laws_for
 from .servo import Servos
 from .steps import Step, Steps
 
@@ -23,23 +22,30 @@ class Plant:
         dt: Physics step [s].
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> None:
         """Set the robot on the ground, straight, its servos at rest, in vertical balance.
 
         Args:
             scenario: The robot, its world, the engine and the physics rate.
+            kernels: What computes the force laws.
 
         Raises:
             UsageError: If the engine cannot hold the robot.
+            ImportError: If the engine or the kernels are not installed.
         """
         robot, world = scenario.robot, scenario.world
         self.servos = Servos([joint.servo for joint in robot.joints])
         self.dt = 1.0 / scenario.physics_rate_hz
         radius = np.array([link.radius for link in robot.links])
+        length = np.array([link.length for link in robot.links])
         self._below = np.zeros((3, len(radius)))
         self._below[2] = -radius
-        self._ground_law = contact_law(world.ground, radius)
-        self._engine = engine_type(scenario.engine)(
+        self._obstacle_law = (
+            obstacle_law(world.obstacles, world.obstacle_contact, radius, length)
+            if world.obstacles
+            else None
+        )
+        self._engine = engine_type(scenario.engine, kernels)(
             robot,
             gravity=world.gravity,
             height=_resting_height(scenario),
@@ -50,8 +56,11 @@ class Plant:
         count = scenario.physics_rate_hz // CONTROL_RATE_HZ
         self._period = Steps.empty(count + 1, len(robot.links), len(robot.joints))
         self._rows = tuple(self._period)
-        self._reference = np.zeros(len(robot.joints))
-        self._look(self._rows[0])
+        self._laws = laws_for(
+            self._period, robot, world.ground, self.servos, dt=self.dt, kernels=kernels
+        )
+        self._look(0)
+        self._laws.start(0)
 
     def close(self) -> None:
         """Free the physics world."""
@@ -68,8 +77,7 @@ class Plant:
         Args:
             reference: Joint angles q_ref [rad], shape (m,).
         """
-        self._reference = reference
-        self._drive(self._rows[0])
+        self._laws.command(0, reference)
 
     def advance(self) -> Steps:
         """Go through one control period.
@@ -79,32 +87,29 @@ class Plant:
             them, even where the state became impossible on the way.
         """
         with np.errstate(all="ignore"):  # whoever looks at the steps finds what overflows
-            for before, here in zip(self._rows[:-1], self._rows[1:], strict=True):
-                self._engine.push(before.contact.force, before.body.position + self._below)
-                self._engine.step(before.drive.torque)
-                _put(here.rotors, self.servos.advance(before.rotors, before.drive, self.dt))
-                self._look(here)
+            for k in range(1, len(self._rows)):
+                self._push(k - 1)
+                self._engine.step(self._rows[k - 1].drive.torque)
+                self._look(k)
+                self._laws.follow(k)
         steps = self._period.copy()
         self._period.table[0] = self._period.table[-1]
+        self._period.obstacles[0] = self._period.obstacles[-1]
         return steps
 
-    def _look(self, here: Step) -> None:
-        """Fill in all that acts at this instant but for the rotors, which are there."""
-        body = self._engine.read()
-        _put(here.body, body)
-        contact = self._ground_law(body.position, body.quaternion, body.velocity, body.spin)
-        _put(here.contact, contact)
-        self._drive(here)
+    def _push(self, k: int) -> None:
+        """Let ground and obstacles act on the links."""
+        step = self._rows[k]
+        self._engine.push(step.contact.force, step.body.position + self._below)
+        if self._obstacle_law is not None:
+            for force, point in self._period.obstacles[k].layers(self._period.link_count):
+                self._engine.push(force, point)
 
-    def _drive(self, here: Step) -> None:
-        """Fill in what the servos do."""
-        angle, rate = here.body.angle, here.body.rate
-        _put(here.drive, self.servos.drive(self._reference, angle, rate, here.rotors))
-
-
-def _put(into: Iterable[FloatArray], values: Iterable[FloatArray]) -> None:
-    for place, value in zip(into, values, strict=True):
-        place[...] = value
+    def _look(self, k: int) -> None:
+        """Fill in the body, and what obstacles do to it."""
+        body = self._engine.read(self._rows[k].body)
+        if self._obstacle_law is not None:
+            self._period.obstacles[k] = self._obstacle_law(*body[:4])
 
 
 def _resting_height(scenario: Scenario) -> float:

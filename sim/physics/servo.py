@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from capture.arrays import FloatArray, frozen
 from capture.robot import Servo
 
 COULOMB_SPEED = 0.05
@@ -57,8 +57,10 @@ class Servos:
     """The servos of all joints, as arrays.
 
     Attributes:
+        table: All parameters of :class:`capture.robot.Servo`, SI, in the order of the attributes
+            below, shape (10, m).
         supply, resistance, torque_constant, gain, inertia, viscous, coulomb, gear_stiffness,
-        gear_damping, play: The parameters of :class:`capture.robot.Servo`, SI, each of shape (m,).
+            gear_damping, play: Its rows, each of shape (m,).
     """
 
     def __init__(self, servos: Sequence[Servo]) -> None:
@@ -67,20 +69,18 @@ class Servos:
         Args:
             servos: One a joint, head to tail.
         """
-
-        def column(values: Sequence[float]) -> FloatArray:
-            return np.array(values, dtype=np.float64)
-
-        self.supply = column([s.supply_v for s in servos])
-        self.resistance = column([s.resistance_ohm for s in servos])
-        self.torque_constant = column([s.torque_constant for s in servos])
-        self.gain = column([s.proportional_gain for s in servos])
-        self.inertia = column([s.rotor_inertia for s in servos])
-        self.viscous = column([s.viscous_friction for s in servos])
-        self.coulomb = column([s.coulomb_friction for s in servos])
-        self.gear_stiffness = column([s.gear_stiffness for s in servos])
-        self.gear_damping = column([s.gear_damping for s in servos])
-        self.play = column([s.backlash for s in servos])
+        parameters = [
+            (
+                *(one.supply_v, one.resistance_ohm, one.torque_constant, one.proportional_gain),
+                *(one.rotor_inertia, one.viscous_friction, one.coulomb_friction),
+                *(one.gear_stiffness, one.gear_damping, one.backlash),
+            )
+            for one in servos
+        ]
+        self.table = frozen(np.array(parameters, dtype=np.float64).T.copy())
+        self.supply, self.resistance, self.torque_constant, self.gain = self.table[:4]
+        self.inertia, self.viscous, self.coulomb = self.table[4:7]
+        self.gear_stiffness, self.gear_damping, self.play = self.table[7:]
         self._tight = not self.play.any()
 
     def current(self, voltage: FloatArray, speed: FloatArray) -> FloatArray:

@@ -1,7 +1,8 @@
 """Consecutive physics steps in one table, so that what adds them up works on whole columns.
 
 A row of the table is one step, everything that acts during it as it stands at its start. The fields
-of :class:`Step` are views of the rows: of one row, or with a leading axis of time, of all.
+of :class:`Step` are views of the rows: of one row, or with a leading axis of time, of all. What
+touches obstacles differs in number from step to step, so it is kept beside the table.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
+from ..world.obstacle_contact import NO_CONTACT, ObstacleContact
 from .contact import Contact
 from .engine import BodyState
 from .servo import Drive, Rotors
@@ -26,10 +28,7 @@ class Step(NamedTuple):
     contact: Contact
     rotors: Rotors
     drive: Drive
-
-
-_LINK_ROWS = (3, 4, 3, 3, 3, 2, 1, 3)  # the body's poses and velocities, then the contact
-_JOINT_COUNT = 7  # angle and rate, then rotors and drive
+    obstacles: ObstacleContact = NO_CONTACT
 
 
 class Steps(Sequence[Step]):
@@ -39,17 +38,26 @@ class Steps(Sequence[Step]):
         table: One row a step, shape (k, 22 n + 7 m).
         link_count: n.
         joint_count: m.
+        obstacles: What touches obstacles, one entry a step.
     """
 
-    def __init__(self, table: FloatArray, link_count: int, joint_count: int) -> None:
+    def __init__(
+        self,
+        table: FloatArray,
+        link_count: int,
+        joint_count: int,
+        obstacles: list[ObstacleContact] | None = None,
+    ) -> None:
         """Wrap a table.
 
         Args:
             table: One row a step, shape (k, 22 n + 7 m).
             link_count: n.
             joint_count: m.
+            obstacles: What touches obstacles, one entry a step; nothing by default.
         """
         self.table = table
+        self.obstacles = [NO_CONTACT] * len(table) if obstacles is None else obstacles
         self.link_count = link_count
         self.joint_count = joint_count
 
@@ -65,12 +73,12 @@ class Steps(Sequence[Step]):
         Returns:
             Steps of zeros.
         """
-        width = sum(_LINK_ROWS) * link_count + _JOINT_COUNT * joint_count
+        width = 22 * link_count + 7 * joint_count
         return cls(np.zeros((count, width)), link_count, joint_count)
 
     def copy(self) -> Steps:
         """The same steps in a table of their own."""
-        return Steps(self.table.copy(), self.link_count, self.joint_count)
+        return Steps(self.table.copy(), self.link_count, self.joint_count, self.obstacles.copy())
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -83,32 +91,33 @@ class Steps(Sequence[Step]):
     def __getitem__(self, index: int | slice) -> Step | Steps:
         """One step, or a stretch of them; views, not copies."""
         if isinstance(index, slice):
-            return Steps(self.table[index], self.link_count, self.joint_count)
-        return _fields(self.table[index], self.link_count, self.joint_count)
+            return Steps(
+                self.table[index], self.link_count, self.joint_count, self.obstacles[index]
+            )
+        step = _fields(self.table[index], self.link_count, self.joint_count)
+        return step._replace(obstacles=self.obstacles[index])
 
     @cached_property
     def stacked(self) -> Step:
-        """All steps as one: each field with a leading axis of time, shape (k, ...)."""
+        """All steps as one: each field with a leading axis of time, shape (k, ...).
+
+        What touches obstacles is not in it.
+        """
         return _fields(self.table, self.link_count, self.joint_count)
 
 
 def _fields(table: FloatArray, n: int, m: int) -> Step:
     """The fields of rows, shape (..., width), as views."""
     lead = table.shape[:-1]
-    views: list[FloatArray] = []
     end = 0
-    for rows in _LINK_ROWS:
-        start, end = end, end + rows * n
-        view = table[..., start:end]
-        views.append(view if rows == 1 else view.reshape(*lead, rows, n))
-    for _ in range(_JOINT_COUNT):
-        start, end = end, end + m
-        views.append(table[..., start:end])
-    position, quaternion, velocity, spin, *contact = views[:8]
-    angle, rate, *servo = views[8:]
-    return Step(
-        BodyState(position, quaternion, velocity, spin, angle, rate),
-        Contact(*contact),
-        Rotors(*servo[:2]),
-        Drive(*servo[2:]),
-    )
+
+    def take(rows: int, columns: int) -> FloatArray:
+        nonlocal end
+        start, end = end, end + rows * columns
+        part = table[..., start:end]
+        return part if rows == 1 else part.reshape(*lead, rows, columns)
+
+    body = BodyState(take(3, n), take(4, n), take(3, n), take(3, n), take(1, m), take(1, m))
+    contact = Contact(take(3, n), take(2, n), take(1, n), take(3, n))
+    rotors, drive = Rotors(take(1, m), take(1, m)), Drive(take(1, m), take(1, m), take(1, m))
+    return Step(body, contact, rotors, drive)

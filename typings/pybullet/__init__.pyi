@@ -73,6 +73,13 @@ def getLinkStates(
 def getJointStates(
     bodyUniqueId: int, jointIndices: Sequence[int], physicsClientId: int = ...
 ) -> tuple[tuple[float, float, _Vector, float], ...]: ...
+def applyExternalTorque(
+    objectUniqueId: int,
+    linkIndex: int,
+    torqueObj: Sequence[float],
+    flags: int,
+    physicsClientId: int = ...,
+) -> None: ...
 def applyExternalForce(
     objectUniqueId: int,
     linkIndex: int,

@@ -1,0 +1,100 @@
+"""The articulated body in PyBullet with kinematics of our own, compiled.
+
+Half of what :mod:`sim.physics.bullet` costs goes into reading poses and velocities link by link and
+into pushing link by link. Here the engine is asked for its coordinates alone, and forces on the
+links reach it as the generalised force that does the same (:mod:`sim.physics.chain_kernels`).
+Importing it needs the extra ``numba``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.robot import Plane, Robot
+
+from . import chain_kernels
+from .bullet import BulletEngine, pybullet
+from .engine import BodyState
+
+
+class CompiledBulletEngine(BulletEngine):
+    """A robot's links and joints in a physics world of their own; :meth:`close` it after use."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        gravity: Sequence[float],
+        height: float,
+        heading: float,
+        velocity: Sequence[float],
+        dt: float,
+    ) -> None:
+        """Build the body, straight, its head above the origin.
+
+        Args:
+            robot: The robot, at most :data:`sim.physics.bullet.MAX_JOINTS` joints.
+            gravity: Acceleration of gravity in the world [m/s^2], length 3.
+            height: Height of the links' centres [m].
+            heading: Direction of the head's x axis, about z [rad].
+            velocity: Of the whole body [m/s], length 3.
+            dt: Step [s].
+
+        Raises:
+            UsageError: If the engine cannot hold the robot.
+        """
+        super().__init__(
+            robot, gravity=gravity, height=height, heading=heading, velocity=velocity, dt=dt
+        )
+        self._half = np.array([link.length / 2 for link in robot.links])
+        self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in robot.joints])
+        self._hinges = np.zeros((6, len(robot.joints)))
+        self._generalised = np.zeros(6 + len(robot.joints))
+        self._state = self.read()
+
+    def read(self, into: BodyState | None = None) -> BodyState:
+        """The present state.
+
+        Args:
+            into: Arrays to be filled in; new ones by default.
+
+        Returns:
+            Positions and velocities of links and joints, in these arrays.
+        """
+        state = into or BodyState.empty(len(self._half), len(self._joints))
+        client = self._client
+        pose = pybullet.getBasePositionAndOrientation(self._body, client)
+        twist = pybullet.getBaseVelocity(self._body, client)
+        head = np.array([*pose[0], *pose[1], *twist[0], *twist[1]])
+        joints = pybullet.getJointStates(self._body, self._joints, client)
+        motion = np.array([joint[:2] for joint in joints])
+        state.angle[...], state.rate[...] = motion.T
+        chain_kernels.spread(head, motion, self._half, self._vertical, *state[:4], self._hinges)
+        self._state = state
+        return state
+
+    def push(self, force: FloatArray, point: FloatArray) -> None:
+        """Apply forces to the links during the next step; calls add up.
+
+        Args:
+            force: In the world [N], shape (3, n).
+            point: Points of action in the world [m], shape (3, n).
+        """
+        chain_kernels.gather(force, point, self._state.position, self._hinges, self._generalised)
+
+    def step(self, torque: FloatArray) -> None:
+        """Advance the body by one step.
+
+        Args:
+            torque: Of the joints [N m], shape (m,).
+        """
+        fx, fy, fz, mx, my, mz = self._generalised[:6].tolist()
+        at = self._state.position[:, 0].tolist()
+        world, client = pybullet.WORLD_FRAME, self._client
+        pybullet.applyExternalForce(self._body, -1, (fx, fy, fz), at, world, client)
+        pybullet.applyExternalTorque(self._body, -1, (mx, my, mz), world, client)
+        super().step(torque + self._generalised[6:])
+        self._generalised[:] = 0.0

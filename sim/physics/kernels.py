@@ -1,0 +1,177 @@
+"""The twin's force laws, compiled.
+
+The same equations as :mod:`sim.physics.contact` and :mod:`sim.physics.servo`, in the same order of
+operations, written out over links and joints. They serve speed alone and are held against those
+modules, which say what the equations mean. Hyperbolic tangents may round otherwise than NumPy's, so
+results agree within rounding and not bit by bit.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from capture.arrays import FloatArray
+
+from ..world.ground import FrictionLaw
+from .servo import COULOMB_SPEED
+
+LAWS = tuple(FrictionLaw)
+"""A friction law's number is its place here."""
+
+_ELLIPSE, _BOX, _TRANSETH, _VISCOUS = (
+    LAWS.index(law)
+    for law in (FrictionLaw.ELLIPSE, FrictionLaw.BOX, FrictionLaw.TRANSETH, FrictionLaw.VISCOUS)
+)
+_TINY = 1e-300
+
+
+@njit(cache=True)
+def _resistance(
+    law: int, along: float, across: float, normal: float, ground: FloatArray
+) -> tuple[float, float]:
+    """Force along (tangential, normal) against slip at a link that touches the ground [N]."""
+    mu_t, mu_n, eps = ground[2], ground[3], ground[4]
+    if law == _VISCOUS:
+        return -ground[5] * along, -ground[6] * across
+    if law == _BOX:
+        return (
+            -mu_t * along / math.sqrt(along * along + eps**2) * normal,
+            -mu_n * across / math.sqrt(across * across + eps**2) * normal,
+        )
+    if law == _TRANSETH:
+        speed = math.sqrt(along * along + across * across + eps**2)
+        return -mu_t * along / speed * normal, -mu_n * across / speed * normal
+    weighted_t, weighted_n = mu_t * along, mu_n * across
+    squares = weighted_t * weighted_t + weighted_n * weighted_n
+    force_t = -mu_t * weighted_t / math.sqrt(squares + ((mu_t * eps) ** 2 + _TINY)) * normal
+    force_n = -mu_n * weighted_n / math.sqrt(squares + ((mu_n * eps) ** 2 + _TINY)) * normal
+    return force_t, force_n
+
+
+@njit(cache=True)
+def touch_ground(
+    row: FloatArray, n: int, m: int, radius: FloatArray, ground: FloatArray, law: int
+) -> None:
+    """Fill in the ground's action.
+
+    Args:
+        row: A step, as :class:`sim.physics.steps.Steps` has it; its body is there.
+        n: Number of links.
+        m: Number of joints.
+        radius: Of the links [m], shape (n,).
+        ground: k, d, mu_t, mu_n, eps, c_t, c_n, shape (7,).
+        law: Number of the friction law in :data:`LAWS`.
+    """
+    position, quaternion = row[: 3 * n].reshape(3, n), row[3 * n : 7 * n].reshape(4, n)
+    velocity, spin = row[7 * n : 10 * n].reshape(3, n), row[10 * n : 13 * n].reshape(3, n)
+    start = 13 * n + 2 * m
+    at_point = row[start : start + 3 * n].reshape(3, n)
+    tangent = row[start + 3 * n : start + 5 * n].reshape(2, n)
+    depth = row[start + 5 * n : start + 6 * n]
+    force = row[start + 6 * n : start + 9 * n].reshape(3, n)
+    for i in range(n):
+        x, y, z, w = quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
+        tx, ty = 0.5 - (y * y + z * z), x * y + z * w
+        length = max(math.sqrt(tx * tx + ty * ty), _TINY)
+        tx, ty = tx / length, ty / length
+        vx = velocity[0, i] - radius[i] * spin[1, i]
+        vy = velocity[1, i] + radius[i] * spin[0, i]
+        vz = velocity[2, i]
+        deep = radius[i] - position[2, i]
+        at_point[0, i], at_point[1, i], at_point[2, i] = vx, vy, vz
+        tangent[0, i], tangent[1, i] = tx, ty
+        depth[i] = deep
+        if deep > 0.0:
+            normal = max(ground[0] * deep - ground[1] * vz, 0.0)
+            along, across = _resistance(law, tx * vx + ty * vy, tx * vy - ty * vx, normal, ground)
+            force[0, i] = tx * along - ty * across
+            force[1, i] = ty * along + tx * across
+            force[2, i] = normal
+        else:
+            force[0, i] = force[1, i] = force[2, i] = 0.0
+
+
+@njit(cache=True)
+def drive_joints(
+    row: FloatArray, n: int, m: int, reference: FloatArray, servos: FloatArray
+) -> None:
+    """Fill in what the servos do.
+
+    Args:
+        row: A step; its body and rotors are there.
+        n: Number of links.
+        m: Number of joints.
+        reference: Commanded joint angles q_ref [rad], shape (m,).
+        servos: :attr:`sim.physics.servo.Servos.table`.
+    """
+    angle, rate = row[13 * n : 13 * n + m], row[13 * n + m : 13 * n + 2 * m]
+    start = 22 * n + 2 * m
+    rotor, speed = row[start : start + m], row[start + m : start + 2 * m]
+    voltage, current = row[start + 2 * m : start + 3 * m], row[start + 3 * m : start + 4 * m]
+    torque = row[start + 4 * m : start + 5 * m]
+    for j in range(m):
+        duty = min(max(servos[3, j] * (reference[j] - angle[j]), -1.0), 1.0)
+        voltage[j] = servos[0, j] * duty
+        current[j] = (voltage[j] - servos[2, j] * speed[j]) / servos[1, j]
+        twist, play = rotor[j] - angle[j], 0.5 * servos[9, j]
+        twist -= min(max(twist, -play), play)
+        torque[j] = servos[7, j] * twist + servos[8, j] * (speed[j] - rate[j])
+
+
+@njit(cache=True)
+def advance_rotors(
+    before: FloatArray, here: FloatArray, n: int, m: int, servos: FloatArray, dt: float
+) -> None:
+    """Fill in the rotors one step later.
+
+    Args:
+        before: A complete step.
+        here: The step after it.
+        n: Number of links.
+        m: Number of joints.
+        servos: :attr:`sim.physics.servo.Servos.table`.
+        dt: Step [s].
+    """
+    start = 22 * n + 2 * m
+    for j in range(m):
+        speed = before[start + m + j]
+        current, torque = before[start + 3 * m + j], before[start + 4 * m + j]
+        drag = servos[6, j] * math.tanh(speed / COULOMB_SPEED)
+        total = servos[2, j] * current - servos[5, j] * speed - (drag + torque)
+        after = speed + dt * total / servos[4, j]
+        here[start + j] = before[start + j] + dt * after
+        here[start + m + j] = after
+
+
+@njit(cache=True)
+def act(
+    before: FloatArray,
+    here: FloatArray,
+    n: int,
+    m: int,
+    radius: FloatArray,
+    ground: FloatArray,
+    law: int,
+    reference: FloatArray,
+    servos: FloatArray,
+    dt: float,
+) -> None:
+    """Complete a step whose body is there: rotors, ground, servos.
+
+    Args:
+        before: The step before it, complete.
+        here: The step.
+        n: Number of links.
+        m: Number of joints.
+        radius: Of the links [m], shape (n,).
+        ground: k, d, mu_t, mu_n, eps, c_t, c_n, shape (7,).
+        law: Number of the friction law in :data:`LAWS`.
+        reference: Commanded joint angles q_ref [rad], shape (m,).
+        servos: :attr:`sim.physics.servo.Servos.table`.
+        dt: Step [s].
+    """
+    advance_rotors(before, here, n, m, servos, dt)
+    touch_ground(here, n, m, radius, ground, law)
+    drive_joints(here, n, m, reference, servos)

@@ -1,0 +1,134 @@
+"""The compiled kernels against the NumPy laws, our own kinematics, and the engine link by link."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from capture import Session
+from capture.robot import Link
+from capture.robot.kinematics import link_poses, rotation_from_quaternion
+from sim import FrictionLaw, Ground, World
+from sim.physics.bullet import BulletEngine
+from sim.physics.compiled_bullet import CompiledBulletEngine
+from sim.physics.compiled_laws import CompiledLaws
+from sim.physics.engine import EngineKind, Kernels
+from sim.physics.laws import NumpyLaws
+from sim.physics.servo import Servos
+from sim.physics.steps import Steps
+from sim.record import record
+from sim.twin import Twin
+from sim.world import Cylinder
+
+START = {"gravity": (0.3, 0, -9.81), "height": 0.3, "heading": 0.7, "velocity": (0.2, 0.1, 0.0)}
+
+
+@pytest.fixture
+def uneven(make_robot):
+    """Links and servos that differ in every respect, so that no mix-up goes unseen."""
+    robot = make_robot(6)
+    links = tuple(
+        Link(f"link{i}", 0.05 + 0.01 * i, 0.02 + 1e-3 * i, 0.1 + 0.02 * i, (3e-5, 5e-5, 6e-5))
+        for i in range(6)
+    )
+    joints = tuple(
+        dataclasses.replace(
+            joint,
+            servo=dataclasses.replace(
+                joint.servo, stall_torque=0.2 + 0.1 * i, backlash=0.02 * (i % 2), supply_v=6 + i
+            ),
+        )
+        for i, joint in enumerate(robot.joints)
+    )
+    return dataclasses.replace(robot, links=links, joints=joints)
+
+
+@pytest.mark.parametrize("law", FrictionLaw)
+def test_laws_agree_to_the_last_digits(uneven, law):
+    random = np.random.default_rng(3)
+    servos = Servos([joint.servo for joint in uneven.joints])
+    ground = Ground(law=law)
+    tables = [Steps.empty(2, 6, 5) for _ in range(2)]
+    for _ in range(50):
+        row = random.normal(size=tables[0].table.shape)
+        reference = random.normal(scale=0.3, size=5)
+        for steps, laws in zip(tables, (NumpyLaws, CompiledLaws), strict=True):
+            steps.table[:] = row
+            steps.stacked.body.position[:, 2] = 0.02 + 0.005 * row[:, :6]
+            steps.stacked.rotors.angle[:] = steps.stacked.body.angle + 0.02 * row[:, :5]
+            compute = laws(steps, uneven, ground, servos, 1e-3)
+            compute.command(0, reference)
+            compute.start(0)
+            compute.follow(1)
+        ours, theirs = (steps.stacked for steps in tables)
+        for group, other in zip(ours[1:4], theirs[1:4], strict=True):
+            for one, two in zip(group, other, strict=True):
+                np.testing.assert_allclose(two, one, rtol=1e-13, atol=1e-13 * np.abs(one).max())
+    assert 0 < np.count_nonzero(ours.contact.force[:, 2]) < 12  # some touch, some don't
+
+
+def test_without_ground_there_is_no_force(uneven):
+    steps = Steps.empty(1, 6, 5)
+    steps.table[:] = np.random.default_rng(3).normal(size=steps.table.shape)
+    steps.stacked.body.position[:, 2] = 0.0
+    laws = CompiledLaws(steps, uneven, None, Servos([j.servo for j in uneven.joints]), 1e-3)
+    laws.start(0)
+    assert not steps.stacked.contact.force.any()
+
+
+def test_the_chain_lies_where_the_kinematics_has_it_and_moves_as_the_engine_says(uneven):
+    random = np.random.default_rng(5)
+    engines = [kind(uneven, dt=1e-3, **START) for kind in (BulletEngine, CompiledBulletEngine)]
+    for _ in range(200):
+        theirs, ours = (engine.read() for engine in engines)
+        head = rotation_from_quaternion(ours.quaternion[:, 0])
+        centres, turns = link_poses(uneven, ours.position[:, 0], head, ours.angle)
+        np.testing.assert_allclose(ours.position.T, centres, atol=1e-14)
+        np.testing.assert_allclose(rotation_from_quaternion(ours.quaternion.T), turns, atol=1e-14)
+        for name in ("position", "velocity", "spin", "angle", "rate"):
+            one, two = getattr(theirs, name), getattr(ours, name)
+            np.testing.assert_allclose(two, one, atol=1e-12 * (1 + np.abs(one).max()))
+        # Pushed in two calls, off the centres, and with torques: the generalised force.
+        force = random.normal(scale=0.3, size=(2, 3, 6))
+        point = theirs.position + random.normal(scale=0.01, size=(2, 3, 6))
+        torque = random.normal(scale=0.01, size=5)
+        for engine in engines:
+            engine.push(force[0], point[0])
+            engine.push(force[1], point[1])
+            engine.step(torque)
+    for engine in engines:
+        engine.close()
+    assert np.abs(theirs.angle).max() > 0.1
+
+
+def run(scenario, kernels):
+    with Twin(scenario, kernels=kernels) as twin:
+        return list(twin.samples())
+
+
+@pytest.mark.parametrize("engine", EngineKind)
+def test_a_run_is_the_same_within_rounding(make_scenario, uneven, engine):
+    # No chaotic growth: a gait on the ground is a stable cycle, errors are damped as they arise.
+    world = World(obstacles=(Cylinder((-0.2, 0.06), 0.03),))
+    scenario = make_scenario(uneven, ramp_s=0.5, duration_s=2.0, engine=engine, world=world)
+    ours, theirs = (run(scenario, kernels) for kernels in (Kernels.NUMBA, Kernels.NUMPY))
+    assert ours[-1].contact_s.any()
+    for k in (1, 100, 200):
+        one, two = ours[k], theirs[k]
+        np.testing.assert_allclose(one.step.body.position, two.step.body.position, atol=1e-12)
+        np.testing.assert_allclose(one.step.body.angle, two.step.body.angle, atol=1e-12)
+        np.testing.assert_allclose(one.energy, two.energy, atol=1e-12)
+
+
+def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
+    tmp_path, make_scenario, make_robot
+):
+    scenario = make_scenario(make_robot(5), ramp_s=0.1, duration_s=0.3)
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for path in paths:
+        record(scenario, path, kernels=Kernels.NUMBA)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with Session.open(paths[0]) as session:
+        facts = session.metadata["undulog"]
+    assert facts["kernels"] == "numba"
+    assert "numba" in set(facts) - {"kernels"}
