@@ -138,35 +138,43 @@ class BitField:
         with np.errstate(invalid="ignore"):  # a NaN in the frame is a NaN in the log
             return self.raw(data).astype(np.float64) * self.scale + self.offset
 
-    def raw_bits(self, value: float, lower: float = -math.inf, upper: float = math.inf) -> int:
-        """The bits of a physical value, the inverse of :meth:`values`.
+    def raw_range(self, lower: float = -math.inf, upper: float = math.inf) -> tuple[float, float]:
+        """The least and the greatest raw number of a range of physical values.
 
         Args:
-            value: Not NaN; what the field can't hold becomes the nearest that it can.
             lower: Least physical value that is allowed.
             upper: Greatest one.
 
         Returns:
+            Whole numbers that the field can hold; of a floating field any numbers.
+        """
+        least, greatest = -math.inf, math.inf
+        if not self.is_float:
+            least = -(1 << (self.length - 1)) if self.signed else 0
+            greatest = least + (1 << self.length) - 1
+        first, last = sorted((bound - self.offset) / self.scale for bound in (lower, upper))
+        if not self.is_float:
+            first, last = (round(x) if math.isfinite(x) else x for x in (first, last))
+        return max(least, first), min(greatest, last)
+
+    def raw_bits(self, value: float, within: tuple[float, float] | None = None) -> int:
+        """The bits of a physical value, the inverse of :meth:`values`.
+
+        Args:
+            value: Not NaN; what the field can't hold becomes the nearest that it can.
+            within: From :meth:`raw_range`; all that the field can hold if None.
+
+        Returns:
             ``length`` bits, two's complement or IEEE 754.
         """
-        if self.is_float:
-            cut = (min(max(value, lower), upper) - self.offset) / self.scale
-            with np.errstate(over="ignore"):  # beyond a narrow float's range is infinite
-                number = np.array(cut, dtype=_FLOATS[self.length])
-            return int(number.view(_UNSIGNED[self.length]))
-        least = -(1 << (self.length - 1)) if self.signed else 0
-        greatest = least + (1 << self.length) - 1
-        bounds = sorted((bound - self.offset) / self.scale for bound in (lower, upper))
-        if math.isfinite(bounds[0]):
-            least = max(least, round(bounds[0]))
-        if math.isfinite(bounds[1]):
-            greatest = min(greatest, round(bounds[1]))
+        least, greatest = within or self.raw_range()
         raw = (value - self.offset) / self.scale
-        if math.isfinite(raw):
-            raw = min(max(round(raw), least), greatest)
-        else:
-            raw = greatest if raw > 0 else least
-        return raw & ((1 << self.length) - 1)
+        raw = least if raw < least else min(raw, greatest)
+        if not self.is_float:
+            return round(raw) & ((1 << self.length) - 1)
+        with np.errstate(over="ignore"):  # beyond a narrow float's range is infinite
+            number = np.array(raw, dtype=_FLOATS[self.length])
+        return int(number.view(_UNSIGNED[self.length]))
 
     def placed(self, bits: int, size: int) -> int:
         """Bits at their place in a frame's data.

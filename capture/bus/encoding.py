@@ -34,14 +34,13 @@ class _Slot:
     """A value's place in a frame, and what the DBC allows it to be."""
 
     entry: MapEntry
-    lower: float
-    upper: float
+    within: tuple[float, float]
 
     def placed(self, value: float, size: int) -> int:
         if value == math.inf and self.entry.out_of_range is not None:
             return self._code(self.entry.out_of_range, size)
         physical = self.entry.physical(value)
-        bits = self.entry.bits.raw_bits(physical, self.lower, self.upper)
+        bits = self.entry.bits.raw_bits(physical, self.within)
         return self.entry.bits.placed(bits, size)
 
     def unknown(self, size: int) -> int | None:
@@ -196,7 +195,7 @@ def _selected(conditions: Conditions, chosen: Mapping[BitField, int]) -> bool:
 def _slot(entry: MapEntry, signal: Signal) -> _Slot:
     lower = -math.inf if signal.minimum is None else float(signal.minimum)
     upper = math.inf if signal.maximum is None else float(signal.maximum)
-    return _Slot(entry, lower, upper)
+    return _Slot(entry, entry.bits.raw_range(lower, upper))
 
 
 def _initial(signal: Signal, size: int) -> int:

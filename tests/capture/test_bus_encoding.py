@@ -54,8 +54,8 @@ def test_values_beyond_the_field_become_its_ends():
     field = BitField(0, 8, signed=True, scale=0.5, offset=1.0)
     found = [field.raw_bits(value) for value in (-1e9, 1e9, math.inf, -math.inf, 1.26, 1.24)]
     assert found == [0x80, 0x7F, 0x7F, 0x80, 1, 0]
-    assert field.raw_bits(50.0, upper=11.0) == 20
-    assert field.raw_bits(-50.0, lower=-9.0) == (-20) & 0xFF
+    assert field.raw_bits(50.0, field.raw_range(upper=11.0)) == 20
+    assert field.raw_bits(-50.0, field.raw_range(lower=-9.0)) == (-20) & 0xFF
     assert BitField(0, 8, scale=-1.0).raw_bits(-1e9) == 0xFF  # a falling scale turns the ends round
     narrow = BitField(0, 16, is_float=True)
     assert narrow.raw_bits(1e9) == int.from_bytes(struct.pack("<e", math.inf), "little")
