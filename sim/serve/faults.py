@@ -59,6 +59,7 @@ _GRAMMAR = {
     FaultKind.NOISE: _Grammar(False, ("a probability", 0.9)),  # frames are repeated until heard
     FaultKind.DELAY: _Grammar(False, ("a time in s", 10.0)),
 }
+_SLACK_S = 1e-9  # ticks and sums of decimal fractions differ in the last bit
 _TEXT = re.compile(r"(?P<what>[^@]*)(@(?P<from>[^+@]*)(\+(?P<for>[^+@]*))?)?")
 FORM = "KIND[:JOINT][:NUMBER][@FROM[+FOR]], e.g. lost:joint07:0.1 or bus-off@5+2"
 """What a fault looks like on the command line, for messages."""
@@ -88,7 +89,7 @@ class BusFault:
         Args:
             time_s: Time since the start [s].
         """
-        return self.from_s <= time_s < self.from_s + self.for_s
+        return -_SLACK_S <= time_s - self.from_s < self.for_s - _SLACK_S
 
     def as_table(self) -> dict[str, Any]:
         """Its table in a scenario; what is as by default is left out."""

@@ -258,11 +258,13 @@ class VirtualRobot:
 
     def _watch(self) -> None:
         """Say when servos get no commands any more."""
-        silent = self._latch.silent(self._pacer.now_ns(), round(WATCHDOG_S * _NS))
+        now_ns, longest_ns = self._pacer.now_ns(), round(WATCHDOG_S * _NS)
+        silent = self._latch.silent(now_ns, longest_ns)
         if bool(silent.any()) is not self._silent:
             self._silent = bool(silent.any())
             if self._silent:
-                names = self._listed(silent)
+                # Those of one burst are missed together, however late some of it came.
+                names = self._listed(self._latch.silent(now_ns, longest_ns // 2))
                 self._say("warn", f"no command for {WATCHDOG_S:g} s: {names} hold their angles")
             else:
                 self._say("info", "commands are back")

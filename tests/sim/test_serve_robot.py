@@ -1,0 +1,375 @@
+"""The virtual robot in one process with its controller: lockstep, the start, faults at work."""
+
+import dataclasses
+import math
+import threading
+import time
+
+import can
+import numpy as np
+import pytest
+
+from capture import load_robot
+from capture.bus.decoding import BusDecoder
+from capture.bus.encoding import BusEncoder
+from capture.interruption import StopRequest
+from capture.log.frames import ERROR_FLAG, empty_frames
+from capture.robot import Direction, Quantity
+from capture.robot.description import parse_robot
+from sim.gait import GaitTick
+from sim.scenario import CONTROL_RATE_HZ
+from sim.sensing import Noise, SensorModels, ServoPolling
+from sim.sensing.contract import JointSample
+from sim.serve.bus import VirtualBus
+from sim.serve.encode import ReplyEncoder
+from sim.serve.fault_line import FaultLine
+from sim.serve.faults import parse_faults
+from sim.serve.pacing import PATIENCE_NS, Pacer
+from sim.serve.robot import PERIOD_NS, VirtualRobot
+from sim.serve.socketcand_server import SocketcandServer
+from sim.twin import Twin
+
+JOINTS = 4
+STEP = math.radians(0.01)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """Five links with the frames of the shipped robot's first four joints."""
+    whole = load_robot("snake25")
+    joints = "".join(
+        f'  {{ name = "joint0{i + 1}", plane = "{("horizontal", "vertical")[i % 2]}" }},\n'
+        for i in range(JOINTS)
+    )
+    text = whole.toml
+    chain = text[text.index("joints = [") : text.index("[defaults.link]")]
+    text = text.replace(chain, f"joints = [\n{joints}]\n\n")
+    sensors = text[text.index("# Sharp GP2Y0A02") : text.index("# The paper names no bus")]
+    text = text.replace(sensors, "")
+    lines = [line for line in text.splitlines() if '"ranges_' not in line]
+    lines = [line for line in lines if "acceleration" not in line and "magnetic" not in line]
+    return parse_robot("\n".join(lines), "short.toml", dict(whole.databases))
+
+
+@pytest.fixture(scope="module")
+def scenario(make_scenario, robot):
+    servo = ServoPolling(slot_s=0.0005, resolution=STEP, command_resolution=STEP)
+    sensing = SensorModels(servo=servo)
+    noise = Noise(position=0.001)
+    return make_scenario(robot, duration_s=0.5, noise=noise, sensing=sensing)
+
+
+class Running:
+    """A virtual robot in a thread, and python-can's client of its bus."""
+
+    def __init__(self, scenario, *, fast=True, **options):
+        self.said = []
+        self.server = SocketcandServer("127.0.0.1", 0, "can0", self.say)
+        self.bus = VirtualBus(self.server, None, self.say)
+        self.stop = StopRequest()
+        self.pacer = Pacer(PERIOD_NS, fast=fast)
+        self.robot = VirtualRobot(
+            scenario, self.bus, self.pacer, say=self.say, stop=self.stop, **options
+        )
+        self.served = None
+        self.ready = threading.Event()
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+        assert self.ready.wait(60)
+        self.client = can.Bus(
+            interface="socketcand", host="127.0.0.1", port=self.server.address[1], channel="can0"
+        )
+        self.encoder = BusEncoder(scenario.robot, Direction.TX)
+
+    def say(self, level, text):
+        self.said.append(text)
+
+    def run(self):
+        try:
+            self.served = self.robot.run(self.ready.set)
+        finally:
+            self.ready.set()
+
+    def command(self, angles):
+        values = {(f"joint0{i + 1}", Quantity.COMMAND, ""): angle for i, angle in enumerate(angles)}
+        for frame in self.encoder.encode(values):
+            data = frame["data"][: frame["dlc"]].tobytes()
+            message = can.Message(
+                arbitration_id=int(frame["id_flags"]), is_extended_id=False, data=data
+            )
+            self.client.send(message)
+
+    def replies(self, count):
+        frames = empty_frames(count)
+        for frame in frames:
+            message = self.client.recv(60)
+            assert message is not None
+            frame["id_flags"] = message.arbitration_id | message.is_error_frame * ERROR_FLAG
+            frame["dlc"] = message.dlc
+            frame["data"][: message.dlc] = list(message.data)
+            frame["t_device_ns"] = round(message.timestamp * 1e6) * 1000
+        return frames
+
+    def ended(self):
+        self.thread.join(60)
+        assert not self.thread.is_alive()
+        return self.served
+
+    def close(self):
+        self.stop.signal = 15
+        self.thread.join(60)
+        self.client.shutdown()
+        self.bus.close()
+
+
+@pytest.fixture
+def running():
+    made = []
+
+    def start(*args, **options):
+        made.append(Running(*args, **options))
+        return made[-1]
+
+    yield start
+    for each in made:
+        each.close()
+
+
+def positions(robot, frames):
+    """Angles that frames of one cycle tell, in the order of the joints."""
+    samples, _ = BusDecoder(robot).decode(frames)
+    (found,) = [one for one in samples if one.signals[0].quantity is Quantity.POSITION]
+    order = [robot.joint_names.index(found.signals[k].target) for k in found.member]
+    angles = np.full(JOINTS, np.nan)
+    angles[order] = found.values
+    return angles
+
+
+def answer(angle, tick):
+    """A controller: straighten what it sees, and wave."""
+    seen = np.where(np.isnan(angle), 0.0, angle)
+    return np.clip(-0.5 * seen + 0.2 * math.sin(0.1 * tick), -0.4, 0.4)
+
+
+class Controller:
+    """The same as a gait."""
+
+    names = ()
+
+    def __init__(self):
+        self.tick = 0
+        self.told = []
+
+    def step(self, time_s, readings):
+        command = answer(readings.angle, self.tick)
+        self.tick += 1
+        self.told.append(command)
+        return GaitTick(command, np.empty(0), "test", ())
+
+
+def test_a_loop_closed_over_the_bus_in_lockstep_is_the_loop_in_process(scenario, robot, running):
+    with Twin(scenario, Controller()) as twin:
+        truth = [sample.position for s in twin.samples() for sample in s.sensed] + [
+            sample.position for sample in twin.flush()
+        ]
+    live = running(scenario, lockstep=True)
+    unknown = np.full(JOINTS, np.nan)
+    found = []
+    for tick in range(scenario.tick_count):
+        if tick >= 2:
+            found.append(live.replies(JOINTS))
+        live.command(answer(positions(robot, found[-1]) if found else unknown, tick))
+    found += [live.replies(JOINTS), live.replies(JOINTS)]
+    served = live.ended()
+    assert (served.complete, served.commands) == (True, JOINTS * scenario.tick_count)
+    told = np.array([positions(robot, frames) for frames in found])
+    np.testing.assert_allclose(told, truth, rtol=0, atol=1e-12)
+    times = np.array([frames["t_device_ns"].astype(np.int64) for frames in found])
+    expected = PERIOD_NS * np.arange(len(found))[:, None] + 500_000 * np.arange(JOINTS)
+    expected[-1] = expected[-1, 0]  # the end of the run has no turns any more
+    assert np.array_equal(times - times[0, 0], expected)
+
+
+def test_commands_in_steps_are_the_same_in_process(scenario):
+    with Twin(scenario) as twin:
+        commands = np.array([sample.gait.command for sample in twin.samples()])
+    np.testing.assert_allclose(np.rint(commands / STEP) * STEP, commands, rtol=0, atol=1e-15)
+    assert len(np.unique(commands[:, 0])) > 20
+
+
+def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, running):
+    live = running(scenario.changed(duration_s=0.3), fast=False, wait=True)
+    time.sleep(0.3)
+    assert live.pacer.tally.ticks == 0
+    before = live.pacer.now_ns()
+    live.command([0.1] * JOINTS)
+    served = live.ended()
+    assert served.complete
+    assert served.start_ns > before + PERIOD_NS // 2 - 1_000_000
+    frames = live.replies(31 * JOINTS)
+    cycles = frames["t_device_ns"].reshape(-1, JOINTS).astype(np.int64) - served.start_ns
+    stood_still = round(served.pace.stood_still_s * 1e9)
+    assert cycles[0, 0] == 0
+    assert cycles[-1, 0] <= 30 * PERIOD_NS + stood_still + 1000
+    assert any("starts at" in text for text in live.said)
+
+
+def test_without_commands_it_holds_still_and_says_whose_commands_are_missing(scenario, running):
+    live = running(scenario.changed(duration_s=0.5), lockstep=True)
+    live.command([0.0] * (JOINTS - 1))
+    deadline = time.monotonic() + 60
+    while "waits for commands of joint04" not in live.said:
+        assert time.monotonic() < deadline, live.said
+        time.sleep(0.05)
+    live.stop.signal = 15
+    served = live.ended()
+    assert (served.complete, served.duration_s) == (False, 0.0)
+
+
+def test_silence_of_the_controller_is_told_and_so_is_its_return(scenario, running):
+    live = running(scenario.changed(duration_s=30.0), fast=False, wait=True)
+
+    def until(part):
+        deadline = time.monotonic() + 60
+        while not any(part in text for text in live.said):
+            assert time.monotonic() < deadline, live.said
+            time.sleep(0.02)
+
+    live.command([0.6] * JOINTS)
+    until("no command for 0.5 s: joint01, joint02, joint03, joint04 hold their angles")
+    live.command([0.1] * JOINTS)
+    until("commands are back")
+    until("joint01 was told to go beyond its limits, and stops there")
+
+
+# -- pacing ----------------------------------------------------------------------------------
+
+
+def test_a_tick_that_comes_much_too_late_leaves_a_gap_and_no_time_goes_back():
+    pacer = Pacer(PERIOD_NS)
+    pacer.start(pacer.now_ns())
+    start = pacer.start_ns
+    assert start % 1000 == 0
+    late = -1.0
+    for tick in range(12):
+        while (wait_s := pacer.wait_s(tick)) > 0.0:
+            time.sleep(wait_s)
+        if tick == 10:
+            time.sleep(2 * PATIENCE_NS * 1e-9)
+        stood_still = pacer.begin(tick)
+        if tick == 10:
+            late = stood_still
+    assert late >= 2 * PATIENCE_NS * 1e-9
+    assert pacer.tally.overruns >= 1
+    assert pacer.tally.worst_s >= late
+    times = np.array([pacer.clock_ns(k * PERIOD_NS) for k in range(13)])
+    steps = np.diff(times)
+    assert (steps >= PERIOD_NS).all()
+    assert times[10] - start >= 10 * PERIOD_NS + 1e9 * late - 1
+    assert pacer.clock_ns(12 * PERIOD_NS + 7_000_000) == times[12] + 7_000_000
+
+
+def test_a_fast_clock_shows_simulated_time():
+    pacer = Pacer(PERIOD_NS, fast=True)
+    pacer.start(123)
+    for tick in range(5):
+        assert pacer.wait_s(tick) == 0.0
+        assert pacer.begin(tick) == 0.0
+        assert pacer.now_ns() == pacer.clock_ns(tick * PERIOD_NS) == tick * PERIOD_NS
+    assert pacer.tally.overruns == 0
+
+
+# -- faults ----------------------------------------------------------------------------------
+
+
+def cycles(robot, line, count):
+    """What the bus shows of so many polling cycles, by tick."""
+    encoder = ReplyEncoder(robot)
+    rng = np.random.default_rng(1)
+    shown = []
+    for tick in range(count):
+        values = rng.uniform(-0.5, 0.5, (5, JOINTS))
+        sample = JointSample(tick, np.zeros(JOINTS), *values)
+        time_s = tick / CONTROL_RATE_HZ
+        frames = encoder.frames(line.samples([sample], time_s), lambda t: t)
+        shown.append(line.replies(frames, tick * PERIOD_NS, time_s))
+    return shown
+
+
+def fault_line(robot, *texts, seed=1):
+    return FaultLine(parse_faults(texts, robot), robot, ReplyEncoder(robot), seed)
+
+
+def test_without_faults_nothing_is_changed(robot):
+    shown = cycles(robot, fault_line(robot), 5)
+    assert [frames["id_flags"].tolist() for frames in shown] == [[513, 514, 515, 516]] * 5
+
+
+def test_lost_replies_are_those_of_the_joint_in_the_share_that_was_ordered(robot):
+    line = fault_line(robot, "lost:joint02:0.3")
+    shown = np.concatenate(cycles(robot, line, 2000))
+    counts = {k: int((shown["id_flags"] == k).sum()) for k in (513, 514, 515, 516)}
+    assert counts[513] == counts[515] == counts[516] == 2000
+    assert counts[514] == 2000 - line.lost
+    # 5 standard deviations of the binomial distribution
+    assert abs(line.lost - 600) < 5 * math.sqrt(2000 * 0.3 * 0.7)
+    again = np.concatenate(cycles(robot, fault_line(robot, "lost:joint02:0.3"), 2000))
+    other = np.concatenate(cycles(robot, fault_line(robot, "lost:joint02:0.3", seed=2), 2000))
+    assert again.tobytes() == shown.tobytes()
+    assert other.tobytes() != shown.tobytes()
+    everyone = fault_line(robot, "lost:1@0.5+0.25")
+    sizes = [len(frames) for frames in cycles(robot, everyone, 100)]
+    assert sizes == [4] * 50 + [0] * 25 + [4] * 25
+
+
+def test_noise_makes_error_frames_and_every_frame_gets_through(robot):
+    line = fault_line(robot, "noise:0.2")
+    shown = np.concatenate(cycles(robot, line, 1000))
+    errors = (shown["id_flags"] & ERROR_FLAG) != 0
+    assert int(errors.sum()) == line.hit
+    assert shown["id_flags"][~errors].tolist() == [513, 514, 515, 516] * 1000
+    # attempts until the first success: p / (1 - p) failures a frame on average
+    assert abs(line.hit - 1000) < 5 * math.sqrt(4000 * 0.2 / 0.8**2)
+
+
+def test_delayed_frames_keep_their_times_and_their_order(robot):
+    shown = cycles(robot, fault_line(robot, "delay:0.02@0.05+0.03"), 20)
+    sizes = [len(frames) for frames in shown]
+    assert sizes == [4] * 5 + [0, 0, 4, 8, 8] + [4] * 10
+    times = np.concatenate(shown)["t_device_ns"] // PERIOD_NS
+    assert sorted(times.tolist()) == np.repeat(np.arange(20), 4).tolist()
+    assert shown[7]["t_device_ns"].tolist() == [5 * PERIOD_NS] * 4
+
+
+def test_off_the_bus_the_robot_neither_speaks_nor_hears(robot):
+    line = fault_line(robot, "bus-off@0.05+0.1")
+    shown = cycles(robot, line, 30)
+    assert [len(frames) for frames in shown] == [4] * 5 + [1] + [0] * 9 + [5] + [4] * 14
+    assert shown[5]["id_flags"].tolist() == [ERROR_FLAG | 0x40]
+    assert shown[15]["id_flags"].tolist() == [ERROR_FLAG | 0x100, 513, 514, 515, 516]
+    assert [line.hears(t) for t in (0.04, 0.05, 0.14, 0.15)] == [True, False, False, True]
+
+
+def test_a_frozen_encoder_tells_its_last_angle_and_a_stuck_servo_holds_it(robot):
+    line = fault_line(robot, "frozen:joint03@0.1", "stuck:joint01@0.1+0.1")
+    shown = cycles(robot, line, 30)
+    told = np.array([positions(robot, frames) for frames in shown])
+    assert len(np.unique(told[:10, 2])) == 10
+    assert len(np.unique(told[10:, 2])) == 1
+    assert len(np.unique(told[:, 0])) == 30
+    command, angle = np.full(JOINTS, 0.3), np.full(JOINTS, 0.1)
+    assert line.command(command, angle, 0.05).tolist() == [0.3] * 4
+    assert line.command(command, angle, 0.10).tolist() == [0.1, 0.3, 0.3, 0.3]
+    assert line.command(-command, angle + 1, 0.15).tolist() == [0.1, -0.3, -0.3, -0.3]
+    assert line.command(-command, angle, 0.20).tolist() == [-0.3] * 4
+
+
+def test_a_stuck_servo_does_not_follow_its_commands(scenario, robot, running):
+    stuck = parse_faults(["stuck:joint01@0.2"], robot)
+    quiet = dataclasses.replace(scenario.changed(duration_s=1.0), noise=Noise())
+    live = running(quiet, lockstep=True, faults=stuck)
+    for tick in range(quiet.tick_count):
+        live.command([0.3 * math.sin(0.1 * tick), 0.0, 0.3 * math.sin(0.1 * tick), 0.0])
+    frames = live.replies(JOINTS * quiet.tick_count).reshape(-1, JOINTS)
+    told = np.array([positions(robot, one) for one in frames])
+    assert np.ptp(told[40:, 0]) < 0.1 * np.ptp(told[40:, 2])
