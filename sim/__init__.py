@@ -7,7 +7,15 @@ from .gait import Gait, GaitTick, PlaneGait, Serpentine, SerpentineGait, Wave
 from .readings import Readings
 from .scenario import Scenario
 from .scenario_file import load_scenario, parse_scenario, scenario_names
-from .sensing import Noise, SensorModels, ServoPolling
+from .sensing import (
+    AccelerometerModel,
+    CompassModel,
+    InfraredModel,
+    Noise,
+    SensorModels,
+    ServoPolling,
+    SonarModel,
+)
 from .world import (
     Box,
     Cylinder,
@@ -21,12 +29,15 @@ from .world import (
 )
 
 __all__ = [
+    "AccelerometerModel",
     "Box",
+    "CompassModel",
     "Cylinder",
     "FrictionLaw",
     "Gait",
     "GaitTick",
     "Ground",
+    "InfraredModel",
     "Noise",
     "ObstacleMaterial",
     "PlaneGait",
@@ -37,6 +48,7 @@ __all__ = [
     "Serpentine",
     "SerpentineGait",
     "ServoPolling",
+    "SonarModel",
     "Target",
     "Wall",
     "Wave",
