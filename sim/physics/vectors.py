@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from capture.arrays import FloatArray
+import numpy as np
 
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+from capture.arrays import FloatArray, frozen
+
+_NEXT, _LAST = frozen(np.array([1, 2, 0])), frozen(np.array([2, 0, 1]))
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products; ``numpy.cross`` costs more than twice as much on short arrays.
+    """Cross products; ``numpy.cross`` costs six times as much on short arrays.
 
     Args:
         a: Vectors, shape (3, n).
@@ -17,7 +19,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     Returns:
         a x b, shape (3, n).
     """
-    return a[_NEXT] * b[_LAST] - a[_LAST] * b[_NEXT]
+    return a.take(_NEXT, 0) * b.take(_LAST, 0) - a.take(_LAST, 0) * b.take(_NEXT, 0)
 
 
 def into_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
