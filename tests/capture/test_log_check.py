@@ -1,84 +1,37 @@
-"""``log check`` against planted truth: each fault is found, counted and placed, nothing else is."""
+"""`undulog log check` against faults planted in the rhythm and the values of a clean session."""
 
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Callable
+import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType
-from mcap.writer import Writer as McapWriter
-from mcap_ros2.writer import Writer as RosWriter
 
 import undulog
-from capture import SessionWriter, load_robot
-from capture.log.bus_tally import BusTally, frame_bits
-from capture.log.cdr import encode
-from capture.log.chunk import walk_records
-from capture.log.frames import ERROR_FLAG, EXTENDED_FLAG, empty_frames
-from capture.log.schemas import message_type, schema_text
 from capture.log.session_check import SessionHealth, check_session
-from capture.log.tallies import SequenceTally, Timing, TimingTally
+from capture.log.tallies import SequenceTally, TimingTally
 
-EPOCH_NS = 1_700_000_000_000_000_000
-STEP_NS = 10_000_000
-ROBOT = load_robot("snake25")
-NAMES = ROBOT.joint_names
-TICKS = 2000
-JOINT_STATE = "sensor_msgs/msg/JointState"
-ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"
-
-Edit = Callable[[int, np.ndarray, np.ndarray], int | None]
-"""Tick, command and measured angles (edited in place) to stamp; None leaves the state out."""
-
-
-def gait(tick: int) -> np.ndarray:
-    return 0.4 * np.sin(np.pi * tick / 100 - 0.5 * np.arange(len(NAMES)))
-
-
-def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> Path:
-    """20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
-    noise = np.random.default_rng(3).normal(0.0, 1e-3, (TICKS, len(NAMES)))
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
-        for tick in range(TICKS):
-            command, angles = gait(tick), gait(tick - 5) + noise[tick]
-            log_ns = EPOCH_NS + tick * STEP_NS
-            t_ns: int | None = log_ns
-            if edit is not None:
-                t_ns = edit(tick, command, angles)
-            commands.write(log_ns, command)
-            if t_ns is not None:
-                states.write(t_ns, angles, command, log_time_ns=log_ns)
-        if verdict is not None:
-            writer.set_verdict(verdict, ["so said the recorder"])
-    return path
-
-
-def at(tick: int) -> int:
-    return EPOCH_NS + tick * STEP_NS
-
-
-def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
-    (found,) = [each.timing for each in health.series if each.topic == topic]
-    return found
+shared = runpy.run_path(str(Path(__file__).with_name("checked_sessions.py")))
+EPOCH_NS = shared["EPOCH_NS"]
+STEP_NS = shared["STEP_NS"]
+ROBOT = shared["ROBOT"]
+NAMES = shared["NAMES"]
+TICKS = shared["TICKS"]
+Edit = shared["Edit"]
+write = shared["write"]
+at = shared["at"]
+timing_of = shared["timing_of"]
+clean = shared["clean"]
+write_raw = shared["write_raw"]
 
 
 def joint_of(health: SessionHealth, name: str, topic: str = "/joint_states"):
     (found,) = [each for each in health.joints if (each.topic, each.name) == (topic, name)]
     return found
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("clean") / "clean.mcap", verdict="good")
 
 
 # -- the clean twin ----------------------------------------------------------------------------
@@ -226,24 +179,7 @@ def test_blocks_don_t_change_a_timing(steps: list[int], cuts: list[int]) -> None
     )
 
 
-# -- sequence numbers --------------------------------------------------------------------------
-
-
-def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
-    """JointState messages of three joints with sequence numbers of our choice."""
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, **options)
-        writer.start(profile="ros2", library="test")
-        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
-        for topic in ("/joint_commands", "/joint_states"):
-            channel = writer.register_channel(topic, "cdr", schema)
-            for k, sequence in enumerate(sequences):
-                stamp = {"sec": at(k) // 10**9, "nanosec": at(k) % 10**9}
-                values = {"header": {"stamp": stamp}, "name": list("abc"), "position": gait(k)[:3]}
-                message = encode(message_type(JOINT_STATE), values)
-                writer.add_message(channel, at(k), message, at(k), sequence)
-        writer.finish()
-    return path
+# -- sequence numbers ------------------------------------------------------------------------------
 
 
 def test_dropped_sequence_numbers_are_proved(tmp_path: Path) -> None:
@@ -335,239 +271,3 @@ def test_a_joint_held_at_its_limit_is_named_and_a_full_stroke_is_not(tmp_path: P
         "/joint_states, joint03",
         "/joint_commands, joint03",
     }
-
-
-# -- planted in the file -----------------------------------------------------------------------
-
-
-def chunk_spans(path: Path) -> list[tuple[int, int]]:
-    with path.open("rb") as stream:
-        indexes = make_reader(stream).get_summary().chunk_indexes
-    return [(index.chunk_start_offset, index.chunk_length) for index in indexes]
-
-
-@pytest.mark.parametrize("part", [0.02, 0.5, 0.9])
-def test_a_flipped_bit_is_found_and_bad(clean: Path, tmp_path: Path, part: float) -> None:
-    start, length = chunk_spans(clean)[1]
-    data = bytearray(clean.read_bytes())
-    data[start + 60 + int(part * (length - 60))] ^= 0x10
-    (tmp_path / "s.mcap").write_bytes(data)
-    health = check_session(tmp_path / "s.mcap")
-    assert health.verdict == "bad"
-    assert health.file.checked == health.file.chunks - 1
-    assert len(health.file.damage) == 1
-    assert "the chunk at byte" in health.file.damage[0]
-    lost = {each.sequence.dropped for each in health.channels}
-    assert len(lost) <= 2
-    assert 0 < sum(lost) < 2 * TICKS  # what the chunk held is proved by the numbers around it
-
-
-@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
-@pytest.mark.parametrize("indexed", [True, False])
-def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
-    tmp_path: Path, compression: CompressionType, indexed: bool
-) -> None:
-    kinds = IndexType.ALL if indexed else IndexType.NONE
-    options = {"compression": compression, "chunk_size": 20_000, "index_types": kinds}
-    path = write_raw(tmp_path / "s.mcap", list(range(500)), **options)
-    data = bytearray(path.read_bytes())
-    chunks = [span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 6]
-    assert check_session(path).file.damage == ()
-    _, start, stop = chunks[2]
-    data[(start + stop) // 2] ^= 0x10
-    path.write_bytes(data)
-    health = check_session(path)
-    assert health.verdict == "bad"
-    assert len(health.file.damage) == 1
-    assert health.file.indexed is indexed
-
-
-def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "s.mcap", list(range(100)))
-    data = bytearray(path.read_bytes())
-    _, start, _ = next(span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 7)
-    data[start + 14 : start + 22] = data[start + 30 : start + 38]  # no CRC covers it
-    path.write_bytes(data)
-    health = check_session(path)
-    assert health.verdict == "bad"
-    assert "does not list its messages" in health.file.damage[0]
-
-
-def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "s.mcap", list(range(100)), enable_crcs=False)
-    data = bytearray(path.read_bytes())
-    counts = struct.pack("<HQHQ", 1, 100, 2, 100)
-    assert data.count(counts) == 1
-    at_count = data.index(counts) + 2
-    data[at_count : at_count + 8] = struct.pack("<Q", 107)
-    path.write_bytes(data)
-    assert check_session(path).file.damage == (
-        "the summary counts 107 messages of /joint_commands, 100 are in the file",
-    )
-
-
-def test_a_flipped_bit_in_an_attachment_is_found(clean: Path, tmp_path: Path) -> None:
-    data = bytearray(clean.read_bytes())
-    data[data.index(b"+-30 degrees")] ^= 1
-    (tmp_path / "s.mcap").write_bytes(data)
-    health = check_session(tmp_path / "s.mcap")
-    assert health.verdict == "bad"
-    assert "the attachment" in health.file.damage[0]
-
-
-def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Path) -> None:
-    start, length = chunk_spans(clean)[1]
-    (tmp_path / "s.mcap").write_bytes(clean.read_bytes()[: start + length // 2])
-    health = check_session(tmp_path / "s.mcap")
-    assert health.file.truncated
-    assert health.verdict == "degraded"
-    assert health.reasons[0].startswith("the file is cut short")
-    assert 0 < timing_of(health).count < TICKS
-    assert health.stored is None
-
-
-def test_a_file_without_index_is_degraded(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False)
-    health = check_session(path)
-    assert not health.file.truncated
-    assert not health.file.indexed
-    assert health.verdict == "degraded"
-    assert timing_of(health).count == 300
-
-
-def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
-    health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), enable_crcs=False))
-    assert health.verdict == "good"
-    assert "carry no CRC" in health.notes[0]
-
-
-# -- foreign bags ------------------------------------------------------------------------------
-
-
-def write_foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
-    """Each tick one message a list of names, as mcap-ros2-support writes them."""
-    with path.open("wb") as stream:
-        writer = RosWriter(stream)
-        schema = writer.register_msgdef(JOINT_STATE, schema_text(JOINT_STATE))
-        for tick in range(400):
-            for k, group in enumerate(names):
-                t_ns = at(tick) + k * 200_000
-                stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
-                position = [float(np.sin(tick / 20 + k))] * len(group)
-                message = {"header": {"stamp": stamp}, "name": group, "position": position}
-                writer.write_message(topic, schema, message, log_time=t_ns, publish_time=t_ns)
-        writer.finish()
-    return path
-
-
-def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
-    path = write_foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
-    health = check_session(path)
-    assert {each.label: each.timing.gaps for each in health.series} == {
-        "/joint_states (a)": 0,
-        "/joint_states (b)": 0,
-        "/joint_states (c)": 0,
-    }
-    assert [each.sequence.kind for each in health.channels] == ["none"]
-    assert health.reasons == ("/joint_commands is missing; JointStates are on /joint_states",)
-
-
-def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
-    health = check_session(write_foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
-    assert health.verdict == "degraded"
-    assert "/joint_states is missing; JointStates are on /arm/state" in health.reasons
-    with SessionWriter(tmp_path / "t.mcap", session_id="t", epoch_ns=EPOCH_NS) as writer:
-        writer.string("/gait/mode").write(EPOCH_NS, "walk")
-    assert check_session(tmp_path / "t.mcap").verdict == "bad"
-
-
-def test_a_joint_that_never_speaks_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "s.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES[:-1], unit="rad")
-        for tick in range(300):
-            commands.write(at(tick), gait(tick))
-            states.write(at(tick), gait(tick)[:-1] + 1e-3 * np.sin(tick))
-    assert check_session(path).reasons == ("/joint_states never carries joint25",)
-
-
-def test_what_is_no_log_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "x.mcap").write_bytes(b"no log at all")
-    assert undulog.run(["log", "check", str(tmp_path / "x.mcap")]) == 1
-    assert "not an MCAP file" in capsys.readouterr().err
-
-
-# -- raw frames --------------------------------------------------------------------------------
-
-
-def test_frame_lengths_are_those_of_the_paper() -> None:
-    frames = empty_frames(4)
-    frames["dlc"] = [8, 8, 0, 8]
-    frames["id_flags"] = [0x123, 0x123 | EXTENDED_FLAG, 0x123, 0x123 | ERROR_FLAG]
-    fewest, most = frame_bits(frames)
-    # Davis et al. (2007): at most 135 bits with 11-bit and 160 with 29-bit identifiers, 8 bytes.
-    assert most.tolist() == [135, 160, 55, 0]
-    assert fewest.tolist() == [111, 131, 47, 0]
-
-
-def test_load_rate_silence_and_errors_of_a_bus() -> None:
-    tally = BusTally()
-    frames = empty_frames(4001)
-    t_ns = EPOCH_NS + np.arange(4001) * 1_000_000
-    t_ns[2000:] += 1_500_000_000
-    frames["t_host_ns"], frames["dlc"] = t_ns, 8
-    frames["id_flags"][::100] = ERROR_FLAG
-    for part in np.split(frames, [1, 700, 3000]):
-        tally.add(part)
-    bus = tally.result("/can/can0", 250_000)
-    assert (bus.frames, bus.error_frames) == (4001, 41)
-    assert bus.rate_hz == pytest.approx(4000 / 5.5)
-    assert (bus.longest_s, bus.longest_at_ns) == (1.501, EPOCH_NS + 1_999_000_000)
-    assert bus.load == pytest.approx((3960 * 111 / 5.5 / 250_000, 3960 * 135 / 5.5 / 250_000))
-    assert bus.peak_load == pytest.approx((990 * 111 / 250_000, 990 * 135 / 250_000))
-
-
-def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path: Path) -> None:
-    path = tmp_path / "s.mcap"
-    sizes = np.random.default_rng(5).integers(0, 40, 300)
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        bus = writer.frames("/can/can0")
-        for k, size in enumerate(sizes.tolist()):
-            frames = empty_frames(size)
-            frames["t_host_ns"] = at(k) + np.arange(size) * 1000
-            frames["dlc"] = 8
-            bus.write(at(k), frames)
-    health = check_session(path)
-    (found,) = health.buses
-    assert found.frames == sizes.sum()
-    assert found.load is not None
-    assert any("there are raw CAN frames" in sentence for sentence in health.reasons)
-
-
-def test_a_real_trace_has_its_own_frame_count(tmp_path: Path) -> None:
-    trace = ARCSNAKE / "linear_trajectory.candump.log"
-    if not trace.is_file():
-        pytest.skip("the recording of ArcSnake is not there")
-    output = tmp_path / "s.mcap"
-    done = undulog.run(["import", str(trace), "-o", str(output), "--robot", "arcsnake-joint"])
-    assert done == 0
-    health = check_session(output)
-    (bus,) = health.buses
-    assert bus.frames == len(trace.read_text().splitlines()) == 19_297
-    assert bus.error_frames == 0
-    # 1,787 frames a second of 111 to 135 bits on 1 Mbit/s.
-    assert bus.load == pytest.approx((0.198, 0.241), abs=0.003)
-    # The trace pauses before the motion and its log stamps have holes; it is fit for use.
-    assert health.verdict == "degraded"
-    stamps = [float(line.split(")")[0][1:]) for line in trace.read_text().splitlines()]
-    assert bus.longest_s == pytest.approx(np.diff(stamps).max(), abs=1e-6)
-
-
-def test_struct_of_the_chunk_header_is_that_of_the_spec(clean: Path) -> None:
-    start, _ = chunk_spans(clean)[0]
-    head = clean.read_bytes()[start + 9 : start + 9 + 32]
-    begin, end, _, crc, size = struct.unpack("<QQQII", head)
-    assert EPOCH_NS <= begin <= end <= at(TICKS)
-    assert crc
-    assert size == len("zstd")

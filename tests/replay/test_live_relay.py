@@ -1,270 +1,35 @@
-"""The live view against the replay of the same session, through real sockets and processes."""
+"""The relay of the live view against frozen, killed, late and noisy processes."""
 
-import json
 import os
-import re
+import runpy
 import signal
 import socket
-import subprocess
-import sys
-import time
-import urllib.request
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
-import undulog
-from capture import Session, SessionWriter
+from capture import SessionWriter
 from capture.daemon import live_feed
-from capture.daemon.live_feed import LiveFeed
 from capture.daemon.live_spawn import spawn_relay
 from capture.daemon.live_wire import DatagramHead, Kind, pack_datagram
 from capture.errors import UsageError
 from replay.live_inbox import Inbox
-from replay.rrd import write_recording
-from replay.viewer import free_ports, viewer_binary
 
-EPOCH_NS = 1_735_689_600_000_000_000
-STEP_NS = 20_000_000
-WAIT_S = 90
-
-
-def until(condition, *, each=lambda: None):
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        each()
-        time.sleep(0.005)
-
-
-def freeze(pid):
-    """Stop a process, and wait until all its threads stand."""
-    os.kill(pid, signal.SIGSTOP)
-    threads = Path(f"/proc/{pid}/task")
-
-    def stands():
-        states = [
-            (one / "stat").read_text().rpartition(")")[2].split()[0] for one in threads.iterdir()
-        ]
-        return set(states) == {"T"}
-
-    until(stands)
-
-
-class Recorder:
-    """Sends a session's messages, as a recorder would, but as fast as the relay takes them."""
-
-    def __init__(self, session, socket_path):
-        with session.open("rb") as stream:
-            reader = make_reader(stream)
-            summary = reader.get_summary()
-            self.definitions = [
-                *reader.iter_metadata(),
-                *summary.schemas.values(),
-                *summary.channels.values(),
-                *reader.iter_attachments(),
-            ]
-            self.messages = [
-                (m.channel_id, m.log_time, m.publish_time, m.sequence, m.data)
-                for _, _, m in reader.iter_messages()
-            ]
-        self.feed = LiveFeed(socket_path)
-        for one in self.definitions:
-            self.feed.define(one)
-
-    def connect(self):
-        until(lambda: self.feed.connected, each=self.feed.pump)
-
-    def send(self, start_s=0.0, stop_s=np.inf, *, wait=True):
-        """Messages of a stretch of time; returns how many ticks there were."""
-        ticks, at_ns = 0, EPOCH_NS
-        for message in self.messages:
-            if not start_s <= (message[1] - EPOCH_NS) * 1e-9 < stop_s:
-                continue
-            if message[1] >= at_ns + STEP_NS:
-                at_ns = message[1]
-                self.feed.pump()
-                ticks += 1
-                if wait:
-                    until(lambda: self.feed.queued == 0, each=self.feed.pump)
-            self.feed.offer(*message)
-        if wait:
-            until(lambda: self.feed.queued == 0, each=self.feed.pump)
-        return ticks
-
-
-class Relay:
-    """The verb in a process of its own."""
-
-    def __init__(self, socket_path, output, *more):
-        self.output = output
-        command = [sys.executable, "-m", "undulog", "view", "--live", socket_path]
-        if output is not None:
-            command += ["--save", output, "--json", "--force"]
-        self.process = subprocess.Popen(
-            [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        until(lambda: socket_path.is_socket() or self.process.poll() is not None)
-
-    def finish(self):
-        out, err = self.process.communicate(timeout=WAIT_S)
-        assert self.process.returncode == 0, err
-        return json.loads(out)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_datagrams():
-    """Sent after 2 ms rather than 20, so that sending takes no time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live_feed, "_FILL_NS", 2_000_000)
-        yield
-
-
-@pytest.fixture
-def stage(tmp_path, session_file):
-    """Makes recorders and relays on one socket; none of them is left."""
-    socket_path = tmp_path / "live.sock"
-    with ExitStack() as stack:
-
-        class Stage:
-            path = socket_path
-
-            @staticmethod
-            def recorder(session=session_file):
-                one = Recorder(session, socket_path)
-                stack.callback(one.feed.close)
-                return one
-
-            @staticmethod
-            def relay(name="live.rrd", *more):
-                one = Relay(socket_path, tmp_path / name if name else None, *more)
-                stack.callback(one.process.communicate)
-                stack.callback(one.process.kill)
-                return one
-
-        yield Stage
-
-
-@pytest.fixture(scope="module")
-def live(session_file, tmp_path_factory, read_back):
-    """The whole session seen live: (what the relay reports, what it drew)."""
-    folder = tmp_path_factory.mktemp("live")
-    socket_path = folder / "live.sock"
-    relay = Relay(socket_path, folder / "live.rrd")
-    try:
-        recorder = Recorder(session_file, socket_path)
-        recorder.connect()
-        recorder.send()
-        recorder.feed.close()
-        return relay.finish(), read_back(relay.output)
-    finally:
-        relay.process.kill()
-        relay.process.communicate()
-
-
-@pytest.fixture(scope="module")
-def replay(session_file, tmp_path_factory, read_back):
-    """The same session as a replay."""
-    path = tmp_path_factory.mktemp("replay") / "replay.rrd"
-    with Session.open(session_file) as session:
-        write_recording(session, path)
-    return read_back(path)
+shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
+EPOCH_NS = shared["EPOCH_NS"]
+WAIT_S = shared["WAIT_S"]
+until = shared["until"]
+freeze = shared["freeze"]
+Recorder = shared["Recorder"]
+stage = shared["stage"]
+small_datagrams = shared["small_datagrams"]
 
 
 def rows(recorded, entity, component):
     """Time to values, in order."""
     found = zip(recorded.times(entity).tolist(), recorded.column(entity, component), strict=True)
     return dict(sorted((t, v) for t, v in found if v is not None))
-
-
-def same(first, second):
-    return np.allclose(
-        np.asarray(first, dtype=float), np.asarray(second, dtype=float), atol=1e-12, equal_nan=True
-    )
-
-
-def test_every_message_is_shown(live, session_file):
-    report, _ = live
-    with Session.open(session_file) as session:
-        count = sum(channel.count for channel in session.channels.values())
-    assert report["sessions"] == ["made-for-tests"]
-    assert (report["shown"], report["dropped"], report["unread"]) == (count, 0, 0)
-    assert report["lag_s"]["p50"] > 0
-
-
-def test_angles_are_those_that_were_measured(live, truth):
-    _, drawn = live
-    t_ns = truth.t_ns - EPOCH_NS
-    for entity, values in (
-        ("/joints/measured", truth.position),
-        ("/joints/commanded", truth.command),
-        ("/joints/error", truth.position - truth.command),
-    ):
-        found = rows(drawn, entity, "Scalars:scalars")
-        assert list(found) == t_ns.tolist()
-        np.testing.assert_allclose(list(found.values()), values, atol=1e-12)
-    degrees = rows(drawn, "/joints/measured", "Angle:degrees")
-    np.testing.assert_allclose(list(degrees.values()), np.degrees(truth.position), rtol=1e-5)
-
-
-def test_power_is_torque_times_velocity(live, truth):
-    _, drawn = live
-    found = rows(drawn, "/power/mechanical", "Scalars:scalars")
-    assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
-    np.testing.assert_allclose(list(found.values()), truth.effort * truth.velocity, atol=1e-12)
-    total = rows(drawn, "/power/total/electrical", "Scalars:scalars")
-    np.testing.assert_allclose(np.ravel(list(total.values())), 6.0 * truth.effort.sum(axis=1))
-
-
-@pytest.mark.parametrize(
-    ("entity", "component"),
-    [
-        ("/world/snake/measured", "Capsules3D:translations"),
-        ("/world/snake/measured", "Capsules3D:quaternions"),
-        ("/world/snake/commanded", "Capsules3D:translations"),
-        ("/world/snake/places", "Points3D:positions"),
-        ("/joints/places/head/measured", "Scalars:scalars"),
-        ("/joints/error", "Scalars:scalars"),
-        ("/signals/joint_current", "Scalars:scalars"),
-        ("/gait/mode", "StateChange:state"),
-        ("/events", "TextLog:text"),
-    ],
-)
-def test_live_and_replay_draw_the_same(live, replay, entity, component):
-    _, drawn = live
-    seen, expected = rows(drawn, entity, component), rows(replay, entity, component)
-    common = [t for t in expected if t in seen]
-    assert len(common) >= 0.9 * len(expected)
-    for t in common:
-        if isinstance(expected[t][0], str):
-            assert seen[t] == expected[t]
-        else:
-            assert same(seen[t], expected[t])
-
-
-def test_names_and_colours_are_the_replays(live, replay):
-    _, drawn = live
-    for entity in ("/joints/measured", "/joints/commanded", "/power/total/mechanical"):
-        for component in ("SeriesLines:names", "SeriesLines:colors"):
-            assert drawn.static(entity, component) == replay.static(entity, component)
-
-
-def test_whatever_is_drawn_is_in_the_replay_too(live, replay):
-    _, drawn = live
-    assert {entity for entity in drawn.entities if not entity.startswith("/__")} <= replay.entities
-
-
-def test_static_things_are_said_once(live):
-    _, drawn = live
-    chunks = [
-        chunk
-        for chunk in drawn._chunks
-        if chunk.entity_path == "/joints/measured" and chunk.is_static
-    ]
-    assert len(chunks) == 1
 
 
 def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):
@@ -470,103 +235,3 @@ def test_frozen_relay_that_was_spawned_can_be_ended(stage, monkeypatch):
     freeze(relay.pid)
     relay.close()
     assert relay.poll() == -signal.SIGKILL
-
-
-@pytest.fixture
-def server(tmp_path):
-    """Rerun's own gRPC server without a window, on this machine only: (address, process)."""
-    (port,) = free_ports(1)
-    process = subprocess.Popen(
-        [viewer_binary(), "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    yield f"rerun+http://127.0.0.1:{port}/proxy", process
-    process.kill()
-    process.wait()
-
-
-@pytest.mark.slow
-def test_frozen_and_killed_viewer_costs_the_feed_nothing(stage, server):
-    address, process = server
-    recorder, relay = stage.recorder(), stage.relay(None, "--connect", address)
-    recorder.connect()
-    recorder.send(0.0, 1.0)
-    freeze(process.pid)
-    assert recorder.send(1.0, 2.0) == 50
-    process.kill()
-    assert recorder.send(2.0) >= 49
-    assert recorder.feed.counts.dropped == 0
-    assert relay.process.poll() is None
-    relay.process.send_signal(signal.SIGTERM)
-    relay.process.communicate(timeout=WAIT_S)
-    assert not stage.path.exists()
-
-
-@pytest.mark.slow
-def test_relay_of_a_frozen_viewer_can_be_ended(stage, server):
-    address, process = server
-    recorder, relay = stage.recorder(), stage.relay(None, "--connect", address)
-    recorder.connect()
-    recorder.send(0.0, 1.0)
-    freeze(process.pid)
-    recorder.send(1.0)
-    relay.process.send_signal(signal.SIGTERM)
-    out, err = relay.process.communicate(timeout=WAIT_S)
-    assert relay.process.returncode == 1
-    assert "messages shown, 0 dropped" in out
-    # Whether it hangs in a send or in the last flush is a matter of when it froze.
-    assert re.search("the viewer (did not take the last of it|takes no data)", err)
-
-
-@pytest.mark.slow
-def test_web_serves_this_machine_only_and_leaves_nothing(stage):
-    relay = stage.relay(None, "--web")
-    page = relay.process.stdout.readline().strip()
-    assert page.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(page, timeout=WAIT_S) as answer:
-        assert answer.status == 200
-    recorder = stage.recorder()
-    recorder.connect()
-    recorder.send(0.0, 1.0)
-    (child,) = (
-        Path(f"/proc/{relay.process.pid}/task/{relay.process.pid}/children").read_text().split()
-    )
-    ports = {int(text) for text in re.findall(r"(?:127.0.0.1:|127.0.0.1%3A)(\d+)", page)}
-    assert len(ports) == 2
-    assert listening(ports) == {(f"{0x0100007F:08X}", port) for port in ports}
-    relay.process.send_signal(signal.SIGINT)
-    relay.process.communicate(timeout=WAIT_S)
-    assert relay.process.returncode == 0
-    assert not Path(f"/proc/{child}").exists()
-    assert not stage.path.exists()
-
-
-def listening(ports):
-    """Address and port of all listening sockets at some ports."""
-    lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
-    lines += Path("/proc/net/tcp6").read_text().splitlines()[1:]
-    entries = [line.split() for line in lines]
-    local = [entry[1].split(":") for entry in entries if entry[3] == "0A"]
-    return {(address, int(port, 16)) for address, port in local if int(port, 16) in ports}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        ([], "give a session to see, or --live"),
-        (["a.mcap", "--live", "s"], "give a session to see, or --live"),
-        (["a.mcap", "--connect", "x"], "give --live as well"),
-        (["--live", "s", "--connect", "x", "--web"], "without --web"),
-    ],
-)
-def test_wrong_usage_is_told(arguments, why, capsys):
-    assert undulog.run(["view", *arguments]) == 2
-    assert why in capsys.readouterr().err
-
-
-def test_window_without_a_display_is_refused_at_once(monkeypatch, tmp_path, capsys):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
-        monkeypatch.delenv(name, raising=False)
-    assert undulog.run(["view", "--live", str(tmp_path / "s")]) == 2
-    assert "no display" in capsys.readouterr().err

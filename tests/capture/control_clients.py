@@ -1,0 +1,112 @@
+"""What the tests of the control socket share: raw clients, patience and other recorders."""
+
+import contextlib
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+from capture.daemon.control import LATER
+from capture.errors import DataError
+
+PATIENCE_S = 60.0
+
+
+def echo(request):
+    """A handler that says what it got; some words have effects."""
+    if request.get("do") == "refuse":
+        raise DataError("not now")
+    if request.get("do") == "big":
+        return {"text": "x" * request["size"]}
+    if request.get("do") == "mistake":
+        return {"value": float("nan")} if request.get("nan") else {}["none"]
+    if request.get("do") == "later":
+        return LATER
+    return {"got": dict(request)}
+
+
+@contextlib.contextmanager
+def polled(server, pause_s=0.001):
+    """A server polled by a thread, as by the recorder's loop."""
+    ended = threading.Event()
+
+    def loop():  # an exception in here fails the test: pytest warns of it
+        while not ended.is_set():
+            server.poll()
+            time.sleep(pause_s)
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def connected(server):
+    """A raw client that doesn't block for ever."""
+    client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    client.connect(str(server.path))
+    client.settimeout(PATIENCE_S)
+    return client
+
+
+def polls(server, until):
+    """Poll until a condition holds."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not until():
+        assert time.monotonic() < deadline
+        server.poll()
+
+
+def replies(data):
+    """Reply lines, each read as JSON."""
+    assert data.endswith(b"\n")
+    return [json.loads(line) for line in data.splitlines()]
+
+
+def drain(server, client, count):
+    """Poll and read until so many reply lines have come."""
+    data = b""
+    client.setblocking(False)
+    deadline = time.monotonic() + PATIENCE_S
+    while data.count(b"\n") < count:
+        assert time.monotonic() < deadline
+        server.poll()
+        with contextlib.suppress(BlockingIOError):
+            got = client.recv(65536)
+            assert got, "the server let go"
+            data += got
+    client.settimeout(PATIENCE_S)
+    return replies(data)
+
+
+def start_recorder(path, extra=""):
+    """A process that serves the socket until it is killed; says 'ready' or why not."""
+    code = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from capture.daemon.control import ControlServer\n"
+        "from capture.errors import ControlError\n"
+        f"{extra}\n"
+        "try:\n"
+        f"    server = ControlServer(Path({str(path)!r}), lambda request: {{}})\n"
+        "except ControlError as error:\n"
+        "    sys.exit(print(error, flush=True))\n"
+        "print('ready', flush=True)\n"
+        "while True:\n"
+        "    server.poll()\n"
+        "    time.sleep(0.005)\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
+    )
+
+
+def end(process):
+    process.send_signal(signal.SIGKILL)
+    process.communicate()

@@ -1,0 +1,106 @@
+"""What the tests of edits share: logs of several makes, and other readers of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from capture.log.cdr import encode
+from capture.log.schemas import message_type, schema_text
+
+EPOCH_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+STRING = "std_msgs/msg/String"
+MAKES = {
+    "zstd": {"compression": CompressionType.ZSTD},
+    "lz4": {"compression": CompressionType.LZ4},
+    "uncompressed": {"compression": CompressionType.NONE},
+    "unchunked": {"use_chunking": False},
+    "no index": {"index_types": IndexType.NONE},
+    "no summary": {
+        "index_types": IndexType.NONE,
+        "use_statistics": False,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_summary_offsets": False,
+    },
+    "uncompressed, no index": {"compression": CompressionType.NONE, "index_types": IndexType.NONE},
+}
+
+
+def text(value: str) -> bytes:
+    return encode(message_type(STRING), {"data": value})
+
+
+def write_log(path: Path, messages, *, attachments=(), metadata=(), units=None, **options) -> Path:
+    """A foreign log of Strings: (topic, log time [ns after the epoch], text)."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=512, **options)
+        writer.start(profile="ros2", library="elsewhere")
+        for name, facts in metadata:
+            writer.add_metadata(name, facts)
+        for name, data in attachments:
+            writer.add_attachment(11, 22, name, "text/plain", data)
+        schema = writer.register_schema(STRING, "ros2msg", schema_text(STRING).encode())
+        channels: dict[str, int] = {}
+        for k, (topic, t_ns, said) in enumerate(messages):
+            if topic not in channels:
+                facts = {"unit": (units or {}).get(topic, ""), "made": "elsewhere"}
+                channels[topic] = writer.register_channel(topic, "cdr", schema, facts)
+            log_ns = EPOCH_NS + t_ns
+            writer.add_message(channels[topic], log_ns, text(said), log_ns - 5, 7 * k)
+        writer.finish()
+    return path
+
+
+def ticks(count: int = 200, topics=("/a", "/b"), start_ms: int = 0):
+    return [
+        (topics[k % len(topics)], (start_ms + 10 * k) * MS, f"word {k} " + "x" * (k % 30))
+        for k in range(count)
+    ]
+
+
+def entry(schema, channel, message):
+    return (
+        message.log_time,
+        channel.topic,
+        message.publish_time,
+        message.sequence,
+        message.data,
+        schema.name,
+        schema.data,
+        schema.encoding,
+        channel.message_encoding,
+        sorted(channel.metadata.items()),
+    )
+
+
+def read(path: Path, **window):
+    """Every message as mcap's own reader gives it, by log time."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [entry(*item) for item in reader.iter_messages(**window)]
+
+
+def in_file_order(path: Path):
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        return [entry(*item) for item in reader.iter_messages(log_time_order=False)]
+
+
+def records(path: Path):
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        stored = {record.name: record.metadata for record in reader.iter_metadata()}
+        attached = [
+            (a.name, a.data, a.media_type, a.create_time, a.log_time)
+            for a in reader.iter_attachments()
+        ]
+    return stored, attached
+
+
+def in_window(messages, start_ms, stop_ms):
+    low, high = EPOCH_NS + round(start_ms * MS), EPOCH_NS + round(stop_ms * MS)
+    return [message for message in messages if low <= message[0] < high]

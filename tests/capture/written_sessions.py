@@ -1,0 +1,56 @@
+"""What the tests of sessions share: one of ours, and one as mcap-ros2-support writes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from mcap_ros2.writer import Writer as RosWriter
+
+from capture import SessionWriter
+from capture.log.schemas import schema_text
+
+EPOCH_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+NAMES = ("joint01", "joint02", "joint03")
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+def samples(count: int = 300) -> np.ndarray:
+    return np.random.default_rng(7).normal(size=(count, 3, len(NAMES)))
+
+
+def write_session(path: Path, count: int = 300, **options: object) -> np.ndarray:
+    data = samples(count)
+    with SessionWriter(path, session_id="s1", epoch_ns=EPOCH_NS, **options) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
+        odometry = writer.odometry("/odom", frame="world", child="link01")
+        events = writer.log("/rosout")
+        mode = writer.string("/gait/mode")
+        mode.write(EPOCH_NS, "walk")
+        events.write(EPOCH_NS, "warn", "twin", "clamped")
+        for tick, (position, velocity, effort) in enumerate(data):
+            t_ns = EPOCH_NS + tick * STEP_NS
+            commands.write(t_ns, position)
+            states.write(t_ns, position, velocity, effort)
+            odometry.write(t_ns, position, np.array([0, 0, 0, 1.0]), velocity, effort)
+        writer.set_verdict("good", ["nothing lost"])
+    return data
+
+
+def write_foreign(
+    path: Path, messages: list[tuple[str, int, dict]], type_name: str = JOINT_STATE
+) -> None:
+    """Messages (topic, log time, content) as mcap-ros2-support writes them."""
+    with path.open("wb") as stream:
+        writer = RosWriter(stream)
+        schema = writer.register_msgdef(type_name, schema_text(type_name))
+        for topic, t_ns, content in messages:
+            writer.write_message(topic, schema, content, log_time=t_ns, publish_time=t_ns)
+        writer.finish()
+
+
+def joint_state(t_ns: int, names: list[str], position: list[float], **more: object) -> dict:
+    stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+    return {"header": {"stamp": stamp}, "name": names, "position": position, **more}
