@@ -19,6 +19,7 @@ from capture.log.frames import DIR_TX
 from capture.sources.address import parse_address
 from capture.sources.events import Tally
 from sim import load_scenario
+from sim.control.build import build_gait
 from sim.drive.driven import find_driven
 from sim.drive.link import VirtualRobotLink, sent_text
 from sim.drive.loop import CommandEncoder
@@ -109,6 +110,27 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, ca
     cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])
     found = np.array(measured.values)[:, : len(cycles)]
     assert np.abs(found - cycles[: found.shape[1]].T).max() <= STEP / 2 * (1 + 1e-6)
+
+
+@pytest.mark.slow
+def test_an_adaptive_controller_does_the_same_over_the_bus_as_in_process():
+    scenario = load_scenario("target-following").changed(duration_s=3.0)
+    over_bus = []
+    with alive(scenario) as (on, served):
+        drive_bus(
+            planned("target-following", on, duration_s=3.0),
+            stop=StopRequest(),
+            on_tick=lambda tick: over_bus.append(tick.gait),
+        )
+    assert served[0].complete
+    with Twin(scenario, Rounded(build_gait(scenario))) as twin:
+        in_process = [sample.gait for sample in twin.samples()]
+    assert [tick.mode for tick in over_bus] == [tick.mode for tick in in_process]
+    assert len({tick.mode for tick in over_bus}) > 1  # it met something
+    commands = np.round(np.array([tick.command for tick in over_bus]) / STEP) * STEP
+    error = np.abs(commands - np.array([tick.command for tick in in_process]))
+    # Readings are rounded on the bus (angles 0.01 degrees, distances 1 mm), and so are commands.
+    assert error.max() <= STEP * (1 + 1e-6)
 
 
 def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):

@@ -1,0 +1,179 @@
+"""Driving as its users do: virtual robot, recorder and controller, each a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from capture import Session
+
+pytestmark = pytest.mark.slow
+
+UNDULOG = (sys.executable, "-m", "undulog")
+STEP = np.radians(0.01)
+
+
+@contextmanager
+def process(*words, env=None):
+    running = subprocess.Popen(
+        [*UNDULOG, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env
+    )
+    try:
+        yield running
+    finally:
+        if running.poll() is None:
+            running.kill()
+        running.communicate(timeout=30)
+
+
+@contextmanager
+def served(scenario, *words):
+    """A virtual robot: its bus's address, and the process."""
+    with process("sim", "serve", scenario, "--socketcand", "0", "--json", *words) as robot:
+        line = robot.stdout.readline()
+        assert line, robot.stderr.read()
+        ready = json.loads(line)
+        assert ready["event"] == "ready"
+        yield f"can:socketcand:{ready['bus']}?host=127.0.0.1&port={ready['port']}", robot
+
+
+@contextmanager
+def recorded(on, path, env):
+    """A recorder of that bus, connected."""
+    with process("record", on, "-r", "snake25", "-o", str(path), "--floor", "0", env=env) as one:
+        deadline = time.monotonic() + 60
+        while True:
+            asked = undulog("record", "status", "--json", env=env)
+            found = json.loads(asked.stdout or "{}").get("recordings", [])
+            if found and found[0]["sources"][0]["connected"]:
+                break
+            assert one.poll() is None, one.stderr.read()
+            assert time.monotonic() < deadline, asked
+            time.sleep(0.1)
+        yield one
+
+
+def undulog(*words, env=None):
+    return subprocess.run(
+        [*UNDULOG, *words], capture_output=True, text=True, check=False, env=env, timeout=300
+    )
+
+
+@pytest.fixture
+def alone(tmp_path):
+    """An environment in which no other recorder is found."""
+    runtime = tmp_path / "run"
+    runtime.mkdir()
+    return os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
+
+
+def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone):
+    path = tmp_path / "recorded.mcap"
+    with served("weak-servo-pi3", "--duration", "60") as (on, _), recorded(on, path, alone):
+        words = ["drive", "weak-servo-pi3", "--on", on, "--arm", "--duration", "2", "--json"]
+        drove = undulog(*words, env=alone)
+        assert drove.returncode == 0, drove.stderr
+        report = json.loads(drove.stdout)
+        assert report["gait_not_told"] is None
+        assert report["gait_told"] == report["ticks"]
+        stopped = undulog("record", "stop", "--wait", env=alone)
+        assert stopped.returncode == 0, stopped.stderr
+    with Session.open(path) as session:
+        gait = session.joints("/gait")
+        said = [message.msg for _, message in session.messages("/rosout")]
+        modes = [message.data for _, message in session.messages("/gait/mode")]
+        commands = session.joints("/joint_commands")
+        states = session.joints("/joint_states")
+        assert session.robot.name == "snake25"
+    assert len(gait.t_ns[0]) == report["ticks"]
+    assert modes == ["walk"]
+    assert any(text.startswith("drives weak-servo-pi3 (gait) on can:") for text in said)
+    assert any(text.startswith("drove weak-servo-pi3 for 2 s") for text in said)
+    assert len(states.t_ns[0]) > 50
+    # Commands on the bus and gait by the control socket tell the same story: what a joint got is
+    # what the gait meant in the same tick, rounded to the bus.
+    a, omega, lag, offset, phase = np.array(gait.values)
+    np.testing.assert_allclose(omega, np.pi)
+    np.testing.assert_allclose(lag, -np.pi / 3)
+    for place, name in enumerate(("joint01", "joint03", "joint05")):
+        meant = a * np.sin(phase + place * lag) + offset
+        given = commands.signal(name).values
+        assert len(given) == report["ticks"]
+        assert np.abs(given - meant).max() <= STEP / 2 * (1 + 1e-6)
+
+
+def test_without_a_recorder_it_says_that_the_gait_is_not_recorded(alone):
+    with served("flat", "--lockstep", "--fast", "--duration", "0.2") as (on, robot):
+        drove = undulog("drive", "flat", "--on", on, "--arm", "--duration", "0.2", env=alone)
+        assert drove.returncode == 0
+        assert drove.stderr == "note: no recorder runs and there is no -o: /gait is not recorded\n"
+        assert "21 ticks in lockstep with the robot, 0 left out" in drove.stdout
+        end = json.loads(robot.communicate(timeout=60)[0].splitlines()[-1])
+    assert (end["event"], end["complete"], end["commands"]) == ("end", True, 21 * 25)
+
+
+def test_several_recorders_have_to_be_told_apart(tmp_path, alone):
+    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    with (
+        served("flat", "--duration", "60") as (on, _),
+        recorded(on, first, alone),
+        recorded(on, second, alone),
+    ):
+        drove = undulog("drive", "flat", "--on", on, "--arm", "--duration", "0.2", env=alone)
+        assert drove.returncode == 2
+        assert "2 recorders run; which one is told the gait?" in drove.stderr
+        sockets = [line.split()[-1] for line in drove.stderr.splitlines()[1:]]
+        chosen = undulog(
+            *("drive", "flat", "--on", on, "--arm", "--duration", "0.2"),
+            *("--recorder", sockets[1], "--json"),
+            env=alone,
+        )
+        assert chosen.returncode == 0, chosen.stderr
+        assert json.loads(chosen.stdout)["recorder"] == sockets[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
+    path = tmp_path / "a.mcap"
+    with served("flat", "--lockstep", "--fast") as (on, _):
+        words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
+        with process(*words, env=alone) as driving:
+            deadline = time.monotonic() + 60
+            while not (path.exists() and path.stat().st_size > 0):
+                assert driving.poll() is None, driving.stderr.read()
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            time.sleep(1.0)
+            driving.send_signal(number)
+            told, complained = driving.communicate(timeout=60)
+    assert (driving.returncode, complained) == (0, "")
+    assert told.startswith("stopped at rest at ")
+    with Session.open(path) as session:
+        commands = np.array(session.joints("/joint_commands").values)
+        assert (session.verdict, session.warnings) == ("good", [])
+    assert not commands[:, -1].any()
+
+
+def test_a_killed_robot_ends_the_drive_with_its_name(tmp_path, alone):
+    path = tmp_path / "a.mcap"
+    with served("flat", "--lockstep", "--fast") as (on, robot):
+        words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
+        with process(*words, env=alone) as driving:
+            deadline = time.monotonic() + 60
+            while not (path.exists() and path.stat().st_size > 0):
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            time.sleep(0.5)
+            robot.kill()
+            _, complained = driving.communicate(timeout=60)
+    assert driving.returncode == 1
+    assert complained.startswith(f"error: {on}: the robot ")
+    with Session.open(path) as session:
+        assert session.verdict == "bad"
+        assert session.channels["/joint_commands"].count > 1
