@@ -1,0 +1,297 @@
+"""``sim serve`` as its users run it: robot, recorders and controller, each a process of its own."""
+
+import json
+import math
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import undulog as front
+from capture import Session
+from capture.log.session_check import check_session
+
+ROOT = Path(__file__).parents[2]
+UNDULOG = [sys.executable, "-m", "undulog"]
+PATIENCE_S = 300
+DURATION_S = 3.0
+STEP = {  # of the robot's DBC, in SI
+    ("/joint_commands", "position"): math.radians(0.01),
+    ("/joint_states", "position"): math.radians(0.01),
+    ("/joint_states", "velocity"): math.radians(0.1),
+    ("/joint_states", "effort"): 0.001,
+    ("/joint_current", "position"): 0.001,
+}
+SCENARIO = f"""
+description = "On the bus and in process."
+robot = "snake25"
+duration_s = {DURATION_S}
+seed = 3
+
+[gait]
+ramp_s = 1.0
+
+[gait.horizontal]
+amplitude = 0.4
+frequency_hz = 0.5
+lag = 1.0471975511965976
+
+[noise]
+position = 0.001
+
+[sensing.servo]
+slot_s = 0.0003
+command_resolution = {math.radians(0.01)!r}
+
+[[world.obstacles]]
+shape = "wall"
+from = [0.8, -3.0]
+to = [0.8, 3.0]
+"""
+
+
+def wait_for(condition, what):
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := condition()):
+        assert time.monotonic() < deadline, f"waited for {what}"
+        time.sleep(0.05)
+    return found
+
+
+@contextmanager
+def process(*words, **options):
+    started = subprocess.Popen(
+        [*UNDULOG, *words], cwd=ROOT, text=True, stdout=subprocess.PIPE, **options
+    )
+    try:
+        yield started
+    finally:
+        if started.poll() is None:
+            started.kill()
+        started.communicate()
+
+
+@contextmanager
+def robot_process(scenario, *words, place="0", **options):
+    """A virtual robot, and what it says when it is ready."""
+    with process(
+        "sim", "serve", str(scenario), "--socketcand", place, "--json", *words, **options
+    ) as started:
+        yield started, json.loads(started.stdout.readline())
+
+
+def ask(control, **request):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.settimeout(PATIENCE_S)
+        client.connect(str(control))
+        client.sendall(json.dumps(request).encode() + b"\n")
+        data = b""
+        while not data.endswith(b"\n"):
+            data += client.recv(65536)
+    return json.loads(data)
+
+
+@contextmanager
+def recorder(source, output):
+    """A recorder whose source is connected; it is asked to end at the end."""
+    control = output.with_suffix(".ctl")
+    words = ("--robot", "snake25", "-o", str(output), "--socket", str(control), "--floor", "0")
+    with process("record", f"can0={source}", *words, "--json", "--quiet") as started:
+
+        def connected():
+            assert started.poll() is None, started.stdout.read()
+            return control.exists() and ask(control, do="status")["sources"][0]["connected"]
+
+        wait_for(connected, f"the recorder of {source}")
+        yield control
+        assert ask(control, do="stop", wait=True)["ok"]
+
+
+def driven(scenario, port, control, *words):
+    done = subprocess.run(
+        [
+            *(*UNDULOG, "drive", str(scenario), "--on", f"can:socketcand:can0?port={port}"),
+            *("--arm", "--recorder", str(control), "--json", *words),
+        ],
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=PATIENCE_S,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@dataclass
+class Run:
+    """One scenario, in process and over the bus."""
+
+    ready: dict
+    end: dict
+    drive: dict
+    in_process: Path
+    over_bus: dict[str, Path]
+
+
+def on_the_bus(folder, scenario, *words):
+    """Robot, two recorders and a controller; returns what each said and wrote."""
+    bus = folder / "bus.sock"
+    over_bus = {way: folder / f"{way}.mcap" for way in ("tcp", "unix")}
+    words = ("--unix", str(bus), "--duration", str(DURATION_S), "--lockstep", *words)
+    with robot_process(scenario, *words) as (robot, ready), ExitStack() as recorders:
+        tcp = f"can:socketcand:can0?port={ready['port']}"
+        control = recorders.enter_context(recorder(tcp, over_bus["tcp"]))
+        recorders.enter_context(recorder(f"unix:{bus}", over_bus["unix"]))
+        drive = driven(scenario, ready["port"], control)
+        out, _ = robot.communicate(timeout=PATIENCE_S)
+        assert robot.returncode == 0
+    return ready, json.loads(out), drive, over_bus
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory):
+    path = tmp_path_factory.mktemp("serve") / "served.toml"
+    path.write_text(SCENARIO)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(scenario):
+    ready, end, drive, over_bus = on_the_bus(scenario.parent, scenario)
+    in_process = scenario.parent / "in_process.mcap"
+    assert front.run(["sim", "run", str(scenario), "-o", str(in_process)]) == 0
+    return Run(ready, end, drive, in_process, over_bus)
+
+
+def columns(session, topic, field):
+    series = session.joints(topic, field)
+    return series.names, np.array(series.values), np.array(series.t_ns)
+
+
+@pytest.mark.slow
+def test_over_the_bus_come_the_same_columns_to_within_half_a_step_of_the_dbc(run):
+    assert (run.end["complete"], run.end["commands"]) == (True, 25 * 301)
+    assert run.end["unix_refused"] == run.end["dropped_clients"] == 0
+    with Session.open(run.in_process) as truth:
+        for path in run.over_bus.values():
+            with Session.open(path) as found:
+                for (topic, field), step in STEP.items():
+                    names, expected, _ = columns(truth, topic, field)
+                    own_names, values, _ = columns(found, topic, field)
+                    assert own_names == names
+                    assert values.shape == expected.shape == (25, 301)
+                    assert np.abs(values - expected).max() <= step / 2 * (1 + 1e-9), topic
+
+
+@pytest.mark.slow
+def test_sensors_come_over_the_bus_too(run):
+    with Session.open(run.in_process) as truth:
+        topics = {sensor.topic: sensor for sensor in truth.robot.sensors}
+        for path in run.over_bus.values():
+            with Session.open(path) as found:
+                assert set(topics) <= set(found.channels)
+                for topic in topics:
+                    expected, values = truth.table(topic), found.table(topic)
+                    assert len(values) == len(expected) > 0, topic
+                    for column, step in SENSOR_COLUMNS[topics[topic].kind].items():
+                        np.testing.assert_allclose(
+                            values[column], expected[column], rtol=0, atol=step / 2 * (1 + 1e-9)
+                        )
+
+
+SENSOR_COLUMNS = {
+    "ir": {"range": 0.001},
+    "sonar": {"range": 0.001},
+    "accelerometer": {f"linear_acceleration.{axis}": 9.80665e-3 for axis in "xyz"},
+    "compass": {f"magnetic_field.{axis}": 1e-8 for axis in "xy"},
+}
+
+
+@pytest.mark.slow
+def test_times_over_the_bus_are_those_of_the_run(run):
+    """Device times to the microsecond; what the recorder makes of them, within 2 ms."""
+    start_ns = round(run.end["start_s"] * 1e9)
+    with Session.open(run.in_process) as truth:
+        _, _, expected = columns(truth, "/joint_states", "position")
+        expected = expected - expected.min()
+    for way, path in run.over_bus.items():
+        with Session.open(path) as found:
+            frames = found.frames("/can/can0")
+            _, _, mapped = columns(found, "/joint_states", "position")
+        states = frames[(frames["id_flags"] >= 513) & (frames["id_flags"] <= 537)]
+        device = states["t_device_ns"].astype(np.int64).reshape(-1, 25).T
+        gap = device - start_ns - expected
+        assert np.ptp(gap, axis=0).max() <= 1000
+        assert (np.diff(gap[0]) >= -1000).all()  # where simulated time stood still, if it did
+        assert gap[0, -1] <= run.end["stood_still_s"] * 1e9 + 1e6
+        late = mapped - run.ready["epoch_ns"] - device
+        if way == "unix":
+            assert np.abs(late).max() < 2_000_000
+        else:  # read a recorder's tick late, all alike once the clock is known
+            settled = late[:, 100:]
+            assert settled.min() > 0
+            assert np.ptp(settled) < 2_000_000
+
+
+@pytest.mark.slow
+def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
+    words = ("lost:joint07:0.2", "frozen:joint03@0.2", "noise:0.02", "bus-off@1.5+0.4")
+    faults = [word for text in words for word in ("--fault", text)]
+    _, end, _, over_bus = on_the_bus(tmp_path, scenario, *faults)
+    assert end["lost"] > 0
+    assert end["hit"] > 0
+    for path in over_bus.values():
+        health = check_session(path)
+        assert health.verdict != "good"
+        reasons = "\n".join(health.reasons)
+        assert "/joint_states, joint07: " in reasons
+        assert "samples are not a number" in reasons
+        assert "/joint_states, joint03: frozen for " in reasons
+        assert "error frames" in reasons
+        (bus,) = health.buses
+        assert bus.error_frames == end["hit"] + 2  # off, and back again
+        with Session.open(path) as session:
+            said = [message.msg for _, message in session.messages("/rosout")]
+        assert "bus-off: the controller left the bus" in said
+        assert "the controller is back on the bus" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_in_good_order(number, tmp_path):
+    bus = tmp_path / "bus.sock"
+    words = ("--wait", "--unix", str(bus)) if number is signal.SIGINT else ()
+    with robot_process("flat", *words, stderr=subprocess.PIPE) as (robot, ready):
+        assert ready["waits"] is bool(words)
+        with socket.create_connection((ready["host"], ready["port"])) as client:
+            assert client.recv(100) == b"< hi >"
+            client.sendall(b"< open can0 >< rawmode >")
+            if not words:
+                while b"< frame 219 " not in client.recv(65536):
+                    pass
+            robot.send_signal(number)
+            out, err = robot.communicate(timeout=60)
+    assert robot.returncode == 0, err
+    end = json.loads(out)
+    assert end["event"] == "end"
+    assert end["complete"] is False
+    assert (end["ticks"] > 0) is not bool(words)
+
+
+def test_what_cannot_be_served_is_said_at_once(capsys):
+    for words, said in (
+        (["flat"], "give --socketcand PORT or --unix PATH"),
+        (["flat", "--socketcand", "1e3"], "expected [HOST:]PORT"),
+        (["flat", "--socketcand", "192.0.2.1:0"], "is not this computer's loopback"),
+        (["snake13-horizontal-pi2", "--socketcand", "0"], "snake13 has no bus map"),
+        (["flat", "--socketcand", "0", "--fast"], "only in lockstep"),
+        (["flat", "--unix", "x", "--lockstep"], "give --socketcand PORT"),
+        (["flat", "--socketcand", "0", "--fault", "lsot:0.1"], "did you mean lost?"),
+        (["flat", "--socketcand", "0", "--duration", "0"], "a duration of 0 s"),
+    ):
+        assert front.run(["sim", "serve", *words]) == 2
+        assert said in capsys.readouterr().err
