@@ -13,26 +13,22 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from accepting import EPOCH_NS, Accept, mcap_writer, measure
 from mcap.records import Channel
-from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from capture.log import durable_sink
 from capture.log.durable_sink import DurableSink
 from capture.log.mcap_sink import McapSink
 
-EPOCH_NS = 1_700_000_000_000_000_000
 SIZES = (100, 1000)
 CHUNKS = (1 << 18, 1 << 19, 1 << 20)
 CHANNEL = Channel(id=1, topic="/t", message_encoding="cdr", metadata={}, schema_id=0)
-
-Accept = Callable[[int, bytes], None]
-"""Takes one message: its number and payload."""
 
 
 @contextmanager
@@ -53,35 +49,11 @@ def session_file(folder: Path) -> Iterator[Accept]:
     sink.close(())
 
 
-@contextmanager
-def mcap_writer(folder: Path) -> Iterator[Accept]:
-    """The MCAP library as it comes: chunks of 1 MiB, zstd."""
-    with (folder / "library.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        channel = writer.register_channel("/t", "cdr", 0)
-        yield lambda number, payload: writer.add_message(
-            channel, EPOCH_NS + number, payload, EPOCH_NS, number
-        )
-        writer.finish()
-
-
 WAYS = {
     "DurableSink": recorders_sink,
     "McapSink": session_file,
     "mcap.Writer": mcap_writer,
 }
-
-
-def measure(accept: Accept, payloads: list[bytes]) -> NDArray[np.int64]:
-    """Time of each call [ns]; the two looks at the clock are in it, the same for all."""
-    clock = time.perf_counter_ns
-    took = np.empty(len(payloads), dtype=np.int64)
-    for number, payload in enumerate(payloads):
-        start = clock()
-        accept(number, payload)
-        took[number] = clock() - start
-    return took
 
 
 def processor_time(accept: Accept, payloads: list[bytes]) -> float:

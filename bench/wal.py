@@ -10,35 +10,27 @@ Run: python bench/wal.py [--messages 50000] [--runs 5] [--folder DIR]
 from __future__ import annotations
 
 import argparse
-import itertools
 import struct
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from accepting import EPOCH_NS, Accept, mcap_writer, measure, new_file
 from mcap.records import Channel
-from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from capture.log.wal import WriteAheadLog
 
-EPOCH_NS = 1_700_000_000_000_000_000
 SIZES = (100, 1000)
 HEAD = struct.Struct("<IHIQQ")
-
-Accept = Callable[[int, bytes], object]
-"""Takes one message: its number and payload."""
-
-_copies = itertools.count()
 
 
 @contextmanager
 def write_ahead_log(folder: Path) -> Iterator[Accept]:
     """Ours, its segments released as a writer would."""
-    with WriteAheadLog(folder / f"{next(_copies)}.wal") as wal:
+    with WriteAheadLog(new_file(folder, ".wal")) as wal:
         wal.define(Channel(id=1, topic="/t", message_encoding="cdr", metadata={}, schema_id=0))
 
         def accept(number: int, payload: bytes) -> None:
@@ -54,7 +46,7 @@ def write_ahead_log(folder: Path) -> Iterator[Accept]:
 @contextmanager
 def flushed_file(folder: Path) -> Iterator[Accept]:
     """A buffered file, flushed to the kernel after each record."""
-    with (folder / f"{next(_copies)}.bin").open("wb") as file:
+    with new_file(folder, ".bin").open("wb") as file:
 
         def accept(number: int, payload: bytes) -> None:
             time_ns = EPOCH_NS + number
@@ -64,38 +56,11 @@ def flushed_file(folder: Path) -> Iterator[Accept]:
         yield accept
 
 
-@contextmanager
-def mcap_writer(folder: Path) -> Iterator[Accept]:
-    """The MCAP library as it comes: chunks of 1 MiB, zstd."""
-    with (folder / f"{next(_copies)}.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        channel = writer.register_channel("/t", "cdr", 0)
-
-        def accept(number: int, payload: bytes) -> None:
-            time_ns = EPOCH_NS + number
-            writer.add_message(channel, time_ns, payload, time_ns, number)
-
-        yield accept
-        writer.finish()
-
-
 WAYS = {
     "write-ahead log": write_ahead_log,
     "file, flush() each": flushed_file,
     "mcap.Writer": mcap_writer,
 }
-
-
-def measure(accept: Accept, payloads: list[bytes]) -> NDArray[np.int64]:
-    """Time of each call [ns]; the two looks at the clock are in it, the same for all."""
-    clock = time.perf_counter_ns
-    took = np.empty(len(payloads), dtype=np.int64)
-    for number, payload in enumerate(payloads):
-        start = clock()
-        accept(number, payload)
-        took[number] = clock() - start
-    return took
 
 
 def main() -> None:
