@@ -57,17 +57,7 @@ class DrainedLink:
         self._thread.start()
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
-        """Take what the thread has gathered.
-
-        Args:
-            now_ns: The session's clock [Unix ns].
-
-        Returns:
-            The frames.
-
-        Raises:
-            OSError: If the connection is broken.
-        """
+        """See :meth:`Link.read`."""
         error = self._error  # before the frames: none comes after it
         found: list[FrameArray] = []
         while self._held:

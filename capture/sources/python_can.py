@@ -84,17 +84,7 @@ class PythonCanLink:
         self._thread.start()
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
-        """Take what has gathered.
-
-        Args:
-            now_ns: The session's clock [Unix ns].
-
-        Returns:
-            The frames.
-
-        Raises:
-            OSError: If the bus failed.
-        """
+        """See :meth:`Link.read`."""
         error = self._error  # before the frames: none comes after it
         count = len(self._held)
         if not count and error is not None:

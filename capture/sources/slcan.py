@@ -108,17 +108,7 @@ class SlcanLink:
         self._error: OSError | None = None
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:
-        """Take what the adapter sent.
-
-        Args:
-            now_ns: The session's clock [Unix ns].
-
-        Returns:
-            The frames.
-
-        Raises:
-            OSError: If the adapter is gone.
-        """
+        """See :meth:`Link.read`."""
         if self._error is not None or self._fileno is None:
             raise self._error or OSError(errno.EBADF, "closed")
         chunks = [self._first] if self._first else []

@@ -121,17 +121,7 @@ class SocketcanLink:
         self._error: OSError | None = None
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (the kernel has the time)
-        """Drain the socket.
-
-        Args:
-            now_ns: The session's clock [Unix ns].
-
-        Returns:
-            The frames.
-
-        Raises:
-            OSError: If the interface went down or away.
-        """
+        """See :meth:`Link.read`."""
         if self._error is not None:
             raise self._error
         found: list[FrameArray] = []

@@ -50,17 +50,7 @@ class SocketcandLink:
         sock.setblocking(False)
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:
-        """Take what the server sent.
-
-        Args:
-            now_ns: The session's clock [Unix ns].
-
-        Returns:
-            The frames.
-
-        Raises:
-            OSError: If the connection is broken.
-        """
+        """See :meth:`Link.read`."""
         if self._error is not None:
             raise self._error
         chunks = [self._first] if self._first else []
