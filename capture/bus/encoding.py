@@ -111,11 +111,15 @@ class BusEncoder:
             if messages[name].length > _MOST_BYTES:
                 raise DataError(f"{name} of {robot.name} is a CAN FD frame; only classic are sent")
             self._frames += _frames_of(messages[name], signals)
+        self._carrying: dict[BusValue, list[int]] = {}
+        for number, frame in enumerate(self._frames):
+            for key in frame.slots:
+                self._carrying.setdefault(key, []).append(number)
 
     @property
     def values(self) -> frozenset[BusValue]:
         """All values that the frames carry."""
-        return frozenset(key for frame in self._frames for key in frame.slots)
+        return frozenset(self._carrying)
 
     def encode(self, values: Mapping[BusValue, float], t_ns: int = 0) -> FrameArray:
         """Encode values.
@@ -134,7 +138,9 @@ class BusEncoder:
             of which a value is given. Its other fields hold what the map names for unknown; else
             they are as they were sent last, at first the DBC's initial value, or zero.
         """
-        ready = [(frame, data) for frame in self._frames if (data := frame.data(values))]
+        touched = {number for key in values for number in self._carrying.get(key, ())}
+        chosen = [self._frames[number] for number in sorted(touched)]
+        ready = [(frame, data) for frame in chosen if (data := frame.data(values))]
         frames = empty_frames(len(ready))
         frames["t_device_ns"] = frames["t_host_ns"] = t_ns
         frames["id_flags"] = [frame.id_flags for frame, _ in ready]
