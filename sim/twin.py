@@ -100,6 +100,7 @@ class Twin:
             obstacle_stiffness=world.obstacle_contact.stiffness,
             dt=self._plant.dt,
             start=self._plant.now,
+            kernels=kernels,
         )
 
     def __enter__(self) -> Self:

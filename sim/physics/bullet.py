@@ -16,7 +16,10 @@ import contextlib
 import os
 import struct
 import sys
+from collections import deque
 from collections.abc import Generator, Sequence
+from itertools import repeat
+from operator import itemgetter
 
 import numpy as np
 
@@ -53,7 +56,7 @@ _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 # Packing is the fastest way from the engine's nested tuples to an array, by a factor of two.
 _pack_link = struct.Struct("13d").pack  # centre, orientation, velocity, angular velocity
-_pack_joint = struct.Struct("2d").pack  # angle, rate
+_angle, _rate = itemgetter(0), itemgetter(1)
 
 
 class BulletEngine:
@@ -163,8 +166,7 @@ class BulletEngine:
         state.position[...], state.quaternion[...] = fields[:3], fields[3:7]
         state.velocity[...], state.spin[...] = fields[7:10], fields[10:]
         joints = pybullet.getJointStates(self._body, self._joints, client)
-        packed = b"".join([_pack_joint(*joint[:2]) for joint in joints])
-        state.angle[...], state.rate[...] = np.frombuffer(packed).reshape(-1, 2).T
+        state.angle[...], state.rate[...] = list(map(_angle, joints)), list(map(_rate, joints))
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
@@ -174,11 +176,13 @@ class BulletEngine:
             force: In the world [N], shape (3, n).
             point: Points of action in the world [m], shape (3, n).
         """
-        apply, world = pybullet.applyExternalForce, pybullet.WORLD_FRAME
-        body, client = self._body, self._client
-        for i, (vector, at) in enumerate(zip(force.T.tolist(), point.T.tolist(), strict=True), -1):
-            if any(vector):
-                apply(body, i, vector, at, world, client)
+        n = force.shape[1]
+        calls = map(
+            pybullet.applyExternalForce,
+            *(repeat(self._body, n), range(-1, n - 1), force.T.tolist(), point.T.tolist()),
+            *(repeat(pybullet.WORLD_FRAME), repeat(self._client)),
+        )
+        deque(calls, maxlen=0)  # runs them all, without a loop of ours
 
     def step(self, torque: FloatArray) -> None:
         """Advance the body by one step.

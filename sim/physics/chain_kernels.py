@@ -17,33 +17,38 @@ from capture.arrays import BoolArray, FloatArray
 
 @njit(cache=True)
 def spread(
-    head: FloatArray,
-    joints: FloatArray,
+    coordinates: FloatArray,
     half: FloatArray,
     vertical: BoolArray,
     position: FloatArray,
     quaternion: FloatArray,
     velocity: FloatArray,
     spin: FloatArray,
+    angle: FloatArray,
+    rate: FloatArray,
     hinges: FloatArray,
 ) -> None:
     """Poses and velocities of all links, from head to tail.
 
     Args:
-        head: Centre, orientation (x, y, z, w), velocity and angular velocity, shape (13,).
-        joints: Angles and rates, shape (m, 2).
+        coordinates: The head's centre, orientation (x, y, z, w), velocity and angular velocity,
+            then all joints' angles and all joints' rates, shape (13 + 2 m,).
         half: Half of the links' lengths [m], shape (n,).
         vertical: Whether a joint turns about y rather than z, shape (m,).
         position: Filled in: centres of the links [m], shape (3, n).
         quaternion: Filled in: their orientations, shape (4, n).
         velocity: Filled in: velocities of the centres [m/s], shape (3, n).
         spin: Filled in: angular velocities [rad/s], shape (3, n).
+        angle: Filled in: joint angles [rad], shape (m,).
+        rate: Filled in: joint rates [rad/s], shape (m,).
         hinges: Filled in: places of the joints [m] and directions of their axes, shape (6, m).
     """
-    px, py, pz = head[0], head[1], head[2]
-    x, y, z, w = head[3], head[4], head[5], head[6]
-    vx, vy, vz = head[7], head[8], head[9]
-    sx, sy, sz = head[10], head[11], head[12]
+    m = len(angle)
+    angle[:], rate[:] = coordinates[13 : 13 + m], coordinates[13 + m :]
+    px, py, pz = coordinates[0], coordinates[1], coordinates[2]
+    x, y, z, w = coordinates[3], coordinates[4], coordinates[5], coordinates[6]
+    vx, vy, vz = coordinates[7], coordinates[8], coordinates[9]
+    sx, sy, sz = coordinates[10], coordinates[11], coordinates[12]
     for i in range(len(half)):
         if i > 0:
             # From the centre of the link in front to the joint, a = -half e_x.
@@ -52,7 +57,7 @@ def spread(
             px, py, pz = px + ax, py + ay, pz + az
             vx, vy, vz = vx + sy * az - sz * ay, vy + sz * ax - sx * az, vz + sx * ay - sy * ax
             # The joint turns about an axis that both links share.
-            s, c = math.sin(0.5 * joints[i - 1, 0]), math.cos(0.5 * joints[i - 1, 0])
+            s, c = math.sin(0.5 * angle[i - 1]), math.cos(0.5 * angle[i - 1])
             if vertical[i - 1]:
                 ax, ay, az = 2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)
                 x, y, z, w = x * c - z * s, y * c + w * s, z * c + x * s, w * c - y * s
@@ -61,8 +66,7 @@ def spread(
                 x, y, z, w = x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
             hinges[0, i - 1], hinges[1, i - 1], hinges[2, i - 1] = px, py, pz
             hinges[3, i - 1], hinges[4, i - 1], hinges[5, i - 1] = ax, ay, az
-            rate = joints[i - 1, 1]
-            sx, sy, sz = sx + rate * ax, sy + rate * ay, sz + rate * az
+            sx, sy, sz = sx + rate[i - 1] * ax, sy + rate[i - 1] * ay, sz + rate[i - 1] * az
             # From the joint to the centre.
             bx, by, bz = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)
             ax, ay, az = -half[i] * bx, -half[i] * by, -half[i] * bz

@@ -8,7 +8,9 @@ Importing it needs the extra ``numba``.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from capture.robot import Plane, Robot
 from . import chain_kernels
 from .bullet import BulletEngine, pybullet
 from .engine import BodyState
+
+_angle, _rate = itemgetter(0), itemgetter(1)
 
 
 class CompiledBulletEngine(BulletEngine):
@@ -53,6 +57,9 @@ class CompiledBulletEngine(BulletEngine):
         self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in robot.joints])
         self._hinges = np.zeros((6, len(robot.joints)))
         self._generalised = np.zeros(6 + len(robot.joints))
+        self._coordinates = np.zeros(13 + 2 * len(robot.joints))
+        self._buffer = self._coordinates.data  # the same memory
+        self._pack = struct.Struct(f"{len(self._coordinates)}d").pack_into
         self._state = self.read()
 
     def read(self, into: BodyState | None = None) -> BodyState:
@@ -66,13 +73,12 @@ class CompiledBulletEngine(BulletEngine):
         """
         state = into or BodyState.empty(len(self._half), len(self._joints))
         client = self._client
-        pose = pybullet.getBasePositionAndOrientation(self._body, client)
-        twist = pybullet.getBaseVelocity(self._body, client)
-        head = np.array([*pose[0], *pose[1], *twist[0], *twist[1]])
+        place, turn = pybullet.getBasePositionAndOrientation(self._body, client)
+        velocity, spin = pybullet.getBaseVelocity(self._body, client)
         joints = pybullet.getJointStates(self._body, self._joints, client)
-        motion = np.array([joint[:2] for joint in joints])
-        state.angle[...], state.rate[...] = motion.T
-        chain_kernels.spread(head, motion, self._half, self._vertical, *state[:4], self._hinges)
+        moving = *map(_angle, joints), *map(_rate, joints)
+        self._pack(self._buffer, 0, *place, *turn, *velocity, *spin, *moving)
+        chain_kernels.spread(self._coordinates, self._half, self._vertical, *state, self._hinges)
         self._state = state
         return state
 

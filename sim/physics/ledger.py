@@ -22,6 +22,7 @@ from capture.arrays import FloatArray
 from capture.robot import Robot
 
 from .contact import into_link_axes
+from .engine import Kernels
 from .servo import Servos
 from .steps import Step, Steps
 from .vectors import cross, into_frames
@@ -153,6 +154,7 @@ class Ledger:
         obstacle_stiffness: float,
         dt: float,
         start: Step,
+        kernels: Kernels = Kernels.NUMPY,
     ) -> None:
         """Open the ledger.
 
@@ -164,7 +166,9 @@ class Ledger:
             obstacle_stiffness: Of the obstacles [N/m].
             dt: Step [s].
             start: The state at which all flows are zero.
+            kernels: What adds up.
         """
+        self._kernels = kernels
         self._servos = servos
         self._mass = np.array([link.mass for link in robot.links])
         self._inertia = np.array([link.inertia for link in robot.links]).T
@@ -194,12 +198,23 @@ class Ledger:
         Args:
             steps: k + 1 steps; the last one closes the one before it and is booked next time.
         """
-        self._joints += joint_flows(steps, self._servos, self._dt)
-        self._ground += ground_flows(steps, self._stiffness, self._dt)
+        if self._kernels is Kernels.NUMBA:
+            self._book_compiled(steps)
+        else:
+            self._joints += joint_flows(steps, self._servos, self._dt)
+            self._ground += ground_flows(steps, self._stiffness, self._dt)
         if any(len(contact.link) for contact in steps.obstacles):
             self._obstacles += obstacle_flows(steps, self._obstacle_stiffness, self._dt)
             for contact in steps.obstacles[:-1]:
                 self._contact_s[np.unique(contact.link)] += self._dt
+
+    def _book_compiled(self, steps: Steps) -> None:
+        """Add the flows through joints and to the ground, by the compiled kernels."""
+        from .ledger_kernels import add_ground_flows, add_joint_flows
+
+        table, n, m = steps.table, steps.link_count, steps.joint_count
+        add_joint_flows(table, n, m, self._servos.table, self._dt, self._joints)
+        add_ground_flows(table, n, m, self._stiffness, self._dt, self._ground)
 
     def stored(self, step: Step) -> FloatArray:
         """Energies stored at one instant.
