@@ -104,6 +104,9 @@ class SessionLog:
         writer.string("/robot_description").write(self._t_ns, description)
         for text in warnings(scenario):
             self.say("warn", text)
+        if scenario.faults:
+            text = "the scenario's faults are those of a bus, which this run does not have"
+            self.say("warn", text)
         self.say("info", f"start of {scenario.name}, seed {scenario.seed}: {scenario.description}")
 
     def say(self, level: str, text: str) -> None:

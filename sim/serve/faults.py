@@ -171,7 +171,7 @@ def _parsed(text: str, robot: Robot) -> BusFault:
     if grammar.joint or (grammar.joint is None and len(rest) > 1):
         joint = rest.pop(0) if rest else ""
         if joint not in robot.joint_names:
-            raise UsageError(f"{text!r}: a joint is missing: {listed(robot.joint_names, joint)}")
+            raise UsageError(f"{text!r}: expected a joint: {listed(robot.joint_names, joint)}")
     if grammar.value is not None:
         what, most = grammar.value
         value = _number(text, rest.pop(0) if rest else "", f"{what} up to {most:g}")
