@@ -218,3 +218,12 @@ def test_a_lag_may_turn_round_through_zero(make_plan, make_robot):
     _, _, values, _ = ran(PlanGait(plan, robot), robot, 3.0)
     assert values["horizontal.lag"][[0, 200, 300]] == pytest.approx([-0.6, 0.0, 0.6])
     assert math.isclose(values["horizontal.A"].min(), 0.2)
+
+
+def test_the_manuals_plan_is_one():
+    page = (Path(__file__).parents[2] / "docs" / "driving.md").read_text()
+    text = page.split("```toml\n")[1].split("```")[0]
+    assert is_plan(text)
+    plan = parse_plan(text, Path("turn.toml"))
+    assert plan.duration_s == 26.0
+    assert [segment.transition_s for segment in plan.segments] == [1.0, 2.0, 1.0]
