@@ -43,5 +43,5 @@ def _course(scenario: Scenario) -> Course:
         north = scenario.sensing.compass.north
         x, y = turned(np.array(target.position), -north).tolist()
         radius_m = controller.calibration.turn_radius_m
-        return TargetCourse(course, (x, y), radius_m, scenario.robot)
+        return TargetCourse(course, (x, y), target.radius, radius_m, scenario.robot)
     return StraightOn()

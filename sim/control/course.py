@@ -116,6 +116,7 @@ class TargetCourse:
         self,
         parameters: TargetHeading,
         target: tuple[float, float],
+        target_radius_m: float,
         turn_radius_m: float,
         robot: Robot,
     ) -> None:
@@ -124,12 +125,13 @@ class TargetCourse:
         Args:
             parameters: How to steer.
             target: From the head's start, along magnetic north and to the left of it [m].
-            turn_radius_m: Of the turn with the largest offset [m]; a target inside that circle is
-                left behind first.
+            target_radius_m: How near it must come [m].
+            turn_radius_m: Of the turn with the largest offset [m].
             robot: The robot; its first compass is read, which sits on the head.
         """
         self._law = parameters
         self._target = np.array(target)
+        self._target_radius_m = target_radius_m
         self._turn_radius_m = turn_radius_m
         self._compass = next(s for s in robot.sensors if s.kind is SensorKind.COMPASS)
         self._north: LowPass[FloatArray] | None = None
@@ -160,9 +162,15 @@ class TargetCourse:
         heading, bearing = start + now.pose.way, math.atan2(way[1], way[0])
         self._values = np.array([heading, bearing, *self._place])
         error = math.remainder(bearing - heading, TURN)
-        if math.hypot(*way) < 2.0 * self._turn_radius_m * math.sin(abs(error)):
-            return 0.0  # inside the circle of the tightest turn: first away from it
+        if self._inside_turn(math.hypot(*way), abs(error)):
+            return 0.0  # no turn leads there: first away from it
         return -min(max(self._law.gain * error, -self._law.largest), self._law.largest)
+
+    def _inside_turn(self, distance: float, error: float) -> bool:
+        """Whether the target lies so far inside the tightest turn that the turn misses it."""
+        radius = self._turn_radius_m
+        ahead, aside = distance * math.cos(error), distance * math.sin(error)
+        return math.hypot(ahead, aside - radius) < radius - self._target_radius_m
 
     def _start_from_north(self, now: Moment) -> float:
         """The head's heading at the start from magnetic north, to the left [rad]; NaN at first."""

@@ -22,7 +22,7 @@ from .reckoning import turned
 
 
 class InTheWay(NamedTuple):
-    """Obstacles ahead.
+    """Obstacles ahead, as far as they are from the nose.
 
     Attributes:
         nearest: The nearest one in the robot's way [m]; +inf where there is none.
@@ -52,6 +52,7 @@ class Lookout:
             for s in robot.sensors
             if s.name in layout.head
         ]
+        self._nose_m = robot.links[0].length / 2
         self._last: dict[str, float] = {}
         self._seen: list[tuple[float, FloatArray]] = []
 
@@ -71,7 +72,8 @@ class Lookout:
         ahead, left = turned(points.T, -now.pose.way)
         beside = np.abs(left)
         chosen = (ahead > beside) & (beside < self._parameters.half_width_m)
-        distance, left = np.hypot(ahead, left)[chosen], left[chosen]
+        distance = np.maximum(np.hypot(ahead, left)[chosen] - self._nose_m, 0.0)
+        left = left[chosen]
         return InTheWay(
             nearest=float(distance.min(initial=math.inf)),
             left=float(distance[left > 0.0].min(initial=math.inf)),

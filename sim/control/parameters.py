@@ -33,7 +33,7 @@ class Calibration:
 
     slip_ratio: float = 50.0
     turn_gain: float = 1.6
-    turn_radius_m: float = 0.6
+    turn_radius_m: float = 0.42
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class TargetHeading:
     """
 
     gain: float = 0.35
-    largest: float = 0.15
+    largest: float = 0.2
     filter_s: float = 2.0
 
 
