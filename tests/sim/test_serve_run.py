@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -67,9 +70,7 @@ def wait_for(condition, what):
 
 @contextmanager
 def process(*words, **options):
-    started = subprocess.Popen(
-        [*UNDULOG, *words], cwd=ROOT, text=True, stdout=subprocess.PIPE, **options
-    )
+    started = subprocess.Popen([*UNDULOG, *words], text=True, stdout=subprocess.PIPE, **options)
     try:
         yield started
     finally:
@@ -120,7 +121,7 @@ def driven(scenario, port, control, *words):
             *(*UNDULOG, "drive", str(scenario), "--on", f"can:socketcand:can0?port={port}"),
             *("--arm", "--recorder", str(control), "--json", *words),
         ],
-        cwd=ROOT, check=False, capture_output=True, text=True, timeout=PATIENCE_S,
+        check=False, capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -280,6 +281,45 @@ def test_it_ends_in_good_order(number, tmp_path):
     assert end["event"] == "end"
     assert end["complete"] is False
     assert (end["ticks"] > 0) is not bool(words)
+
+
+@pytest.mark.slow
+def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
+    page = (ROOT / "docs" / "virtual-robot.md").read_text()
+    section = page[page.index("## Three terminals") : page.index("## The bus")]
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    section = section.replace("29536", str(port)).replace("--duration 20", "--duration 2")
+    commands = [line[2:] for line in section.splitlines() if line.startswith("$ ")]
+    serve, record, drive, stop = (shlex.split(command)[1:] for command in commands)
+    options = {"env": os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}, "cwd": tmp_path}
+    with process(*serve, **options) as robot:
+        line = robot.stdout.readline().rstrip()
+        assert line == f"snake25 is on can0 at 127.0.0.1:{port}; it waits for commands"
+        assert line in section
+        with process(*record, **options) as recording:
+
+            def connected():
+                said = subprocess.run(
+                    [*UNDULOG, "record", "status", "--json"],
+                    capture_output=True, text=True, check=False, **options,
+                )  # fmt: skip
+                found = json.loads(said.stdout or "{}").get("recordings", [])
+                return found and found[0]["sources"][0]["connected"]
+
+            wait_for(connected, "the recorder")
+            for words in (drive, stop):
+                subprocess.run([*UNDULOG, *words], check=True, timeout=PATIENCE_S, **options)
+            assert recording.wait(60) == 0
+        robot.send_signal(signal.SIGINT)
+        told, _ = robot.communicate(timeout=60)
+        assert robot.returncode == 0
+        assert re.match(r"snake25 lived [\d.]+ s of flat ", told)
+    with Session.open(tmp_path / "run.mcap") as session:
+        commanded, measured = (session.joints(f"/joint_{w}") for w in ("commands", "states"))
+        assert commanded.names == measured.names == session.robot.joint_names
+        assert len(measured.values[0]) >= len(commanded.values[0]) > 50
+        assert session.channels["/gait"].count > 50
 
 
 def test_what_cannot_be_served_is_said_at_once(capsys):
