@@ -105,17 +105,7 @@ class McapFile:
         self._buffer.close()
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
-        """The uncompressed bytes of a block, and where in them the message offsets count from.
-
-        Args:
-            block: One of ``blocks``.
-
-        Returns:
-            A buffer and the base offset (0 unless the block is unchunked).
-
-        Raises:
-            LogError: If the payload can't be decompressed or its CRC doesn't fit.
-        """
+        """See :meth:`BlockSource.payload`."""
         if not block.compression:
             return self._buffer, block.start
         if block.start in self._cache:
@@ -128,17 +118,7 @@ class McapFile:
         return data, 0
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """The uncompressed bytes of a block, checked, and not kept in memory for later.
-
-        Args:
-            block: One of ``blocks``.
-
-        Returns:
-            A buffer, and the first and one past the last byte of the payload in it.
-
-        Raises:
-            LogError: If the payload can't be decompressed or its CRC doesn't fit.
-        """
+        """See :meth:`BlockSource.payload_once`."""
         if block.compression:
             data = self._decompress(block)
             return data, 0, len(data)
@@ -150,29 +130,14 @@ class McapFile:
         return self._buffer, block.start, block.stop
 
     def inflates(self, block: Block, limit: int) -> bool:
-        """Whether :meth:`inflate_into` can be used: a whole zstd chunk of no more than ``limit``.
-
-        Args:
-            block: One of ``blocks``.
-            limit: Largest size wanted [byte].
-
-        Returns:
-            False for a block that only :meth:`payload` can read.
-        """
+        """See :meth:`BlockSource.inflates`."""
         return block.compression == "zstd" and block.complete and 0 < block.size <= limit
 
     def inflate_into(self, block: Block, room: memoryview) -> None:
-        """Decompress a block into memory that is there already, and check it.
+        """See :meth:`BlockSource.inflate_into`.
 
         A frame that has a checksum of its own is not held against the chunk's CRC as well: both
         are 32 bits of the same bytes, and decompression has verified the one.
-
-        Args:
-            block: One for which :meth:`inflates` holds.
-            room: As many bytes as it has.
-
-        Raises:
-            LogError: If it can't be decompressed or its CRC doesn't fit.
         """
         where = f"the chunk at byte {block.start}"
         try:
@@ -187,19 +152,7 @@ class McapFile:
             raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
 
     def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """The message index of some channels in a block: log time and offset of each message.
-
-        Args:
-            block: One of ``blocks``.
-            channel_ids: The channels.
-
-        Returns:
-            For each channel 16 bytes a message (two u64), in the order of the index; nothing is
-            checked but its size.
-
-        Raises:
-            LogError: If the index or the payload is damaged.
-        """
+        """See :meth:`BlockSource.entries`."""
         if block.offsets is not None or not block.index_at:
             return [as_entries(self.offsets(block, channel_id)) for channel_id in channel_ids]
         buffer, end = self._buffer, len(self._buffer)
@@ -221,18 +174,7 @@ class McapFile:
         return found
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """Where a channel's message records start in a block's payload.
-
-        Args:
-            block: One of ``blocks``.
-            channel_id: The channel.
-
-        Returns:
-            Offsets of the records' opcode bytes, shape (n,), in the order of the index.
-
-        Raises:
-            LogError: If the index or the payload is damaged.
-        """
+        """See :meth:`BlockSource.offsets`."""
         if block.offsets is None and block.index_at:
             return self._message_index(block, channel_id)
         if block.offsets is None:  # a chunk that was written without a message index

@@ -10,7 +10,6 @@ import mmap
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
+from .block_source import BlockSource
 from .chunk import Block, Buffer
 from .mcap_file import McapFile
 from .message_heads import read_heads
@@ -25,18 +25,6 @@ from .part_files import PartFiles, first_part, open_parts
 from .part_names import PART_RECORD
 from .recovered import Recovered
 from .wal_tail import MessageKey, WalContents, WalTail, beyond, read_wal
-
-
-class _Part(Protocol):
-    """What has blocks."""
-
-    def payload(self, block: Block) -> tuple[Buffer, int]: ...
-    def payload_once(self, block: Block) -> tuple[Buffer, int, int]: ...
-    def inflates(self, block: Block, limit: int) -> bool: ...
-    def inflate_into(self, block: Block, room: memoryview) -> None: ...
-    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]: ...
-    def offsets(self, block: Block, channel_id: int) -> IntArray: ...
-    def close(self) -> None: ...
 
 
 class LogFile:
@@ -64,7 +52,7 @@ class LogFile:
         self.attachments: dict[str, Attachment] = {}
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
-        self._sources: list[_Part] = []
+        self._sources: list[BlockSource] = []
         self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
         first = first_part(path)
         wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
@@ -98,86 +86,27 @@ class LogFile:
         self.parts.close()
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
-        """The uncompressed bytes of a block, and where in them the message offsets count from.
-
-        Args:
-            block: One of ``blocks``.
-
-        Returns:
-            A buffer and the base offset (0 unless the block is unchunked).
-
-        Raises:
-            LogError: If the payload can't be decompressed or its CRC doesn't fit.
-        """
+        """See :meth:`BlockSource.payload`."""
         return self._sources[block.part].payload(block)
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """The uncompressed bytes of a block, checked, and not kept in memory for later.
-
-        Args:
-            block: One of ``blocks``.
-
-        Returns:
-            A buffer, and the first and one past the last byte of the payload in it.
-
-        Raises:
-            LogError: If the payload can't be decompressed or its CRC doesn't fit.
-        """
+        """See :meth:`BlockSource.payload_once`."""
         return self._sources[block.part].payload_once(block)
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """Where a channel's message records start in a block's payload.
-
-        Args:
-            block: One of ``blocks``.
-            channel_id: The channel.
-
-        Returns:
-            Offsets of the records' opcode bytes, shape (n,), in the order of the index.
-
-        Raises:
-            LogError: If the index or the payload is damaged.
-        """
+        """See :meth:`BlockSource.offsets`."""
         return self._sources[block.part].offsets(block, channel_id)
 
     def inflates(self, block: Block, limit: int) -> bool:
-        """Whether :meth:`inflate_into` can be used: a whole zstd chunk of no more than ``limit``.
-
-        Args:
-            block: One of ``blocks``.
-            limit: Largest size wanted [byte].
-
-        Returns:
-            False for a block that only :meth:`payload` can read.
-        """
+        """See :meth:`BlockSource.inflates`."""
         return self._sources[block.part].inflates(block, limit)
 
     def inflate_into(self, block: Block, room: memoryview) -> None:
-        """Decompress a block into memory that is there already, and check it.
-
-        Args:
-            block: One for which :meth:`inflates` holds.
-            room: As many bytes as it has.
-
-        Raises:
-            LogError: If it can't be decompressed or its CRC doesn't fit.
-        """
+        """See :meth:`BlockSource.inflate_into`."""
         self._sources[block.part].inflate_into(block, room)
 
     def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """The message index of some channels in a block: log time and offset of each message.
-
-        Args:
-            block: One of ``blocks``.
-            channel_ids: The channels.
-
-        Returns:
-            For each channel 16 bytes a message (two u64), in the order of the index; nothing is
-            checked but its size.
-
-        Raises:
-            LogError: If the index or the payload is damaged.
-        """
+        """See :meth:`BlockSource.entries`."""
         return self._sources[block.part].entries(block, channel_ids)
 
     # -- putting together ------------------------------------------------------------------
@@ -199,7 +128,7 @@ class LogFile:
             self._keep(item)
         self._add(file, file.blocks, file.counts)
 
-    def _add(self, source: _Part, blocks: list[Block], counts: dict[int, int]) -> None:
+    def _add(self, source: BlockSource, blocks: list[Block], counts: dict[int, int]) -> None:
         for block in blocks:
             block.part = len(self._sources)
         self._sources.append(source)

@@ -123,27 +123,27 @@ class WalTail:
         self.blocks = [Block(0, size, "", size, 0, start_ns, end_ns, offsets=offsets)]
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
-        """The bytes of the block, and where its offsets count from."""
+        """See :meth:`BlockSource.payload`."""
         return self._data, block.start
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """The bytes of the block, its first byte and one past its last."""
+        """See :meth:`BlockSource.payload_once`."""
         return self._data, block.start, block.stop
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """Where a channel's messages start, shape (n,)."""
+        """See :meth:`BlockSource.offsets`."""
         return (block.offsets or {}).get(channel_id, np.empty(0, dtype=np.int64))
 
     def inflates(self, block: Block, limit: int) -> bool:  # noqa: ARG002 (as a file has it)
-        """Never: nothing is compressed."""
+        """See :meth:`BlockSource.inflates`; never: nothing is compressed."""
         return False
 
     def inflate_into(self, block: Block, room: memoryview) -> None:
-        """Copy the block."""
+        """See :meth:`BlockSource.inflate_into`."""
         room[:] = self._data[block.start : block.stop]
 
     def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """The offsets of some channels as message indexes without log times."""
+        """See :meth:`BlockSource.entries`."""
         return [as_entries(self.offsets(block, channel_id)) for channel_id in channel_ids]
 
     def close(self) -> None:
