@@ -15,7 +15,7 @@ from capture.shipped import Shelf
 from ..control.build import build_gait
 from ..gait import Gait
 from ..scenario import Scenario
-from ..scenario_file import load_scenario, parse_scenario
+from ..scenario_file import load_scenario, parse_scenario, scenario_names
 from .command_session import CommandReplay, RecordedCommands
 from .plan import PlanGait
 from .plan_file import is_plan, parse_plan
@@ -29,27 +29,27 @@ class Driven:
         kind: ``gait``, ``plan`` or ``commands``.
         name: What to call it.
         robot: Who it was made for.
-        world: The scenario that it was made for, None where that isn't known.
+        world: Finds the scenario that it was made for, None where that isn't known.
         duration_s: How long it lasts.
         planes: The planes that it needs.
         make: Builds the gait, at time zero, for a robot; in a world if that is given, else in the
             one that it was made for.
         facts: What a session's metadata says of it.
         attachments: File name to TOML text that explains it.
-        own_gait: Whether gait and controller of ``world`` are what is driven: a run's scenario then
-            says it all.
+        own: The scenario whose gait and controller are driven, if that is what it is: a run's
+            scenario then says it all.
     """
 
     kind: str
     name: str
     robot: Robot
-    world: Scenario | None
+    world: Callable[[], Scenario | None]
     duration_s: float
     planes: tuple[Plane, ...]
     make: Callable[[Robot, Scenario | None], Gait]
     facts: Mapping[str, str]
     attachments: Mapping[str, bytes]
-    own_gait: bool = False
+    own: Scenario | None = None
 
     def scenario(self, world: Scenario | None, duration_s: float | None) -> Scenario:
         """The scenario of a run on the twin.
@@ -63,8 +63,9 @@ class Driven:
 
         Raises:
             UsageError: If no world is known, or its robot lacks a plane.
+            ScenarioError: If the world that it was made for can't be had, e.g. for its robot.
         """
-        where = world or self.world
+        where = world or self.world()
         if where is None:
             raise UsageError(
                 f"{self.name} does not say in which world it ran; name one, e.g. --on twin:flat"
@@ -75,9 +76,8 @@ class Driven:
                     f"{self.name} moves {plane} joints and {where.robot.name} of {where.name} has "
                     "none"
                 )
-        if self.own_gait and self.world is not None:
-            own = self.world
-            where = dataclasses.replace(where, gait=own.gait, controller=own.controller)
+        if self.own is not None:
+            where = dataclasses.replace(where, gait=self.own.gait, controller=self.own.controller)
         return where.changed(duration_s=self.duration_s if duration_s is None else duration_s)
 
 
@@ -99,7 +99,8 @@ def find_driven(word: str, world: Scenario | None = None) -> Driven:
         DataError: If a session's commands are of another robot, or of none.
     """
     path = Path(word)
-    if path.suffix == ".mcap":
+    is_folder = path.is_dir() and word not in scenario_names()  # of the parts of a session
+    if path.suffix == ".mcap" or is_folder:
         return _commands(path, world)
     found = Shelf("gait or plan", "sim", "scenarios", PlanError).read(word)
     if is_plan(found.text):
@@ -115,13 +116,13 @@ def _gait(scenario: Scenario) -> Driven:
         kind="gait",
         name=scenario.name,
         robot=scenario.robot,
-        world=scenario,
+        world=lambda: scenario,
         duration_s=scenario.duration_s,
         planes=tuple(scenario.gait.planes),
         make=make,
         facts={"driven": "gait", "driven.by": scenario.name},
         attachments={"gait.toml": scenario.toml().encode()},
-        own_gait=True,
+        own=scenario,
     )
 
 
@@ -131,7 +132,7 @@ def _plan(text: str, source: Path) -> Driven:
         kind="plan",
         name=plan.name,
         robot=plan.scenario.robot,
-        world=plan.scenario,
+        world=lambda: plan.scenario,
         duration_s=plan.duration_s,
         planes=tuple(plan.start),
         make=lambda robot, _: PlanGait(plan, robot),
@@ -144,7 +145,7 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
-        scenario = _recorded_scenario(session) if world is None else world
+        text = session.attachments.get("scenario.toml")
         robot = session.robot if world is None else world.robot
         facts["driven.session_id"] = session.session_id
     if robot is None:
@@ -153,22 +154,19 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
         replay = CommandReplay(recorded, robot)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
+
+    def recorded_world() -> Scenario | None:
+        """The scenario that a session of the twin ran."""
+        return None if text is None else parse_scenario(text.decode(), f"{path}:scenario.toml")
+
     return Driven(
         kind="commands",
         name=path.name,
         robot=robot,
-        world=scenario,
+        world=recorded_world,
         duration_s=replay.duration_s,
         planes=(),
         make=lambda robot, _: CommandReplay(recorded, robot),
         facts=facts,
         attachments={},
     )
-
-
-def _recorded_scenario(session: Session) -> Scenario | None:
-    """The scenario that a session of the twin ran."""
-    text = session.attachments.get("scenario.toml")
-    if text is None:
-        return None
-    return parse_scenario(text.decode(), f"{session.path}:scenario.toml")

@@ -1,0 +1,118 @@
+"""Telling a recorder the gait: through a real control socket, and what follows when it goes."""
+
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from capture.daemon.control import ControlServer
+from capture.daemon.control_requests import GAIT_NAMES
+from capture.errors import ControlError
+from sim.drive.gait_teller import GaitTeller
+from sim.gait import GaitTick
+
+NAMES = tuple(f"horizontal.{key}" for key in ("A", "omega", "lag", "offset", "phase"))
+
+
+def tick(k, mode="walk", count=5):
+    return GaitTick(np.zeros(25), np.arange(count) + float(k), mode, ())
+
+
+@contextmanager
+def control_socket(path, refuse=()):
+    """A recorder's control socket that keeps what it is asked."""
+    heard, ended = [], threading.Event()
+
+    def handle(request):
+        heard.append(dict(request))
+        if request["do"] in refuse:
+            raise ControlError("a source writes that topic")
+        return {}
+
+    server = ControlServer(path, handle)
+
+    def serve():
+        while not ended.is_set():
+            server.poll()
+            time.sleep(0.002)
+        server.close()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+
+    def end():
+        ended.set()
+        thread.join()
+
+    try:
+        yield heard, end
+    finally:
+        end()
+
+
+def test_everything_is_told_in_order(tmp_path):
+    with control_socket(tmp_path / "a.sock") as (heard, _):
+        teller = GaitTeller(tmp_path / "a.sock", NAMES)
+        teller.note("drives")
+        for k in range(300):
+            teller.tell(tick(k, "walk" if k < 200 else "avoid"), 10**18 + k)
+        teller.close()
+    assert (teller.told, teller.dropped, teller.error) == (300, 0, None)
+    gait = [request for request in heard if request["do"] == "gait"]
+    assert [request["t_ns"] - 10**18 for request in gait] == list(range(300))
+    assert gait[7]["values"] == dict(zip(NAMES, [7.0, 8.0, 9.0, 10.0, 11.0], strict=True))
+    others = [(heard.index(one), one) for one in heard if one["do"] != "gait"]
+    assert others == [
+        (0, {"do": "note", "text": "drives", "level": "info"}),
+        (1, {"do": "mode", "text": "walk"}),
+        (202, {"do": "mode", "text": "avoid"}),
+    ]
+
+
+def test_values_of_single_joints_are_not_for_the_recorder(tmp_path):
+    with control_socket(tmp_path / "a.sock") as (heard, _):
+        teller = GaitTeller(tmp_path / "a.sock", (*NAMES, "joint01.A", "joint03.A"))
+        teller.tell(tick(0, count=7), 1)
+        teller.close()
+    assert set(heard[-1]["values"]) == set(NAMES) <= set(GAIT_NAMES)
+
+
+def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
+    with control_socket(tmp_path / "a.sock") as (heard, _):
+        teller = GaitTeller(tmp_path / "a.sock", ())
+        teller.tell(tick(0, "replay", count=0), 1)
+        teller.close()
+    assert heard == [{"do": "mode", "text": "replay"}]
+    assert teller.told == 0
+
+
+def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
+    with control_socket(tmp_path / "a.sock") as (_, end):
+        teller = GaitTeller(tmp_path / "a.sock", NAMES)
+        teller.tell(tick(0), 1)
+        teller_told(teller, 1)
+        end()
+        for k in range(5000):  # more than is held: nothing waits, nothing fails
+            teller.tell(tick(k), k)
+        teller.close()
+    assert teller.told == 1
+    assert "went" in teller.error
+    with control_socket(tmp_path / "b.sock", refuse=("gait",)):
+        teller = GaitTeller(tmp_path / "b.sock", NAMES)
+        teller.tell(tick(0), 1)
+        teller.close()
+    assert (teller.told, teller.error) == (0, "a source writes that topic")
+
+
+def teller_told(teller, count):
+    deadline = time.monotonic() + 10
+    while teller.told < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_no_recorder_there_is_an_error(tmp_path):
+    with pytest.raises(ControlError, match="no recorder listens there"):
+        GaitTeller(tmp_path / "none.sock", NAMES)
