@@ -29,6 +29,7 @@ from .blueprint import build_blueprint
 from .content import Content, Signal, Start
 from .motion import HeadPath, assemble, read_head
 from .response import charts, log_charts
+from .surroundings import log_surroundings, world_of
 from .timeline import Clock
 from .tracks import Columns, Track, read_columns
 from .views import body_title
@@ -223,6 +224,9 @@ def _log_world(
             f"no angles of {', '.join(missing)}: the body is drawn up to the first of these"
         )
     rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    world = world_of(sources.session, sources.warnings)
+    if world is not None:
+        log_surroundings(rec, world)
     limit = body.log_body(rec, clock, motion)
     body.log_ghost(rec, clock, motion)
     ranges.log_ranges(rec, clock, sources.session, motion)

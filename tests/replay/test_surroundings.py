@@ -1,0 +1,54 @@
+"""Obstacles and target: where the scenario has them, read back from the recording."""
+
+import numpy as np
+import pytest
+
+from capture import Session, SessionWriter
+from replay.rrd import write_recording
+from sim import load_scenario
+from sim.world import Cylinder, Wall
+
+EPOCH_NS = 1_735_689_600_000_000_000
+
+
+@pytest.fixture(scope="module")
+def world():
+    """A shipped world with cylinders, walls and a target."""
+    return load_scenario("target-following").world
+
+
+@pytest.fixture
+def recorded(snake25, tmp_path):
+    """A function that records a straight robot with a scenario attached, and converts it."""
+
+    def convert(scenario):
+        path = tmp_path / "run.mcap"
+        with SessionWriter(path, session_id="x", epoch_ns=EPOCH_NS, robot=snake25) as writer:
+            writer.attach("scenario.toml", "application/toml", scenario)
+            states = writer.joint_state("/joint_states", snake25.joint_names, unit="rad")
+            for i in range(4):
+                states.write(EPOCH_NS + i * 10_000_000, np.zeros(25))
+        with Session.open(path) as session:
+            return write_recording(session, tmp_path / "run.rrd")
+
+    return convert
+
+
+def test_obstacles_and_target_stand_where_the_scenario_has_them(world, recorded, read_back):
+    scenario = load_scenario("target-following").toml().encode()
+    found = read_back(recorded(scenario).path)
+    cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
+    walls = [one for one in world.obstacles if isinstance(one, Wall)]
+    radii = found.static("/world/obstacles/cylinders", "Cylinders3D:radii")
+    np.testing.assert_allclose(radii, [one.radius for one in cylinders], rtol=1e-6)
+    half = found.static("/world/obstacles/boxes", "Boxes3D:half_sizes")
+    length = [np.hypot(*np.subtract(one.end, one.start)) for one in walls]
+    np.testing.assert_allclose(2 * np.array(half)[:, 0], length, rtol=1e-6)
+    strips = found.static("/world/target", "LineStrips3D:strips")
+    away = np.array(strips[0])[:, :2] - world.target.position
+    np.testing.assert_allclose(np.hypot(*away.T), world.target.radius, rtol=1e-5)
+
+
+def test_a_faulty_scenario_is_said_and_the_rest_drawn(recorded):
+    recording = recorded(b"[world]\nheading = 'north'\n")
+    assert any("obstacles are not drawn: world.heading" in text for text in recording.warnings)
