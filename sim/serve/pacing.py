@@ -14,8 +14,10 @@ import time
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 
-PATIENCE_NS = 100_000_000
-"""So far behind the twin may be [ns] and still try to catch up."""
+PATIENCE_NS = 50_000_000
+"""So far behind the twin may be [ns] and still try to catch up. Its samples are two control periods
+old when they come; together that stays below the 0.1 s by which a recorder tells times that are
+late from a clock that was set back."""
 
 _ON_THEIR_WAY = 5  # ticks: no sample arrives later than that
 _NS = 1_000_000_000
