@@ -22,9 +22,9 @@ Extra = Callable[[float, FloatArray], FloatArray]
 """Further rates of the phases [rad/s], given the time since the start of the advance [s] and the
 phases in the turning frame [rad]."""
 
-STEP_OF_FASTEST = 0.1
-"""Longest step, as a share of the shortest time constant: the classical Runge-Kutta method then
-errs by less than 1e-7 in a time constant ((0.1)^5/120 a step)."""
+STEP_OF_FASTEST = 0.2
+"""Longest step, as a share of the shortest time constant that the rates' bound allows: a step of
+the classical Runge-Kutta method then errs by (0.2)^5/120 = 3e-6 of a deviation at most."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,9 @@ def phase_rates(theta: FloatArray, coupling: Coupling) -> FloatArray:
         Their rates [rad/s], shape (n,).
     """
     pull = np.sin(theta[1:] - theta[:-1] - coupling.lag)
-    rate = np.zeros_like(theta)
-    rate[:-1] += coupling.backward * pull
+    rate = np.empty_like(theta)
+    rate[-1] = 0.0
+    np.multiply(coupling.backward, pull, out=rate[:-1])
     rate[1:] -= coupling.forward * pull
     return rate
 

@@ -161,10 +161,14 @@ class _OscillatorRhythm:
         omega, phase = self._omega * self._factor, self._phase.value
         detuning, felt, steady = self._factor * self._detuning, self._felt, self._steady
 
-        def extra(time_s: float, theta: FloatArray) -> FloatArray:
+        def constant(_time_s: float, _theta: FloatArray) -> FloatArray:
+            return detuning
+
+        def sensed(time_s: float, theta: FloatArray) -> FloatArray:
             return detuning + felt * np.cos(phase + omega * time_s + theta) - steady
 
-        # Without feedback the detuning is all there is, and constant: nothing to resolve.
-        strongest = float(np.abs(felt).max())
-        fastest = abs(omega) + strongest if strongest > 0.0 else 0.0
-        self._oscillators.advance(elapsed_s, extra, fastest)
+        if self._chain.feedback > 0.0:
+            fastest = abs(omega) + float(np.abs(felt).max())
+            self._oscillators.advance(elapsed_s, sensed, fastest)
+        else:
+            self._oscillators.advance(elapsed_s, constant, 0.0)

@@ -5,11 +5,13 @@ to 0.32 m/s sideways; rolling half a turn a second; twist 0.05 to 0.11 m/s.
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from capture.robot import Plane
 from sim import Readings, load_scenario
 from sim.gait import generator
 from sim.twin import Twin
@@ -27,6 +29,7 @@ class Motion(NamedTuple):
     positions: np.ndarray
 
 
+@cache
 def motion(name):
     positions, rolls = [], []
     with Twin(load_scenario(name)) as twin:
@@ -112,3 +115,23 @@ def test_other_generators_settle_into_the_wave_of_flat(name):
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators"])
 def test_the_same_wave_moves_the_body_alike_whatever_made_it(name):
     assert motion(name).forward == pytest.approx(motion("flat").forward, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_felt_servos_keep_the_wave_and_slow_it_a_little():
+    # The responses follow their commands with gains near 1: see the closed form of the drift,
+    # -eps^2 g^2 / 2 omega, in test_gait_oscillators.
+    scenario = load_scenario("oscillators-feedback")
+    with Twin(scenario) as twin:
+        names = list(twin.gait.names)
+        values = np.array([sample.gait.values for sample in twin.samples()])
+    joints = scenario.robot.joint_indices(Plane.HORIZONTAL)
+    at = [names.index(f"{scenario.robot.joint_names[i]}.phase") for i in joints]
+    chain = scenario.gait.planes[Plane.HORIZONTAL]
+    time_s = np.arange(len(values)) / 100
+    shift = values[:, at] - math.pi * time_s[:, None] - np.arange(13) * chain.signed_lag
+    late = shift[-1 - CYCLE : -1].mean(axis=0)
+    assert np.ptp(late) < math.radians(10.0)
+    drift = (late - shift[1000 : 1000 + CYCLE].mean(axis=0)) / (time_s[-1 - CYCLE] - 10.0)
+    expected = -(chain.feedback**2) / (2 * math.pi)
+    np.testing.assert_allclose(drift, expected, rtol=0.2)

@@ -169,7 +169,7 @@ def test_phases_against_scipy(make_robot):
     times = np.arange(501) / 100
     pattern = -PSI * np.arange(8)
     foreign = foreign_phases(pattern + start, forward, backward, detuning, times=times)
-    np.testing.assert_allclose(theta, foreign, atol=2e-6)
+    np.testing.assert_allclose(theta, foreign, atol=1e-7)
 
 
 def test_hopf_oscillators_against_scipy_and_the_paper_s_form(make_robot):
@@ -209,7 +209,7 @@ def test_hopf_oscillators_against_scipy_and_the_paper_s_form(make_robot):
         detuning=tuple(detuning),
         start_phase=tuple(start),
     )
-    np.testing.assert_allclose(commands[100:], foreign[100:, n:], atol=1e-6)
+    np.testing.assert_allclose(commands[100:], foreign[100:, n:], atol=1e-7)
 
 
 def test_the_limit_cycle_has_its_radius_and_its_frequency(make_robot):
@@ -298,7 +298,7 @@ def test_feedback_against_scipy(make_robot):
         ends = np.array([0.0, 0.01])
         half = np.full(n - 1, 0.5)
         state = foreign_phases(state, half, half, np.zeros(n), times=ends, drive=drive)[-1]
-    np.testing.assert_allclose(theta, found, atol=1e-6)
+    np.testing.assert_allclose(theta, found, atol=1e-7)
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.5, 1.0])
@@ -318,6 +318,26 @@ def test_feedback_settles_where_the_mean_response_equals_the_bias(make_robot, bi
     theta, _, _ = run(robot, 32.0, feedback=eps, feedback_bias=b, answer=answer)
     shift = (theta[-200:] + PSI * np.arange(3)).mean()
     assert shift == pytest.approx(late - math.asin(b / gain), abs=eps * gain / (2 * OMEGA))
+
+
+def test_feedback_of_an_answer_that_follows_slows_the_rhythm_in_second_order(make_robot):
+    # q = A sin(phi + delta): phi' = omega + eps (sin(2 phi + delta) + sin(delta) - b). With the
+    # bias taken out, the ripple theta = -(eps/2 omega) cos(2 phi + delta) times the slope
+    # 2 eps cos(2 phi + delta) leaves -eps^2/2 omega in the mean.
+    eps = 0.2
+    bias = math.sin(-0.015 * OMEGA)  # the answer is the command itself, 10 to 20 ms old
+    theta, _, _ = run(
+        make_robot(4, planar=True),
+        30.0,
+        approach_rate=100.0,
+        forward=0.0,
+        backward=0.0,
+        feedback=eps,
+        feedback_bias=bias,
+        answer=lambda t, command: command,
+    )
+    drift = (theta[-1] - theta[1000]).mean() / 20.0
+    assert drift == pytest.approx(-(eps**2) / (2 * OMEGA), rel=0.05)
 
 
 def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):
