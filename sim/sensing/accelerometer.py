@@ -87,17 +87,21 @@ class Accelerometer:
 
     def _specific_force(self, steps: Steps) -> FloatArray:
         """Mean specific force of each step in the carrying links' frames, shape (t, k, 3)."""
-        body = steps.stacked.body
-        sums: list[FloatArray] = []
+        body, count = steps.stacked.body, len(steps) - 1
+        means: list[FloatArray] = []
         for link, mount in zip(self._mounts.link, self._mounts.position, strict=True):
             quaternion = body.quaternion[:, :, link].T  # (4, t + 1)
-            arm = out_of_frames(quaternion, np.broadcast_to(mount[:, None], (3, len(steps))))
-            velocity = body.velocity[:, :, link].T + cross(body.spin[:, :, link].T, arm)
-            force = np.diff(velocity) / self._dt - self._gravity[:, None]
-            sums.append(
-                into_frames(quaternion[:, :-1], force) + into_frames(quaternion[:, 1:], force)
+            velocity = body.velocity[:, :, link].T
+            if mount.any():
+                arm = out_of_frames(quaternion, np.tile(mount[:, None], count + 1))
+                velocity = velocity + cross(body.spin[:, :, link].T, arm)
+            force = (velocity[:, 1:] - velocity[:, :-1]) / self._dt - self._gravity[:, None]
+            at_ends = into_frames(
+                np.concatenate([quaternion[:, :-1], quaternion[:, 1:]], axis=1),
+                np.concatenate([force, force], axis=1),
             )
-        return 0.5 * np.array(sums).transpose(2, 0, 1)
+            means.append(0.5 * (at_ends[:, :count] + at_ends[:, count:]).T)
+        return np.stack(means, axis=1)
 
     def _told(self, force: FloatArray, time_s: float) -> list[VectorSample]:
         force = (force[:, None] @ self._mounts.rotation)[:, 0]  # into the sensors' frames

@@ -60,7 +60,7 @@ class Compass:
         """
         self._names = [one.name for one in sensors]
         self._mounts = Mounts(sensors, robot)
-        self._schedule = Schedule(1.0 / model.rate_hz, [0.0] * len(sensors), dt)
+        self._schedule = Schedule(1.0 / model.rate_hz, len(sensors), dt)
         self._model = model
         self._field = earth_field(model)
         self._axes = measured(sensors)

@@ -82,12 +82,11 @@ class Infrared:
             seed: Of the noise.
         """
         count = len(sensors)
-        phases = [i * model.hold_s / count for i in range(count)]
         self._ranging = Ranging(
             sensors,
             robot,
             caster,
-            Schedule(model.hold_s, phases, dt),
+            Schedule(model.hold_s, count, dt),
             bundles=np.tile([[1.0], [0.0], [0.0]], (count, 1, 1)),
             sees_ground=True,
             dt=dt,

@@ -1,4 +1,4 @@
-"""Where the sensors of a robot are and which way they look, and when each is due."""
+"""Where the sensors of a robot are, which way they look, and when each is due."""
 
 from __future__ import annotations
 
@@ -76,18 +76,19 @@ class Mounts:
 
 
 class Schedule:
-    """Sensors that each measure at a rate of their own, in whole physics steps."""
+    """Sensors that take turns: each measures once a period, in whole physics steps."""
 
-    def __init__(self, period_s: float, phases_s: Sequence[float], dt: float) -> None:
-        """Start at step zero.
+    def __init__(self, period_s: float, count: int, dt: float) -> None:
+        """Start at step zero, where the first sensor measures.
 
         Args:
             period_s: From one measurement of a sensor to its next [s], rounded to whole steps.
-            phases_s: When each sensor measures first [s], rounded likewise.
+            count: k; their turns are spread evenly over the period.
             dt: Physics step [s].
         """
-        self.period = max(1, round(period_s / dt))
-        self._next = np.rint(np.array(phases_s, dtype=np.float64) / dt).astype(np.int64)
+        self._period = max(1, round(period_s / dt))
+        self._phases = [i * self._period // count for i in range(count)]
+        self._done = 0
 
     def due(self, stop: int) -> tuple[IntArray, IntArray]:
         """The measurements before a step that were not asked for yet.
@@ -98,14 +99,13 @@ class Schedule:
         Returns:
             Steps and sensors, in order of time, each of shape (p,).
         """
-        steps: list[IntArray] = []
-        sensors: list[IntArray] = []
-        while len(due := np.flatnonzero(self._next < stop)):
-            steps.append(self._next[due])
-            sensors.append(due)
-            self._next[due] += self.period
-        if not steps:
-            return np.empty(0, np.int64), np.empty(0, np.int64)
-        step, sensor = np.concatenate(steps), np.concatenate(sensors)
-        order = np.argsort(step, kind="stable")
-        return step[order], sensor[order]
+        found: list[tuple[int, int]] = []
+        while True:
+            turn, sensor = divmod(self._done, len(self._phases))
+            step = turn * self._period + self._phases[sensor]
+            if step >= stop:
+                break
+            found.append((step, sensor))
+            self._done += 1
+        steps, sensors = np.array(found, dtype=np.int64).reshape(-1, 2).T
+        return steps, sensors

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Protocol
 
-from capture.arrays import FloatArray
 from capture.robot import Sensor, SensorKind
 
 from ..physics.steps import Steps
@@ -83,26 +81,21 @@ class Senses:
 
     def _known(self, samples: list[SensorSample]) -> list[SensorSample]:
         """Take samples into the readings; returns them."""
-        ranges: dict[str, float] = {}
-        acceleration: dict[str, FloatArray] = {}
-        magnetic_field: dict[str, FloatArray] = {}
-        known = self._readings
+        if not samples:
+            return samples
+        old = self._readings
+        angle, velocity = old.angle, old.velocity
+        ranges, acceleration, field = {**old.ranges}, {**old.acceleration}, {**old.magnetic_field}
         for sample in samples:
             if isinstance(sample, JointSample):
-                known = dataclasses.replace(known, angle=sample.position, velocity=sample.velocity)
+                angle, velocity = sample.position, sample.velocity
             elif isinstance(sample, RangeSample):
                 ranges[sample.name] = sample.distance
             elif sample.name in self._accelerometers:
                 acceleration[sample.name] = sample.vector
             else:
-                magnetic_field[sample.name] = sample.vector
-        if samples:
-            self._readings = dataclasses.replace(
-                known,
-                ranges={**known.ranges, **ranges},
-                acceleration={**known.acceleration, **acceleration},
-                magnetic_field={**known.magnetic_field, **magnetic_field},
-            )
+                field[sample.name] = sample.vector
+        self._readings = Readings(angle, velocity, ranges, acceleration, field)
         return samples
 
 

@@ -68,13 +68,11 @@ class Sonar:
             dt: Physics step [s].
             seed: Of the noise.
         """
-        count = len(sensors)
-        period_s = 1.0 / model.rate_hz
         self._ranging = Ranging(
             sensors,
             robot,
             caster,
-            Schedule(period_s, [i * period_s / count for i in range(count)], dt),
+            Schedule(1.0 / model.rate_hz, len(sensors), dt),
             bundles=np.array([cone(model.rays, one.field_of_view or 0.0) for one in sensors]),
             sees_ground=False,
             dt=dt,
