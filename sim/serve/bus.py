@@ -11,7 +11,8 @@ from capture.log.frames import FrameArray, empty_frames
 from capture.sources.records import records
 from capture.sources.sender import FrameSender
 
-from .socketcand_server import Sent, SocketcandServer
+from .bus_client import Sent
+from .socketcand_server import SocketcandServer
 
 _LONGEST_WAIT_S = 0.05
 

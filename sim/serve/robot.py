@@ -1,9 +1,9 @@
 """The virtual robot: the twin, commanded over its bus and reporting there.
 
 At each control tick what the sensors have told by then goes out first, and then the newest commands
-are latched, so that a controller that is quick enough (in lockstep: every controller) closes its
-loop within the tick, as one in process does. The frames of a tick go out in one burst; their device
-times are the sampling times.
+are latched. In lockstep a controller thus closes its loop within the tick, as one in process does;
+in real time its answer counts from the next tick on. The frames of a tick go out in one burst;
+their device times are the sampling times.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ..scenario import CONTROL_RATE_HZ, Scenario
 from ..sensing.contract import SensorSample
 from ..twin import Twin
 from .bus import VirtualBus
+from .bus_client import Sent
 from .commands import WATCHDOG_S, CommandLatch
 from .encode import ReplyEncoder
 from .fault_line import FaultLine
 from .faults import BusFault
 from .pacing import Pacer, PaceTally
-from .socketcand_server import Sent
 
 _NS = 1_000_000_000
 PERIOD_NS = _NS // CONTROL_RATE_HZ

@@ -17,12 +17,12 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 from capture.log.frames import FrameArray
 
+from .bus_client import BusClient, Sent
 from .loopback import listen_on_loopback
-from .socketcand_text import ClientText, frame_text, sent_frame
+from .socketcand_text import frame_text, sent_frame
 
 MOST_CLIENTS = 16
 """Clients at once."""
@@ -37,30 +37,6 @@ comes with the answer for part of it."""
 _CHUNK = 1 << 14
 _UNSUPPORTED = ("add", "update", "delete", "subscribe", "unsubscribe", "filter", "muxfilter")
 _SEND = ("send", "sendrtr")
-
-
-class Sent(NamedTuple):
-    """A frame that a client sent.
-
-    Attributes:
-        client: Number of the client.
-        record: As :data:`capture.sources.records.pack_record` packs it, without times.
-    """
-
-    client: int
-    record: bytes
-
-
-class _Client:
-    """One connection."""
-
-    def __init__(self, number: int, sock: socket.socket, peer: str) -> None:
-        self.number, self.sock, self.peer = number, sock, peer
-        self.text = ClientText()
-        self.bus_open = self.raw = self.marks = False
-        self.held_until = 0.0
-        self.out = bytearray()
-        self.watched = selectors.EVENT_READ
 
 
 class SocketcandServer:
@@ -87,7 +63,7 @@ class SocketcandServer:
         self.identity = ""
         self._tick: int | None = None
         self._bus, self._say = bus, say
-        self._clients: dict[int, _Client] = {}
+        self._clients: dict[int, BusClient] = {}
         self._number = 0
         self._sent: deque[Sent] = deque()
         self._selector = selectors.DefaultSelector()
@@ -120,7 +96,7 @@ class SocketcandServer:
         held = [client.held_until - now for client in self._clients.values() if client.out]
         waits = [wait for wait in held if wait > 0]
         for key, mask in self._selector.select(max(0.0, min([timeout_s, *waits]))):
-            client: _Client | None = key.data
+            client: BusClient | None = key.data
             if client is None:
                 self._accept()
                 continue
@@ -192,12 +168,12 @@ class SocketcandServer:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._number += 1
-        client = _Client(self._number, sock, f"client {self._number} at port {peer[1]}")
+        client = BusClient(self._number, sock, peer[1])
         self._clients[client.number] = client
         self._selector.register(sock, client.watched, client)
         self._give(client, b"< hi >")
 
-    def _read(self, client: _Client) -> None:
+    def _read(self, client: BusClient) -> None:
         try:
             chunk = client.sock.recv(_CHUNK)
             messages = client.text.feed(chunk)
@@ -219,7 +195,7 @@ class SocketcandServer:
             for each in self._clients.values():
                 self._watch(each)
 
-    def _hear(self, client: _Client, message: str) -> None:
+    def _hear(self, client: BusClient, message: str) -> None:
         """Act on one message."""
         word, _, rest = message.partition(" ")
         if word in _SEND and client.bus_open:
@@ -252,14 +228,14 @@ class SocketcandServer:
         else:
             self._give(client, b"< error unknown command >")
 
-    def _give(self, client: _Client, text: bytes) -> None:
+    def _give(self, client: BusClient, text: bytes) -> None:
         client.out += text
         if len(client.out) > MOST_BYTES:
             self._drop(client, "does not take its frames and was let go")
         else:
             self._write(client)
 
-    def _write(self, client: _Client) -> None:
+    def _write(self, client: BusClient) -> None:
         """Send what the connection takes."""
         if client.out and time.monotonic() >= client.held_until:
             try:
@@ -272,7 +248,7 @@ class SocketcandServer:
                 return
         self._watch(client)
 
-    def _watch(self, client: _Client) -> None:
+    def _watch(self, client: BusClient) -> None:
         """Wait for what can go on: reading unless too much was read, writing what is left."""
         events = 0
         if len(self._sent) < MOST_SENT:
@@ -289,12 +265,12 @@ class SocketcandServer:
             self._selector.modify(client.sock, events, client)
         client.watched = events
 
-    def _drop(self, client: _Client, why: str) -> None:
+    def _drop(self, client: BusClient, why: str) -> None:
         self.dropped += 1
         self._say("warn", f"{client.peer} {why}")
         self._forget(client)
 
-    def _forget(self, client: _Client) -> None:
+    def _forget(self, client: BusClient) -> None:
         if client.watched:
             self._selector.unregister(client.sock)
         client.sock.close()
