@@ -1,0 +1,189 @@
+"""Target following against the random walk, on seeds that no parameter was tuned on.
+
+Both controllers cross the same yard: ten cylinders at places drawn with the seed, a target 3.6 m
+away. A run ends when the middle of the head is within the target's radius (the controllers are not
+told), or at the limit; then time and energy of the walk are at least what was seen, and so are the
+ratios. Ratios are paired by seed: random walk over target following. Their medians' intervals are
+those of the sign test, which needs no assumption on how they are spread.
+
+Seeds 1 to 16 served for tuning. Each run is a process of its own; results are kept in the output
+file as they come, and runs that it holds already are not repeated.
+
+Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--limit 60] [-o FILE.json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom
+
+from sim import load_scenario
+from sim.physics.engine import Kernels
+from sim.physics.ledger import TERMS
+from sim.scenario import CONTROL_RATE_HZ
+from sim.twin import Twin
+
+FOLLOW, WALK = "target-following", "random-walk"
+UNTUNED = range(101, 131)
+
+
+def run(name: str, seed: int, limit_s: float, kernels: str = "numpy") -> dict[str, Any]:
+    """Run one scenario until the target is met, or to the limit."""
+    scenario = load_scenario(name).changed(duration_s=limit_s, seed=seed)
+    target = scenario.world.target
+    assert target is not None
+    path_m, touched, link_s, before = 0.0, 0, 0.0, np.zeros(2)
+    met = False
+    with Twin(scenario, kernels=Kernels(kernels)) as twin:
+        for sample in twin.samples():
+            place = sample.step.body.position[:2, 0]
+            path_m += math.dist(place, before)
+            before = place.copy()
+            touched += sample.contact_s.sum() > link_s
+            link_s = float(sample.contact_s.sum())
+            met = math.dist(place, target.position) <= target.radius
+            if met:
+                break
+    energy = dict(zip(TERMS, sample.energy.tolist(), strict=True))
+    return {
+        "controller": name,
+        "seed": seed,
+        "limit_s": limit_s,
+        "kernels": kernels,
+        "session_id": scenario.session_id,
+        "met": met,
+        "time_s": sample.time_s,
+        "path_m": path_m,
+        "electrical_j": energy["electrical_plus"],
+        "electrical_net_j": energy["electrical_net"],
+        "contact_s": touched / CONTROL_RATE_HZ,
+        "contact_link_s": link_s,
+    }
+
+
+def median_interval(values: list[float], level: float = 0.95) -> tuple[float, float, float]:
+    """A median with the interval of the sign test, from order statistics.
+
+    Returns:
+        Median, and the ends of an interval that covers the true one at least so often; the whole
+        range where there are too few values for that.
+    """
+    ordered = sorted(values)
+    n = len(ordered)
+    k = int(binom.ppf((1 - level) / 2, n, 0.5))  # P(X < k) <= (1 - level) / 2
+    k = max(k, 1)
+    return float(np.median(ordered)), ordered[k - 1], ordered[n - k]
+
+
+def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the runs say, seed by seed."""
+    by = {
+        name: {r["seed"]: r for r in results if r["controller"] == name} for name in (FOLLOW, WALK)
+    }
+    seeds = sorted(by[FOLLOW].keys() & by[WALK].keys())
+    both = [(by[FOLLOW][seed], by[WALK][seed]) for seed in seeds]
+    told: dict[str, Any] = {"seeds": seeds}
+    for name in (FOLLOW, WALK):
+        runs = [by[name][seed] for seed in seeds]
+        told[name] = {"met": sum(one["met"] for one in runs)} | {
+            key: median_interval([one[key] for one in runs])
+            for key in ("time_s", "electrical_j", "contact_s", "path_m")
+        }
+    for key in ("time_s", "electrical_j"):
+        told[f"{key}_ratio"] = median_interval([walk[key] / follow[key] for follow, walk in both])
+    told["contact_share"] = {
+        name: float(
+            sum(by[name][seed]["contact_s"] for seed in seeds)
+            / sum(by[name][seed]["time_s"] for seed in seeds)
+        )
+        for name in (FOLLOW, WALK)
+    }
+    return told
+
+
+def text(told: dict[str, Any], limit_s: float) -> str:
+    """The answer first, then the table."""
+    n = len(told["seeds"])
+    faster, less = told["time_s_ratio"], told["electrical_j_ratio"]
+    censored = n - told[WALK]["met"]
+    lines = [
+        (
+            f"target following met the target in {told[FOLLOW]['met']} of {n} runs, "
+            f"{faster[0]:.1f} times as fast as the random walk (95 % interval {faster[1]:.1f} to "
+            f"{faster[2]:.1f}), for 1/{less[0]:.1f} of its electrical energy (1/{less[1]:.1f} to "
+            f"1/{less[2]:.1f}): medians of paired ratios"
+        ),
+        (
+            f"{'':18} {'met':>7} {'time s':>22} {'electrical J':>22} {'contact s':>22} "
+            f"{'share in contact':>17}"
+        ),
+    ]
+    for name in (FOLLOW, WALK):
+        row = told[name]
+        cells = [
+            f"{row[key][0]:8.1f} ({row[key][1]:.1f} to {row[key][2]:.1f})".rjust(22)
+            for key in ("time_s", "electrical_j", "contact_s")
+        ]
+        share = f"{100 * told['contact_share'][name]:.1f} %"
+        lines.append(f"{name:18} {row['met']:3}/{n:3} {' '.join(cells)} {share:>17}")
+    lines.append(
+        f"medians with 95 % intervals of the sign test, over {n} seeds; {censored} random walks "
+        f"ended at the limit of {limit_s:g} s and count with what they had used by then, so the "
+        "ratios are lower bounds there"
+    )
+    return "\n".join(lines)
+
+
+def study(
+    seeds: list[int], limit_s: float, jobs: int, kernels: str, output: Path | None
+) -> list[dict[str, Any]]:
+    """Run what the output file does not hold yet, keeping it up to date."""
+    results: list[dict[str, Any]] = []
+    if output is not None and output.exists():
+        results = json.loads(output.read_text())["runs"]
+    wanted = [(name, seed) for name in (FOLLOW, WALK) for seed in seeds]
+    ids = {
+        (name, seed): load_scenario(name).changed(duration_s=limit_s, seed=seed).session_id
+        for name, seed in wanted
+    }
+    results = [r for r in results if ids.get((r["controller"], r["seed"])) == r["session_id"]]
+    held = {(r["controller"], r["seed"]) for r in results}
+    left = [one for one in wanted if one not in held]
+    with ProcessPoolExecutor(jobs, max_tasks_per_child=1) as pool:
+        runs = [pool.submit(run, name, seed, limit_s, kernels) for name, seed in left]
+        for done in as_completed(runs):
+            results.append(done.result())
+            if output is not None:
+                output.parent.mkdir(parents=True, exist_ok=True)
+                output.write_text(json.dumps({"runs": results}, indent=1) + "\n")
+    return results
+
+
+def main() -> None:
+    """Run, print, keep."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--limit", type=float, default=60.0, help="longest run [s]")
+    parser.add_argument("--kernels", choices=list(Kernels), default=Kernels.NUMPY)
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/target_following.json"))
+    options = parser.parse_args()
+    first, _, last = options.seeds.partition("-")
+    seeds = list(range(int(first), int(last or first) + 1))
+    results = study(seeds, options.limit, options.jobs, options.kernels, options.output)
+    told = summary(results)
+    kept = {"summary": told, "runs": sorted(results, key=lambda r: (r["controller"], r["seed"]))}
+    options.output.write_text(json.dumps(kept, indent=1) + "\n")
+    print(text(told, options.limit))
+    print(f"{options.output} has every run")
+
+
+if __name__ == "__main__":
+    main()
