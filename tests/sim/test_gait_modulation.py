@@ -72,7 +72,7 @@ some_limits = st.lists(
     changes=st.lists(modulations, min_size=1, max_size=8),
     seed=st.integers(0, 9),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_no_modulation_passes_a_limit(kind, limits, changes, seed):
     robot = snake(limits)
     gait = generator(GAITS[kind], robot, per_joint=True)
