@@ -16,7 +16,6 @@ from ..errors import DataError
 from .bus_tally import BusTally
 from .cdr import Layout, layout_of
 from .chunk import Buffer
-from .columns import fits_layout
 from .frame_messages import records_at
 from .frames import (
     FD_FRAME_DTYPE,
@@ -27,6 +26,7 @@ from .frames import (
     FRAME_TOPIC_PREFIXES,
 )
 from .freeze import RangeTally
+from .groups import fits_layout
 from .health import LIMIT_RAD
 from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType

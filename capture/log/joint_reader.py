@@ -9,13 +9,15 @@ import numpy as np
 
 from ..arrays import IntArray
 from ..errors import DataError, MissingChannelError
+from .batches import Window
 from .columns import Messages
 from .joint_rows import JointRows, merge_rows, rows_of
 from .own_times import Series, own_times
 from .rosmsg import MessageType
+from .sampling_window import NEAR_NS, SLACK_NS, covers, cut, widened
 from .signals import JointSignals
 from .stamp_clock import StampClock
-from .topics import Topics, Window
+from .topics import Topics
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
@@ -34,12 +36,6 @@ OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
     "/joint_commands": "/joint_command_offset"
 }
 """Topic to the topic with its joints' times relative to the stamp: a bus goes joint by joint."""
-
-_SLACK_NS = 5 * _NS
-"""How far a sampling time may lie from its log time before a window could miss it."""
-
-_NEAR_NS = _NS // 4
-"""The same for logs of our own, as long as the window turns out to be covered."""
 
 
 class JointReader:
@@ -82,9 +78,9 @@ class JointReader:
         requests = self.requests(wanted)
         found: dict[str, Messages] | None = None
         if self._topics.is_ours and window_ns != (None, None):
-            found = self._topics.read(requests, _widened(window_ns, _NEAR_NS))
-        if found is None or not _covers(found, window_ns):
-            found = self._topics.read(requests, _widened(window_ns, _SLACK_NS))
+            found = self._topics.read(requests, widened(window_ns, NEAR_NS))
+        if found is None or not covers(found, window_ns):
+            found = self._topics.read(requests, widened(window_ns, SLACK_NS))
         return self.signals(wanted, found, window_ns, chain)
 
     def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
@@ -146,7 +142,7 @@ class JointReader:
                     if name not in offsets.names:
                         self._warn(f"{offset_topic} has no {name}: its message stamps are used")
         shared = {id(t_ns): t_ns for key in keys for t_ns in times[key]}
-        cuts = {each: _cut(t_ns, window_ns) for each, t_ns in shared.items()}
+        cuts = {each: cut(t_ns, window_ns) for each, t_ns in shared.items()}
         return {key: self._signals(key, series[key], times[key], cuts, chain) for key in keys}
 
     def _offset_topic(self, topic: str) -> str | None:
@@ -276,32 +272,3 @@ def _is_joint_state(found: MessageType) -> bool:
 
 def _copied(series: Series) -> Series:
     return Series(series.names, series.t_ns, [values.copy() for values in series.values])
-
-
-def _widened(window_ns: Window, slack_ns: int) -> Window:
-    """A window of log times for one of sampling times."""
-    start, stop = window_ns
-    return None if start is None else start - slack_ns, None if stop is None else stop + slack_ns
-
-
-def _covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
-    """Whether what was read goes beyond a window at both ends, in order, so nothing is missing."""
-    start, stop = window_ns
-    for messages in found.values():
-        if len(messages.groups) != 1 or messages.unread:
-            return False
-        stamps = messages.groups[0].stamps()
-        if not (start is None or stamps[0] < start) or not (stop is None or stamps[-1] >= stop):
-            return False
-        if (stamps[1:] < stamps[:-1]).any():
-            return False
-    return True
-
-
-def _cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
-    """Which samples are in the half-open window [start, stop), and their times; a view."""
-    start, stop = window_ns
-    first = 0 if start is None else int(t_ns.searchsorted(start))
-    last = len(t_ns) if stop is None else int(t_ns.searchsorted(stop))
-    inside = slice(first, last)
-    return inside, t_ns[inside]

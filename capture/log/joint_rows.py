@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
-from .columns import Group
+from .groups import Group
 
 _EARLY_OR_LATE = 0.1
 """A joint that is missing for more than this part of the topic's span is worth a warning."""

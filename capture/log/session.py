@@ -19,7 +19,7 @@ from ..arrays import IntArray
 from ..errors import DataError, RobotFileError
 from ..robot import Robot
 from ..robot.description import robot_in_session
-from .columns import Group, Messages
+from .columns import Messages
 from .frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -28,6 +28,7 @@ from .frames import (
     FrameArray,
     join_batches,
 )
+from .groups import Group
 from .joint_reader import JointReader
 from .read_ahead import threads_or_default
 from .signals import JointSignals

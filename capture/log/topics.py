@@ -12,12 +12,12 @@ from mcap.exceptions import McapError
 from mcap.records import Schema
 
 from ..errors import DataError, MissingChannelError
+from .batches import Window
 from .cdr import Layout
 from .columns import Messages, Request, message_blocks, message_bytes, read_messages
 from .rosmsg import MessageType, parse_message_type
 from .storage import LogFile
 
-Window = tuple[int | None, int | None]
 _ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
 
 
