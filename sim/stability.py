@@ -1,7 +1,8 @@
 """Is the physics step short enough for the stiff parts of a scenario?
 
 The straight robot, at rest on level ground, is a linear system M z'' + C z' + K z = 0 of springs
-and dampers: gears, motors, ground. Its motions in the horizontal plane (sideways, yaw, roll) and in
+and dampers: gears, motors, ground, and an obstacle, where there are any, at that link's end which
+gives way most easily. Its motions in the horizontal plane (sideways, yaw, roll) and in
 the vertical one (along, up, pitch) are independent. Stepped by the semi-implicit Euler rule, a
 motion loses its stability when it turns its sign at every step, z -> -z; put into the rule, that is
 
@@ -65,23 +66,25 @@ def stability(scenario: Scenario, *, friction: bool = True) -> dict[Plane, Use]:
 
 
 def warnings(scenario: Scenario) -> tuple[str, ...]:
-    """What is too stiff for the step.
+    """What is too stiff for the step, or too soft for the robot.
 
     Args:
         scenario: The scenario.
 
     Returns:
-        One sentence for each plane whose motion is unstable.
+        One sentence for each plane whose motion is unstable, and one where the ground is too soft.
     """
-    return tuple(
+    stiff = tuple(
         f"{_verdict(use, scenario)}: expect vibration or failure"
         for use in stability(scenario).values()
         if use.share > 1.0
     )
+    sunk = _sunk(scenario)
+    return stiff if sunk is None else (*stiff, sunk)
 
 
 def likely_cause(scenario: Scenario) -> str:
-    """Name the stiffest part.
+    """Name the stiffest part, or the link that the ground does not carry.
 
     Args:
         scenario: The scenario that failed.
@@ -90,6 +93,8 @@ def likely_cause(scenario: Scenario) -> str:
         A clause for an error message.
     """
     use = max(stability(scenario, friction=False).values(), key=lambda use: use.share)
+    if use.share <= 1.0 and (sunk := _sunk(scenario)) is not None:
+        return f"likely cause: {sunk}"
     if use.share <= 1.0:
         return "no parameter is too stiff for the step: look at the gait and the start"
     return f"likely cause: {_verdict(use, scenario)}; soften it or raise physics_rate_hz"
@@ -103,16 +108,38 @@ def _verdict(use: Use, scenario: Scenario) -> str:
     )
 
 
+def _sunk(scenario: Scenario) -> str | None:
+    """What to say where a link's weight presses it into the ground by more than its radius."""
+    ground = scenario.world.ground
+    if ground is None:
+        return None
+    pull = max(-scenario.world.gravity[2], 0.0) / ground.stiffness
+    depth, link = max(
+        ((link.mass * pull / link.radius, link) for link in scenario.robot.links),
+        key=lambda pair: pair[0],
+    )
+    if depth <= 1.0:
+        return None
+    return (
+        f"{link.name} is too heavy for world.ground.stiffness: with {link.mass:g} kg it rests "
+        f"{link.mass * pull:.2g} m deep"
+    )
+
+
 def _use(scenario: Scenario, plane: Plane, *, friction: bool) -> Use:
     robot = scenario.robot
     servos = Servos([joint.servo for joint in robot.joints if joint.plane is plane])
     shift, turn = _chain(robot, plane)
+    mass = _mass(robot, plane, servos, shift, turn)
     parts = {
         part.name: part.rows.T @ (part.strength[:, np.newaxis] * part.rows) / 4
-        for part in (*_servo_parts(scenario, servos), *_ground_parts(scenario, plane, shift, turn))
+        for part in (
+            *_servo_parts(scenario, servos),
+            *_ground_parts(scenario, plane, shift, turn),
+            *_obstacle_parts(scenario, plane, shift, turn, mass),
+        )
         if friction or part.name not in _BOUNDED
     }
-    mass = _mass(robot, plane, servos, shift, turn)
     total = np.sum([*parts.values(), 0.0 * mass], axis=0)
     root = np.linalg.inv(np.linalg.cholesky(mass))
     shares, motions = np.linalg.eigh(root @ total @ root.T)
@@ -203,3 +230,22 @@ def _ground_parts(
     else:
         load = np.array([link.mass for link in robot.links]) * max(-scenario.world.gravity[2], 0.0)
         yield _Part("world.ground.slip_speed", 2 * dt * mu * load / ground.slip_speed, slip)
+
+
+def _obstacle_parts(
+    scenario: Scenario, plane: Plane, shift: FloatArray, turn: FloatArray, mass: FloatArray
+) -> Iterator[_Part]:
+    """An obstacle at the end of a link, the one with the least mass behind it.
+
+    Obstacles push sideways only. How much of their friction's smoothing is used depends on the
+    press, which is not known beforehand.
+    """
+    if plane is Plane.VERTICAL or not scenario.world.obstacles:
+        return
+    dt, material = 1.0 / scenario.physics_rate_hz, scenario.world.obstacle_contact
+    half = np.array([[link.length / 2] for link in scenario.robot.links])
+    ends = np.concatenate([shift + half * turn, shift - half * turn])
+    give = (ends * np.linalg.solve(mass, ends.T).T).sum(axis=1)  # 1 / mass behind each
+    weakest, one = ends[[np.argmax(give)]], np.ones(1)
+    yield _Part("world.obstacle_contact.stiffness", dt**2 * material.stiffness * one, weakest)
+    yield _Part("world.obstacle_contact.damping", 2 * dt * material.damping * one, weakest)

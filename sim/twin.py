@@ -31,6 +31,9 @@ from .stability import likely_cause
 MAX_SPEED = 10.0
 """No link of an undulating robot is faster than this [m/s]: beyond it the simulation has failed."""
 
+MAX_ROTOR_SPEED = 1000.0
+"""No servo turns faster than this, referred to its joint [rad/s]."""
+
 
 class Sample(NamedTuple):
     """The twin at one control tick.
@@ -162,12 +165,23 @@ class Twin:
         Raises:
             SimulationError: If there is one.
         """
-        speed = np.abs(steps.stacked.body.velocity)
-        if not speed.max() <= MAX_SPEED:  # true for NaN
-            speed = speed.max(axis=1)
-            k, link = map(int, np.argwhere(~(speed <= MAX_SPEED))[0])
-            raise SimulationError(
-                f"the twin failed at {start_s + k * self._plant.dt:.3f} s: "
-                f"{self.scenario.robot.links[link].name} moves at {speed[k, link]:g} m/s, more "
-                f"than {MAX_SPEED:g} m/s; {likely_cause(self.scenario)}"
-            )
+        motion = np.abs(steps.stacked.body.velocity)
+        rotors = np.abs(steps.stacked.rotors.speed)
+        if motion.max() <= MAX_SPEED and rotors.max() <= MAX_ROTOR_SPEED:  # false for NaN
+            return
+        speed = motion.max(axis=1)
+        sound = rotors <= MAX_ROTOR_SPEED  # false for NaN
+        k = int(np.argmin(sound.all(axis=1) & (speed <= MAX_SPEED).all(axis=1)))
+        if not sound[k].all():  # a servo that runs away throws links, hardly the other way round
+            joint = int(np.argmax(rotors[k]))  # NaN before all numbers
+            name = self.scenario.robot.joints[joint].name
+            what = f"the servo of {name} turns at {rotors[k, joint]:g} rad/s"
+            bound = f"{MAX_ROTOR_SPEED:g} rad/s"
+        else:
+            link = int(np.argmax(speed[k]))
+            name = self.scenario.robot.links[link].name
+            what, bound = f"{name} moves at {speed[k, link]:g} m/s", f"{MAX_SPEED:g} m/s"
+        raise SimulationError(
+            f"the twin failed at {start_s + k * self._plant.dt:.3f} s: {what}, more than {bound}; "
+            f"{likely_cause(self.scenario)}"
+        )

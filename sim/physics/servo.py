@@ -77,7 +77,7 @@ class Servos:
             )
             for one in servos
         ]
-        self.table = frozen(np.array(parameters, dtype=np.float64).T.copy())
+        self.table = frozen(np.array(parameters, dtype=np.float64).reshape(-1, 10).T.copy())
         self.supply, self.resistance, self.torque_constant, self.gain = self.table[:4]
         self.inertia, self.viscous, self.coulomb = self.table[4:7]
         self.gear_stiffness, self.gear_damping, self.play = self.table[7:]

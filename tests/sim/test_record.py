@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 from capture import Session
-from capture.errors import OutputExistsError, SimulationError
+from capture.errors import OutputExistsError
 from capture.interruption import StopRequest
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 from sim import (
@@ -297,17 +299,58 @@ def test_a_stop_request_ends_between_two_samples(tmp_path, scenario):
     assert (found.sample_count, found.duration_s, found.complete) == (8, 0.07, False)
 
 
-def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, make_scenario, make_robot):
-    path = tmp_path / "a.mcap"
-    scenario = make_scenario(
-        make_robot(5), ramp_s=0.0, world=World(ground=Ground(stiffness=1e7)), duration_s=2.0
+BAD = {
+    "ground": ("[world.ground]\nstiffness = 1e7", "world.ground.stiffness is too stiff for steps"),
+    "obstacle": (
+        """[[world.obstacles]]
+shape = "cylinder"
+position = [0.0, 0.08]
+radius = 0.05
+[world.obstacle_contact]
+stiffness = 1e8""",
+        "world.obstacle_contact.stiffness is too stiff for steps",
+    ),
+    "gear": (
+        "[servo_of.joint03]\ngear_stiffness = 1e6",
+        "servo.gear_stiffness is too stiff for steps",
+    ),
+    "rotor": (
+        "[servo_of.joint03]\nrotor_inertia = 1e-8",
+        "servo.rotor_inertia is too stiff for steps",
+    ),
+    "heavy": ("[link_of.link03]\nmass_factor = 1e4", "link03 is too heavy for world.ground"),
+    "step": ("", "servo.gear_stiffness is too stiff for steps of 5 ms"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, capsys, name):
+    import undulog as front
+
+    text, cause = BAD[name]
+    (tmp_path / "bad.toml").write_text(
+        'description = "bad"\nrobot = "snake13"\nduration_s = 2.0\n'
+        + ("physics_rate_hz = 200\n" if name == "step" else "")
+        + "[gait]\nramp_s = 0.5\n[gait.horizontal]\namplitude = 0.4\nfrequency_hz = 1.0\n"
+        f"lag = 1.0\n{text}\n"
     )
-    with pytest.raises(SimulationError) as caught:
-        record(scenario, path)
+    path = tmp_path / "a.mcap"
+    assert front.run(["sim", "run", str(tmp_path / "bad.toml"), "-o", str(path)]) == 1
+    complaint = capsys.readouterr().err.strip().removeprefix("error: ")
+    found = re.match(r"the twin failed at (\d+\.\d+) s: (.*)(link|joint)\d\d ", complaint)
+    assert found
+    assert f"likely cause: {cause}" in complaint
+    if name in ("gear", "rotor"):
+        assert "the servo of joint03 turns at" in complaint
     with Session.open(path) as session:
         assert session.verdict == "bad"
-        assert [message.msg for _, message in session.messages("/rosout")][-1] == str(caught.value)
-        assert session.channels["/joint_states"].count >= 1
+        assert session.warnings == []
+        assert [message.msg for _, message in session.messages("/rosout")][-1] == complaint
+        angles = columns(session, "/joint_states")
+        times = columns(session, "/energy_ledger").shape[0]
+    # All samples from before the failure, none from after it, and all of them sound.
+    assert times == math.floor(float(found[1]) * 100 - 1e-6) + 1
+    assert np.abs(angles).max(initial=0.0) < np.pi
 
 
 def test_nothing_is_overwritten_unasked(tmp_path, scenario):

@@ -10,6 +10,7 @@ from capture.robot import Plane
 from sim import FrictionLaw, Ground, PlaneGait, Serpentine, World, load_scenario, scenario_names
 from sim.stability import likely_cause, stability, warnings
 from sim.twin import Twin
+from sim.world import Cylinder, ObstacleMaterial
 
 IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 
@@ -89,6 +90,33 @@ def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name, links):
     assert restless(calm) < 1e-3
     assert not restless(wild) < 3e-3  # not much where the links leave the ground
     assert any(text.startswith(f"world.ground.{name} is too stiff") for text in warnings(wild))
+
+
+def test_an_obstacle_uses_the_range_as_the_end_of_the_chain_gives_way(nudged):
+    # Two links with a loose gear: 1 / mass at the end, from free links and the joint between them.
+    material = ObstacleMaterial(stiffness=3e4, damping=5.0)
+    world = dataclasses.replace(
+        IN_SPACE, obstacles=(Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
+    )
+    found = stability(nudged(2, world=world, gear_stiffness=1e-9, gear_damping=1e-9))
+    free = np.diag(1 / np.array([0.1, 5e-5, 0.1, 5e-5]))  # shift and turn, shift and turn
+    joint = np.array([1.0, -0.03, -1.0, -0.03])
+    end = np.array([1.0, 0.03, 0.0, 0.0])
+    held = free @ joint
+    give = end @ free @ end - (end @ held) ** 2 / (joint @ held)
+    expected = (2e-3 * 5.0 + 1e-6 * 3e4) * give / 4
+    assert found[Plane.HORIZONTAL].share == pytest.approx(expected, rel=1e-6)
+    assert found[Plane.HORIZONTAL].stiffest == "world.obstacle_contact.stiffness"
+
+
+def test_a_ground_that_does_not_carry_a_link_is_named(make_scenario, make_robot):
+    robot = make_robot(4)
+    heavy = dataclasses.replace(robot.links[2], mass=0.025 * 2000.0 / 9.81 + 0.01)
+    links = (*robot.links[:2], heavy, robot.links[3])
+    scenario = make_scenario(dataclasses.replace(robot, links=links), physics_rate_hz=4000)
+    said = "link03 is too heavy for world.ground.stiffness: with 5.10684 kg it rests 0.025 m deep"
+    assert warnings(scenario)[-1] == said
+    assert likely_cause(scenario) == f"likely cause: {said}"
 
 
 @pytest.mark.parametrize(
