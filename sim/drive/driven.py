@@ -20,6 +20,9 @@ from .command_session import CommandReplay, RecordedCommands
 from .plan import PlanGait
 from .plan_file import is_plan, parse_plan
 
+_EXPLAINS = ("plan.toml", "gait.toml")
+"""Attachments of recorded commands that say what they were made from: they go on to the run."""
+
 
 @dataclass(frozen=True)
 class Driven:
@@ -145,7 +148,7 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
-        text = session.attachments.get("scenario.toml")
+        stored = session.attachments
         robot = session.robot if world is None else world.robot
         facts["driven.session_id"] = session.session_id
     if robot is None:
@@ -157,6 +160,7 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
 
     def recorded_world() -> Scenario | None:
         """The scenario that a session of the twin ran."""
+        text = stored.get("scenario.toml")
         return None if text is None else parse_scenario(text.decode(), f"{path}:scenario.toml")
 
     return Driven(
@@ -168,5 +172,5 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
         planes=(),
         make=lambda robot, _: CommandReplay(recorded, robot),
         facts=facts,
-        attachments={},
+        attachments={name: stored[name] for name in _EXPLAINS if name in stored},
     )

@@ -113,6 +113,11 @@ def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, capsys):
         assert omega[[0, 29, 50, 70]] == pytest.approx([np.pi, np.pi, 2 * np.pi, 2 * np.pi])
         modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
         assert modes == [(0, "walk"), (300_000_000, "turn")]
+    again = tmp_path / "again.mcap"
+    assert front.run(["drive", str(path), "--on", "twin", "-o", str(again)]) == 0
+    assert column_bytes(again) == column_bytes(path)
+    with Session.open(again) as session:
+        assert session.attachments["plan.toml"].decode() == PLAN  # what the commands were made from
 
 
 def test_a_gait_can_be_driven_in_another_world(tmp_path, capsys):
@@ -141,6 +146,7 @@ def test_a_gait_can_be_driven_in_another_world(tmp_path, capsys):
     [
         (("flt", "--on", "twin", "-o", "a.mcap"), "did you mean flat?"),
         (("flat", "--on", "twin"), "name the session with -o"),
+        (("vertical", "--on", "twin:snake13-planar-pi2", "-o", "a.mcap"), "vertical joints and"),
         (("flat", "--on", "twin", "-o", "a.csv"), "name it a.mcap"),
         (("flat", "--on", "twins", "-o", "a.mcap"), "expected twin"),
         (("flat", "--on", "twin", "-o", "a.mcap", "--duration", "0"), "a duration of 0 s"),
