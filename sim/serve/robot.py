@@ -246,8 +246,8 @@ class VirtualRobot:
         if self._pacer.tally.overruns > overruns and not self._lockstep:
             self._say("warn", "the twin is more than a control period behind real time")
         if stood_still_s:
-            text = f"simulated time stood still for {stood_still_s:.2f} s: samples have a gap there"
-            self._say("warn", text)
+            why = "commands came late" if self._lockstep else "the twin can't keep up"
+            self._say("warn", f"{why}: simulated time stood still, and samples have a gap there")
 
     def _report(self, samples: Sequence[SensorSample], tick: int) -> None:
         """Send what the sensors have told by a tick."""
