@@ -28,7 +28,8 @@ class GaitTick(NamedTuple):
         command: Joint angles to be reached [rad], shape (m,).
         values: What the gait meant, in the order of :attr:`Gait.names`, shape (k,).
         mode: One word for what the gait is about.
-        clamped: Names of values that were cut to the joint limits.
+        clamped: Names of values that were cut to the joint limits: ``horizontal.A`` where it
+            concerns all joints of the plane, ``joint03.A`` where it concerns some.
     """
 
     command: FloatArray
@@ -93,5 +94,8 @@ class Generator(Gait, Protocol):
 
         Args:
             modulation: What to change, until the next call.
+
+        Raises:
+            UsageError: If it is of another number of joints or has a value that is not finite.
         """
         ...
