@@ -1,34 +1,46 @@
 """Cost of a physics step: the twin, against PyBullet's own contacts and motors on the same body.
 
-Both step the shipped 25-joint snake at 1 kHz through the same commands, in turn, in one process.
-The twin computes ground, servos and the energy ledger itself; PyBullet's way has capsules on a
-plane with its anisotropic friction, and POSITION_CONTROL motors. Processor time, median of runs.
+All step the shipped 25-joint snake at 1 kHz through the same commands, in turn, in one process. The
+twin computes ground, servos, all sensors and the energy ledger itself, with NumPy or compiled with
+numba, on PyBullet's dynamics or MuJoCo's; PyBullet's own way has capsules on a plane with its
+anisotropic friction, POSITION_CONTROL motors, and the links read at every step. Then the same
+without sensors for chains of 12 to 100 joints. Processor time, the least of several runs: other
+programs on the machine can only add to it.
 
-Run: python bench/twin_step.py [--seconds 2] [--runs 5]
+Run: python bench/twin_step.py [--seconds 1] [--runs 5]
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
-import statistics
+import os
 import time
+from collections.abc import Callable
 
 import pybullet
 
 from capture.robot import Plane, Robot
 from sim.gait import SerpentineGait
+from sim.physics.engine import EngineKind, Kernels
 from sim.readings import Readings
 from sim.scenario import CONTROL_RATE_HZ, Scenario
 from sim.scenario_file import load_scenario
 from sim.twin import Twin
 
+LENGTHS = (12, 25, 50, 100)
+BUILT_IN = "PyBullet contacts + motors"
+NUMPY, NUMBA = "twin, NumPy", "twin, numba"
 
-def step_twin(scenario: Scenario) -> float:
+
+def step_twin(scenario: Scenario, kernels: Kernels) -> float:
     """Seconds of processor time a step, through the twin."""
-    with Twin(scenario) as twin:
+    with Twin(scenario, kernels=kernels) as twin:
+        samples = twin.samples()
+        next(samples)  # the start: what is compiled is there from here on
         start = time.process_time()
-        for _ in twin.samples():
+        for _ in samples:
             pass
         used = time.process_time() - start
     return used / (scenario.duration_s * scenario.physics_rate_hz)
@@ -112,26 +124,77 @@ def built_in_body(robot: Robot, client: int) -> int:
     return body
 
 
+def chain(robot: Robot, joints: int) -> Robot:
+    """A robot of another length, of the same modules, without sensors."""
+    last, (one, other) = robot.links[-1], robot.joints[:2]
+    return dataclasses.replace(
+        robot,
+        name=f"chain{joints}",
+        links=tuple(dataclasses.replace(last, name=f"link{k}") for k in range(joints + 1)),
+        joints=tuple(
+            dataclasses.replace(other if k % 2 else one, name=f"joint{k}") for k in range(joints)
+        ),
+        sensors=(),
+        bus=None,
+        databases=(),
+    )
+
+
+def least(ways: dict[str, Callable[[], float]], runs: int) -> dict[str, float]:
+    """Microseconds a step of each way, the least of some runs in turn."""
+    found = dict.fromkeys(ways, math.inf)
+    for _ in range(runs):
+        for name, step in ways.items():
+            found[name] = min(found[name], 1e6 * step())
+    return found
+
+
 def main() -> None:
-    """Step both in turn, print."""
+    """Step all in turn, print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--runs", type=int, default=5)
     options = parser.parse_args()
-    scenario = load_scenario("flat").changed(duration_s=options.seconds)
-    ours: list[float] = []
-    theirs: list[float] = []
-    for _ in range(options.runs):
-        ours.append(step_twin(scenario))
-        theirs.append(step_builtin(scenario))
-    ratio = statistics.median(theirs) / statistics.median(ours)
-    print(f"{ratio:.1f} times as cheap a step as PyBullet's own contacts and motors")
-    for name, seconds in (("undulog twin", ours), ("PyBullet contacts + motors", theirs)):
-        each = 1e6 * statistics.median(seconds)
-        print(
-            f"{name:<27} {each:7.0f} us a step (min {1e6 * min(seconds):.0f}, "
-            f"max {1e6 * max(seconds):.0f})  real-time factor {1e3 / each:.1f} at 1 kHz"
+    flat = load_scenario("flat").changed(duration_s=options.seconds)
+    mujoco = dataclasses.replace(flat, engine=EngineKind.MUJOCO)
+    step_twin(flat.changed(duration_s=0.05), Kernels.NUMBA)  # compiles, the first time
+    each = least(
+        {
+            NUMPY: lambda: step_twin(flat, Kernels.NUMPY),
+            NUMBA: lambda: step_twin(flat, Kernels.NUMBA),
+            "twin, NumPy, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMPY),
+            "twin, numba, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMBA),
+            BUILT_IN: lambda: step_builtin(flat),
+        },
+        options.runs,
+    )
+    theirs = each[BUILT_IN]
+    print(
+        f"25 joints at 1 kHz: {1e3 / each[NUMPY]:.1f} x real time with NumPy and "
+        f"{1e3 / each[NUMBA]:.1f} x with numba; a step {theirs / each[NUMPY]:.1f} and "
+        f"{theirs / each[NUMBA]:.1f} times as cheap as PyBullet's own contacts and motors"
+    )
+    for name, step_us in each.items():
+        print(f"{name:<27} {step_us:7.0f} us a step  {1e3 / step_us:5.1f} x real time")
+    print(f"\n{'joints, without sensors':<27}" + "".join(f"{n:>9}" for n in LENGTHS))
+    rows: dict[str, list[float]] = {NUMPY: [], NUMBA: [], BUILT_IN: []}
+    for n in LENGTHS:
+        scenario = dataclasses.replace(
+            flat.changed(duration_s=options.seconds / 4), robot=chain(flat.robot, n)
         )
+        found = least(
+            {
+                NUMPY: lambda one=scenario: step_twin(one, Kernels.NUMPY),
+                NUMBA: lambda one=scenario: step_twin(one, Kernels.NUMBA),
+                BUILT_IN: lambda one=scenario: step_builtin(one),
+            },
+            options.runs,
+        )
+        for name, step_us in found.items():
+            rows[name].append(step_us)
+    for name, costs in rows.items():
+        print(f"{name + ', us a step':<27}" + "".join(f"{cost:9.0f}" for cost in costs))
+    print(f"\nload average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
 if __name__ == "__main__":
