@@ -9,7 +9,7 @@ those of the sign test, which needs no assumption on how they are spread.
 Seeds 1 to 16 served for tuning. Each run is a process of its own; results are kept in the output
 file as they come, and runs that it holds already are not repeated.
 
-Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--limit 60] [-o FILE.json]
+Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--limit 45] [-o FILE.json]
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def study(
     results: list[dict[str, Any]] = []
     if output is not None and output.exists():
         results = json.loads(output.read_text())["runs"]
-    wanted = [(name, seed) for name in (FOLLOW, WALK) for seed in seeds]
+    wanted = [(name, seed) for seed in seeds for name in (FOLLOW, WALK)]
     ids = {
         (name, seed): load_scenario(name).changed(duration_s=limit_s, seed=seed).session_id
         for name, seed in wanted
@@ -171,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--limit", type=float, default=60.0, help="longest run [s]")
+    parser.add_argument("--limit", type=float, default=45.0, help="longest run [s]")
     parser.add_argument("--kernels", choices=list(Kernels), default=Kernels.NUMPY)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/target_following.json"))
     options = parser.parse_args()
