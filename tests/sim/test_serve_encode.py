@@ -10,7 +10,7 @@ from capture import load_robot
 from capture.bus.decoding import BusDecoder
 from capture.bus.encoding import BusEncoder
 from capture.errors import DataError
-from capture.log.frames import DIR_RX, DIR_TX, EXTENDED_FLAG
+from capture.log.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, empty_frames
 from capture.robot import Direction, Quantity
 from capture.robot.description import parse_robot
 from sim.sensing.contract import JointSample, RangeSample, VectorSample
@@ -168,6 +168,19 @@ def test_servos_hold_their_last_command_within_their_limits(robot):
     assert latch.take(commands(robot, {"joint02": -0.2}), heard=False)[1]
     assert latch.angle[1] == pytest.approx(0.2, abs=1e-4)
     assert latch.frames == 6
+
+
+def test_commands_are_read_as_cantools_writes_them(robot, database):
+    angles = np.random.default_rng(2).uniform(-0.5, 0.5, 25)
+    frames = empty_frames(25)
+    for frame, name, angle in zip(frames, robot.joint_names, angles, strict=True):
+        message = database.get_message_by_name(f"{name}_command")
+        data = message.encode({"position": math.degrees(angle)})
+        frame["id_flags"], frame["dlc"], frame["dir"] = message.frame_id, len(data), DIR_TX
+        frame["data"][: len(data)] = list(data)
+    latch = CommandLatch(robot)
+    latch.take(frames[np.random.default_rng(3).permutation(25)])
+    assert np.abs(latch.angle - angles).max() <= math.radians(0.005) * (1 + 1e-9)
 
 
 def test_replies_and_foreign_frames_are_no_commands(robot):
