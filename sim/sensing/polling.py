@@ -66,6 +66,7 @@ class JointPolling:
             seed: Of the noise.
         """
         self._offset_s = frozen(servos.slot_s * np.arange(joint_count, dtype=np.float64))
+        self._at_once = servos.slot_s == 0.0
         self._servos = servos
         self._noise = np.array([[noise.position], [noise.velocity], [noise.effort]])
         self._random = np.random.default_rng([seed, STREAM])
@@ -121,13 +122,18 @@ class JointPolling:
         motion = np.concatenate(
             [self._kept[0].motion[:1], *(period.motion[1:] for period in self._kept)]
         )
-        position, velocity = _between(motion, at)
         drive = np.concatenate([period.drive for period in self._kept])
-        summed = np.concatenate([np.zeros((1, *drive.shape[1:])), np.cumsum(drive, axis=0)])
-        lower, upper = np.maximum(at - n / 2, 0.0), np.minimum(at + n / 2, end)
-        effort, current, voltage = (_between(summed, upper) - _between(summed, lower)) / (
-            upper - lower
-        )
+        if self._at_once:  # at a step, so nothing is to be interpolated
+            position, velocity = motion[start]
+            first, last = max(start - n // 2, 0), min(start + n // 2, end)
+            effort, current, voltage = drive[first:last].sum(axis=0) / (last - first)
+        else:
+            position, velocity = _between(motion, at)
+            summed = np.concatenate([np.zeros((1, *drive.shape[1:])), np.cumsum(drive, axis=0)])
+            lower, upper = np.maximum(at - n / 2, 0.0), np.minimum(at + n / 2, end)
+            effort, current, voltage = (_between(summed, upper) - _between(summed, lower)) / (
+                upper - lower
+            )
         reported = np.array([position, velocity, effort])
         reported += self._noise * self._random.standard_normal(reported.shape)
         return JointSample(
