@@ -2,13 +2,25 @@
 
 import dataclasses
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from capture import Session
 from capture.errors import ScenarioError
-from sim import Cylinder, Readings, Wall, load_scenario, parse_scenario
+from capture.robot import Plane
+from sim import (
+    Cylinder,
+    Readings,
+    SensorModels,
+    ServoPolling,
+    Wall,
+    load_scenario,
+    parse_scenario,
+)
 from sim.record import record
 from sim.sensing.contract import JointSample, RangeSample, VectorSample
 from sim.twin import Twin
@@ -111,6 +123,60 @@ def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_pat
                 else:
                     assert message.range == np.float32(one.distance)
         assert session.warnings == []
+
+
+def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
+    make_scenario, make_robot
+):
+    slot_s, hz = 0.7e-3, 1.0
+    robot = make_robot(14)
+    yaw = robot.joint_indices(Plane.HORIZONTAL)
+
+    def phases(servo, *, own_times=True):
+        scenario = make_scenario(
+            robot,
+            frequency_hz=hz,
+            ramp_s=0.5,
+            duration_s=4.0,
+            sensing=SensorModels(servo),
+        )
+        with Twin(scenario) as twin:
+            samples = [one for sample in twin.samples() for one in sample.sensed]
+        chosen = samples[-200:]  # two whole cycles
+        angle = np.array([one.position for one in chosen])
+        cycle = np.array([one.cycle for one in chosen])[:, None] / 100
+        turn = 2 * np.pi * hz * (cycle + own_times * np.array([one.offset_s for one in chosen]))
+        found = []
+        for t, q in zip(turn.T[yaw], angle.T[yaw], strict=True):
+            basis = np.column_stack([np.cos(t), np.sin(t), np.ones_like(t)])
+            c, d = np.linalg.lstsq(basis, q, rcond=None)[0][:2]
+            found.append(math.degrees(math.atan2(c, d)))
+        return np.array(found)
+
+    at_once, in_turn = phases(ServoPolling()), phases(ServoPolling(slot_s=slot_s))
+    # Within a control period the joints ripple, each command being held: 0.055 degrees from peak to
+    # peak of this phase, by the place in the period at which the physics steps are looked at.
+    np.testing.assert_allclose(in_turn, at_once, atol=0.055)
+    # One stamp for all would be off by omega times the skew, up to 3 degrees.
+    careless = phases(ServoPolling(slot_s=slot_s), own_times=False)
+    expected = 360.0 * hz * slot_s * yaw
+    np.testing.assert_allclose(careless - in_turn, expected, atol=0.02)
+
+
+def test_two_processes_write_the_same_bytes(tmp_path):
+    (tmp_path / "x.toml").write_text(SCENARIO)
+    for name in ("a", "b"):
+        done = subprocess.run(
+            [*(sys.executable, "-m", "undulog", "sim", "run", "x.toml", "-o", f"{name}.mcap")],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONHASHSEED": str(ord(name))},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    first, second = ((tmp_path / f"{name}.mcap").read_bytes() for name in "ab")
+    assert first == second
 
 
 def test_without_its_sensors_a_robot_has_its_servos_only(scenario):
