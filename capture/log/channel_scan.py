@@ -55,7 +55,7 @@ class Series:
         first_log_ns: First log time [Unix ns].
         last_log_ns: Last log time [Unix ns].
         numbers: Numbers looked at.
-        nan: NaN among them.
+        nan_of: NaN among them, and how many there were, by field.
         rows: Samples with values.
         joint_nan: Samples that are NaN in some field, shape (k,).
         at_limit: Angles at the joint's limits, shape (k,).
@@ -67,7 +67,7 @@ class Series:
     first_log_ns: int = 2**63 - 1
     last_log_ns: int = 0
     numbers: int = 0
-    nan: int = 0
+    nan_of: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
     rows: int = 0
     joint_nan: IntArray = field(init=False)
     at_limit: IntArray = field(init=False)
@@ -77,6 +77,24 @@ class Series:
         """Size the counters."""
         self.joint_nan = np.zeros(len(self.names), np.int64)
         self.at_limit = np.zeros(len(self.names), np.int64)
+
+    @property
+    def nan(self) -> int:
+        """NaN where a number should be.
+
+        An axis of a vector that never has a number while another one has is not measured, and says
+        so as sensor_msgs/MagneticField has it.
+        """
+        return sum(
+            count
+            for path, (count, of) in self.nan_of.items()
+            if count < of or not self._is_spare_axis(path)
+        )
+
+    def _is_spare_axis(self, path: str) -> bool:
+        vector, _, axis = path.rpartition(".")
+        every = [self.nan_of.get(f"{vector}.{other}", (0, 0)) for other in "xyz"]
+        return axis in ("x", "y", "z") and any(count < of for count, of in every)
 
 
 class ChannelScan:
@@ -339,7 +357,9 @@ def _count_nan(series: Series, layout: Layout, part: Matrix) -> None:
     for path, leaf in layout.leaves.items():
         if leaf.dtype in ("<f4", "<f8"):
             series.numbers += len(part) * leaf.count
-            series.nan += int(np.isnan(_values(layout, path, part)).sum())
+            count = int(np.isnan(_values(layout, path, part)).sum())
+            before, of = series.nan_of.get(path, (0, 0))
+            series.nan_of[path] = before + count, of + len(part) * leaf.count
 
 
 def _stamp(stamps: IntArray, rows: IntArray, matrix: Matrix) -> None:

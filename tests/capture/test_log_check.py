@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import undulog
+from capture import SessionWriter
 from capture.log.session_check import SessionHealth, check_session
 from capture.log.tallies import SequenceTally, TimingTally
 
@@ -229,6 +230,31 @@ def test_nan_is_counted_by_joint(tmp_path: Path) -> None:
     assert joint_of(health, "joint05").nan == 50
     assert sum(joint.nan for joint in health.joints) == 50
     assert health.reasons == ("/joint_states, joint05: 50 of 2000 samples are not a number",)
+
+
+@pytest.mark.parametrize(
+    ("axes", "told"),
+    [
+        ("z", 0),  # not measured, and said so as sensor_msgs/MagneticField has it
+        ("x", 0),
+        ("xyz", 3 * 200),  # then nothing is left of the sensor
+    ],
+)
+def test_an_axis_that_is_never_measured_is_no_fault(tmp_path: Path, axes: str, told: int) -> None:
+    path = tmp_path / "s.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        compass = writer.magnetic_field("/compass", frame="head")
+        imu = writer.imu("/imu", frame="head")
+        for tick in range(200):
+            vector = np.full(3, 2e-5)
+            vector[["xyz".index(axis) for axis in axes]] = np.nan
+            compass.write(EPOCH_NS + tick * STEP_NS, vector)
+            vector = np.array([0.0, np.nan if tick < 20 else 0.1, 9.8])
+            imu.write(EPOCH_NS + tick * STEP_NS, vector)
+    reasons = [reason for reason in check_session(path).reasons if "not a number" in reason]
+    assert any(reason.startswith("/imu: 20 of ") for reason in reasons)
+    of_compass = [reason for reason in reasons if reason.startswith("/compass")]
+    assert [reason.split(" of ")[0] for reason in of_compass] == [f"/compass: {told}"] * (told > 0)
 
 
 def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(tmp_path: Path) -> None:
