@@ -48,7 +48,7 @@ class Steering:
         """
         law, distance = self._law, seen.nearest
         side = self._latch.step(now.time_s, seen.left, seen.right)
-        self.avoiding = distance < law.range_m
+        self.avoiding = distance < law.range_m and law.f0 > 0.0
         wanted = course
         if self.avoiding:
             away = bend(distance, side, law.f0, law.k)
