@@ -22,7 +22,7 @@ from capture.arrays import FloatArray
 from capture.robot import Robot
 
 from .contact import into_link_axes
-from .engine import Kernels
+from .engine import BodyState, Kernels
 from .servo import Servos
 from .steps import Step, Steps
 from .vectors import cross, into_frames
@@ -171,7 +171,7 @@ class Ledger:
         self._kernels = kernels
         self._servos = servos
         self._mass = np.array([link.mass for link in robot.links])
-        self._inertia = np.array([link.inertia for link in robot.links]).T
+        self._inertia = np.array([link.inertia for link in robot.links]).T.copy()
         self._gravity = gravity
         self._stiffness = stiffness
         self._obstacle_stiffness = obstacle_stiffness
@@ -226,14 +226,12 @@ class Ledger:
             Energies [J], as :data:`STORED_TERMS`, shape (6,).
         """
         body, rotors, servos = step.body, step.rotors, self._servos
-        spin = into_frames(body.quaternion, body.spin)
         twist = servos.twist(body.angle, rotors.angle)
         depth = _pressed(step.contact.depth)
         dent = step.obstacles.depth
         return np.array(
             [
-                0.5
-                * (self._mass @ (body.velocity**2).sum(axis=0) + (self._inertia * spin**2).sum()),
+                self._kinetic(body),
                 -(self._gravity @ body.position) @ self._mass,
                 0.5 * self._stiffness * (depth @ depth),
                 0.5 * self._obstacle_stiffness * (dent @ dent),
@@ -241,6 +239,16 @@ class Ledger:
                 0.5 * servos.gear_stiffness @ twist**2,
             ]
         )
+
+    def _kinetic(self, body: BodyState) -> float:
+        """Kinetic energy of the links [J]."""
+        if self._kernels is Kernels.NUMBA:
+            from .ledger_kernels import kinetic_energy
+
+            return kinetic_energy(*body[1:4], self._mass, self._inertia)
+        spin = into_frames(body.quaternion, body.spin)
+        moving = self._mass @ (body.velocity**2).sum(axis=0)
+        return 0.5 * float(moving + (self._inertia * spin**2).sum())
 
     def read(self, step: Step) -> FloatArray:
         """All terms at one instant.

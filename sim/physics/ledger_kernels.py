@@ -73,3 +73,38 @@ def add_ground_flows(
             flows[0] -= dt * (tx * fx + ty * fy) * (tx * vx + ty * vy)
             flows[1] -= dt * (tx * fy - ty * fx) * (tx * vy - ty * vx)
             flows[2] -= dt * (fz - stiffness * max(depth, 0.0)) * vz
+
+
+@njit(cache=True)
+def kinetic_energy(
+    quaternion: FloatArray,
+    velocity: FloatArray,
+    spin: FloatArray,
+    mass: FloatArray,
+    inertia: FloatArray,
+) -> float:
+    """Kinetic energy of all links.
+
+    Args:
+        quaternion: Orientations x, y, z, w, shape (4, n).
+        velocity: Of the centres [m/s], shape (3, n).
+        spin: Angular velocities in the world [rad/s], shape (3, n).
+        mass: Of the links [kg], shape (n,).
+        inertia: Their principal moments [kg m^2], shape (3, n).
+
+    Returns:
+        Energy [J].
+    """
+    twice = 0.0
+    for i in range(len(mass)):
+        x, y, z, w = quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
+        sx, sy, sz = spin[0, i], spin[1, i], spin[2, i]
+        # Into the link's frame: s - 2 w (u x s) + 2 u x (u x s).
+        cx, cy, cz = y * sz - z * sy, z * sx - x * sz, x * sy - y * sx
+        rx = sx - 2 * w * cx + 2 * (y * cz - z * cy)
+        ry = sy - 2 * w * cy + 2 * (z * cx - x * cz)
+        rz = sz - 2 * w * cz + 2 * (x * cy - y * cx)
+        square = velocity[0, i] ** 2 + velocity[1, i] ** 2 + velocity[2, i] ** 2
+        twice += mass[i] * square
+        twice += inertia[0, i] * rx**2 + inertia[1, i] * ry**2 + inertia[2, i] * rz**2
+    return 0.5 * twice
