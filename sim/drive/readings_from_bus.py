@@ -6,6 +6,7 @@ must not act on a distance of long ago.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -21,7 +22,9 @@ OLDEST_S = 0.5
 """A value older than this counts as unknown [s]; the slowest sensors come several times in it."""
 
 _AXES = "xyz"
+_OF_JOINTS = (Quantity.POSITION, Quantity.VELOCITY)
 _VECTORS = (Quantity.ACCELERATION, Quantity.MAGNETIC_FIELD)
+_TOLD = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
 
 
 class BusReadings:
@@ -37,7 +40,7 @@ class BusReadings:
         Raises:
             DataError: If the robot has no bus, or not the databases that its map needs.
         """
-        self._decoder = BusDecoder(robot)
+        self._decoder = BusDecoder(_as_far_as_told(robot))
         self._oldest_s = oldest_s
         self._joints = {name: i for i, name in enumerate(robot.joint_names)}
         self._range_max = {
@@ -47,7 +50,7 @@ class BusReadings:
         count = len(robot.joints)
         self._joint_values: dict[Quantity, FloatArray] = {}
         self._joint_times: dict[Quantity, FloatArray] = {}
-        for quantity in (Quantity.POSITION, Quantity.VELOCITY):
+        for quantity in _OF_JOINTS:
             self._joint_values[quantity] = np.full(count, np.nan)
             self._joint_times[quantity] = np.full(count, -np.inf)
         self._ranges: dict[str, tuple[float, float]] = {}
@@ -126,3 +129,11 @@ class BusReadings:
                 vector = known[target][1].copy() if target in known else np.full(3, np.nan)
                 vector[_AXES.index(axis)] = value
                 known[target] = time_s, frozen(vector)
+
+
+def _as_far_as_told(robot: Robot) -> Robot:
+    """The robot with a bus map of what a gait is told: the rest costs time in every tick."""
+    if robot.bus is None:
+        return robot
+    signals = tuple(signal for signal in robot.bus.signals if signal.quantity in _TOLD)
+    return dataclasses.replace(robot, bus=dataclasses.replace(robot.bus, signals=signals))
