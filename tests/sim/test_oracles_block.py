@@ -10,6 +10,7 @@ from sim import FrictionLaw, Ground, World
 from sim.physics.engine import EngineKind
 from sim.physics.ledger import TERMS
 from sim.twin import Twin
+from sim.world.model import tilted_gravity
 
 G, MASS, RADIUS = 9.81, 0.1, 0.025
 STIFFNESS, SLIP_SPEED = Ground.stiffness, Ground.slip_speed
@@ -46,7 +47,7 @@ def slide(make_robot, make_scenario):
         # With a thin body friction has no lever: it slides, as a block does.
         links = tuple(dataclasses.replace(link, radius=radius) for link in robot.links)
         world = World(
-            gravity=(G * math.sin(slope), 0.0, -G * math.cos(slope)),
+            gravity=tilted_gravity(slope, 0.0),
             heading=TURN[axis],
             velocity=(speed, 0.0, lift),
             ground=Ground(law=law),
