@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
+from typing import TypeAlias
 
 from ..errors import LogError
 from .chunk import Block, Buffer
 from .pages import keep_freed, new_pages
-from .read_ahead import Start, ahead, helpers
+from .read_ahead import Piece, ahead, helpers
 from .storage import LogFile
 
 ARENA_SIZE = 8 << 20
@@ -38,8 +40,8 @@ class Placed:
     stop: int
 
 
-_Piece = Callable[[], tuple[Buffer, Placed]]
-"""Waits for a block's payload; raises LogError if it can't be read."""
+_Found: TypeAlias = tuple[Buffer, Placed] | LogError
+"""A buffer and what is in it, or why the block can't be read."""
 
 
 def filled_arenas(
@@ -56,7 +58,7 @@ def filled_arenas(
         channel_ids: Blocks whose index has none of these channels are passed over.
         blocks: Where to look.
         warn: Takes one sentence for each block that couldn't be read.
-        threads: How many decompress; with more than one they do so ahead of what is used.
+        threads: How many decompress, the caller's among them; others do so ahead of what is used.
 
     Yields:
         A buffer, which is overwritten when the next is asked for, and what is in it.
@@ -68,16 +70,18 @@ def filled_arenas(
     keep_freed(ARENA_SIZE)  # no copy of messages is larger
     scratch = log_file.scratch
     arenas = [scratch.pop() if scratch else new_pages(ARENA_SIZE) for _ in range(1 + spare)]
-    with helpers(max(min(threads, len(wanted)), 1)) as start:
-        for pieces in ahead(_begun(log_file, runs, arenas, start), spare):
-            found: list[tuple[Buffer, Placed]] = []
-            for piece in pieces:
-                try:
-                    found.append(piece())
-                except LogError as error:
-                    warn(f"{error}; its messages are missing")
-            if found:
-                yield found[0][0], [placed for _, placed in found]
+    with helpers(max(min(threads, len(wanted)), 1)) as pool:
+        for pieces in ahead(_begun(log_file, runs, arenas, pool), spare):
+            if pool is not None:
+                for piece in reversed(pieces):  # the helpers come from the other end
+                    piece.hurry()
+            found = [piece.result() for piece in pieces]
+            for each in found:
+                if isinstance(each, LogError):
+                    warn(f"{each}; its messages are missing")
+            filled = [each for each in found if not isinstance(each, LogError)]
+            if filled:
+                yield filled[0][0], [placed for _, placed in filled]
     if len(blocks) < len(log_file.blocks):  # after a window there is often another
         scratch[:] = [*arenas, *scratch][:2]
 
@@ -104,24 +108,28 @@ def _begun(
     log_file: LogFile,
     runs: Iterable[list[Placed] | Block],
     arenas: Sequence[mmap.mmap],
-    start: Start,
-) -> Iterator[list[_Piece]]:
-    """For each run what waits for its blocks; work on them begins when it is taken."""
+    pool: ThreadPoolExecutor | None,
+) -> Iterator[list[Piece[_Found]]]:
+    """The work on each run; it is offered to the helpers when it is taken from here."""
     for run, arena in zip(runs, cycle(arenas), strict=False):
         if isinstance(run, list):
-            yield [start(partial(_inflated, log_file, arena, placed)) for placed in run]
-        elif run.size <= ARENA_SIZE:
-            yield [start(partial(_alone, log_file, run))]
-        else:  # two of that size at once are too much
-            yield [partial(_alone, log_file, run)]
+            yield [Piece(partial(_inflated, log_file, arena, placed), pool) for placed in run]
+        else:  # two at once that are larger than a buffer are too much
+            yield [Piece(partial(_alone, log_file, run), pool if run.size <= ARENA_SIZE else None)]
 
 
-def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> tuple[Buffer, Placed]:
-    with memoryview(arena) as whole, whole[placed.base : placed.stop] as room:
-        log_file.inflate_into(placed.block, room)
+def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
+    try:
+        with memoryview(arena) as whole, whole[placed.base : placed.stop] as room:
+            log_file.inflate_into(placed.block, room)
+    except LogError as error:
+        return error
     return arena, placed
 
 
-def _alone(log_file: LogFile, block: Block) -> tuple[Buffer, Placed]:
-    data, base, stop = log_file.payload_once(block)
+def _alone(log_file: LogFile, block: Block) -> _Found:
+    try:
+        data, base, stop = log_file.payload_once(block)
+    except LogError as error:
+        return error
     return data, Placed(block, base, stop)

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from ..errors import UsageError
 
@@ -20,19 +20,34 @@ _MOST_BY_DEFAULT = 4
 _T = TypeVar("_T")
 
 
-class Start(Protocol):
-    """Starts work."""
+class Piece(Generic[_T]):
+    """A piece of work: who comes first does it, a helper or the one who needs the result."""
 
-    def __call__(self, work: Callable[[], _T]) -> Callable[[], _T]:
-        """Start a piece of work.
+    def __init__(self, work: Callable[[], _T], helpers: ThreadPoolExecutor | None) -> None:
+        """Offer it to the helpers.
 
         Args:
             work: The work.
+            helpers: Threads; None where there are none.
+        """
+        self._work = work
+        self._taken = None if helpers is None else helpers.submit(work)
+        self._done: list[_T] = []
+
+    def hurry(self) -> None:
+        """Do it now unless a helper has begun it."""
+        if not self._done and (self._taken is None or self._taken.cancel()):
+            self._taken = None
+            self._done.append(self._work())
+
+    def result(self) -> _T:
+        """What the work gave; waits for it.
 
         Returns:
-            What waits for it, and returns or raises what it did.
+            The result; what the work raises is raised here, or where it was done in a hurry.
         """
-        ...
+        self.hurry()
+        return self._done[0] if self._taken is None else self._taken.result()
 
 
 def threads_or_default(threads: int | None) -> int:
@@ -57,32 +72,23 @@ def threads_or_default(threads: int | None) -> int:
 
 
 @contextmanager
-def helpers(threads: int) -> Generator[Start]:
-    """Threads that do work meanwhile; at the end of the block none is left.
+def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
+    """The threads that help a caller; at the end of the block none is left.
 
     Args:
-        threads: How many; with 1 there is none but the caller's own, which does each piece of
-            work when it asks for its result.
+        threads: How many work, the caller's own among them.
 
     Yields:
-        What starts a piece of work.
+        The others; None where there are none.
     """
     if threads == 1:
-        yield _later
+        yield None
         return
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="undulog-read")
-
-    def start(work: Callable[[], _T]) -> Callable[[], _T]:
-        return pool.submit(work).result
-
+    pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="undulog-read")
     try:
-        yield start
+        yield pool
     finally:  # also when the caller stops half-way: what hasn't begun never will
         pool.shutdown(cancel_futures=True)
-
-
-def _later(work: Callable[[], _T]) -> Callable[[], _T]:
-    return work
 
 
 def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:

@@ -15,7 +15,7 @@ from capture import Session, SessionWriter
 from capture.errors import UsageError
 from capture.log import arenas
 from capture.log.durable_sink import DurableSink
-from capture.log.read_ahead import ahead, helpers
+from capture.log.read_ahead import Piece, ahead, helpers
 from capture.log.storage import LogFile
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -185,20 +185,40 @@ def test_work_is_begun_so_far_ahead_and_no_further():
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_an_error_comes_where_the_result_is_asked_for(threads):
-    with helpers(threads) as start:
-        pieces = [start(lambda n=n: 12 // n) for n in (1, 0, 3)]
-        assert pieces[0]() == 12
+    with helpers(threads) as pool:
+        pieces = [Piece(lambda n=n: 12 // n, pool) for n in (1, 0, 3)]
+        assert pieces[0].result() == 12
         with pytest.raises(ZeroDivisionError):
-            pieces[1]()
-        assert pieces[2]() == 4
+            pieces[1].result()
+        assert pieces[2].result() == 4
     assert not helpers_alive()
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_each_piece_is_done_once_whoever_does_it(threads):
+    done = []
+    with helpers(threads) as pool:
+        pieces = [Piece(lambda n=n: done.append(n) or n, pool) for n in range(200)]
+        for piece in reversed(pieces):
+            piece.hurry()
+        assert [piece.result() for piece in pieces] == list(range(200))
+        assert [piece.result() for piece in pieces] == list(range(200))
+    assert sorted(done) == list(range(200))
+
+
+def test_who_needs_a_result_does_not_wait_for_helpers_that_are_busy():
+    gate = threading.Event()
+    with helpers(2) as pool:
+        Piece(gate.wait, pool)
+        assert Piece(threading.get_ident, pool).result() == threading.get_ident()
+        gate.set()
 
 
 def test_what_has_not_begun_is_left_undone_at_the_end():
     done, gate = [], threading.Event()
-    with helpers(2) as start:
+    with helpers(3) as pool:
         for n in range(50):
-            start(lambda n=n: (gate.wait(), done.append(n)))
+            Piece(lambda n=n: (gate.wait(), done.append(n)), pool)
         threading.Timer(0.05, gate.set).start()
     assert len(done) < 50
     assert not helpers_alive()
