@@ -1,8 +1,10 @@
 """Chains of coupled oscillators, Eq. 1 of Meister, Stepanenko & Kernbach 2011, integrated.
 
 x_i' = f(x_i, a) + phi(x_{i-1}, x_{i+1}, b) with open ends: the first and the last have one
-neighbour. All states are in a frame that turns with the common phase Phi' = omega, which coupling
-does not see: only what sets an oscillator apart from Phi is integrated numerically.
+neighbour. Ijspeert, Neural Networks 21, 642 (2008), reviews both kinds of oscillator.
+
+All states are in a frame that turns with the common phase Phi' = omega, which coupling does not
+see: only what sets an oscillator apart from Phi is integrated numerically.
 """
 
 from __future__ import annotations
