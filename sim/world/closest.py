@@ -67,9 +67,33 @@ def to_rectangles(middle: FloatArray, half: FloatArray, size: FloatArray) -> Clo
     Returns:
         The closest points, normals in the rectangles' axes.
     """
-    apart, inside = _apart(middle, half, size), _overlapping(middle, half, size)
-    meet = inside.distance < 0.0
+    gaps = rectangle_gaps(middle, half, size)
+    meet = gaps.max(axis=0) < 0.0
+    apart = _apart(middle, half, size)
+    if not meet.any():
+        return apart
+    inside = _overlapping(middle, half, size, gaps)
     return Closest(*(np.where(meet, b, a) for a, b in zip(apart, inside, strict=True)))
+
+
+def rectangle_gaps(middle: FloatArray, half: FloatArray, size: FloatArray) -> FloatArray:
+    """Gaps between segments and rectangles along the axes that may separate them.
+
+    Args:
+        middle: As in :func:`to_rectangles`.
+        half: Likewise.
+        size: Likewise.
+
+    Returns:
+        Along the rectangle's axes and across the segment [m], negative where they overlap, shape
+        (3, p): the greatest one is never more than the distance, and negative where they meet.
+    """
+    along_axes = np.abs(middle) - np.abs(half) - size
+    length = _length(half)
+    reach = np.abs(half[1]) * size[0] + np.abs(half[0]) * size[1]
+    offset = np.abs(half[0] * middle[1] - half[1] * middle[0])
+    across = np.where(length > 0.0, (offset - reach) / np.maximum(length, _TINY), -np.inf)
+    return np.concatenate([along_axes, across[None]])  # a point has no side
 
 
 def _apart(middle: FloatArray, half: FloatArray, size: FloatArray) -> Closest:
@@ -91,18 +115,11 @@ def _apart(middle: FloatArray, half: FloatArray, size: FloatArray) -> Closest:
     return Closest(s[nearest, pair], shortest, away[:, nearest, pair] / np.maximum(shortest, _TINY))
 
 
-def _overlapping(middle: FloatArray, half: FloatArray, size: FloatArray) -> Closest:
-    """The shortest way out; its distance is negative only where segment and rectangle meet."""
-    length = _length(half)
-    across = np.array([-half[1], half[0]]) / np.maximum(length, _TINY)
-    offset = (across * middle).sum(axis=0)
-    gaps = np.array(
-        [
-            *(np.abs(middle) - np.abs(half) - size),
-            np.abs(offset) - (np.abs(across) * size).sum(axis=0),
-        ]
-    )
-    gaps[2, length == 0.0] = -np.inf  # a point has no side
+def _overlapping(
+    middle: FloatArray, half: FloatArray, size: FloatArray, gaps: FloatArray
+) -> Closest:
+    """The shortest way out where segment and rectangle meet."""
+    across = np.array([-half[1], half[0]]) / np.maximum(_length(half), _TINY)
     axis = np.argmax(gaps, axis=0)
     pair = np.arange(len(axis))
     zero = np.zeros(len(axis))
@@ -110,7 +127,7 @@ def _overlapping(middle: FloatArray, half: FloatArray, size: FloatArray) -> Clos
         [
             [_side(middle[0]), zero],
             [zero, _side(middle[1])],
-            across * _side(offset),
+            across * _side((across * middle).sum(axis=0)),
         ]
     )  # (3, 2, p)
     normal = normals[axis, :, pair].T

@@ -28,7 +28,8 @@ class RandomField:
         centre: Its centre, x and y [m].
         radius: Least and greatest radius [m].
         height: [m].
-        clear: No cylinder is nearer than this to the robot at its start or to the target [m].
+        clear: No cylinder is nearer than this to the robot's axis at its start or to the target's
+            edge [m].
         gap: Nor nearer than this to another obstacle [m].
         seed: Of places and radii; the scenario's if None.
     """

@@ -22,7 +22,7 @@ from capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..physics.contact import normal_force
 from ..physics.vectors import cross
-from .closest import Closest, to_circles, to_rectangles
+from .closest import Closest, rectangle_gaps, to_circles, to_rectangles
 from .obstacles import (
     Boxes,
     Cylinders,
@@ -116,15 +116,18 @@ def obstacle_law(
         if not len(link):
             return None
         half = length[link] / 2 * _forward(quaternion[:, link])
-        found = shape.closest(which, position[:2, link], half[:2])
+        pair, found = shape.closest(which, position[:2, link], half[:2], radius[link])
+        if not len(pair):
+            return None
+        which, link, axis = which[pair], link[pair], found.s * half[:, pair]
         depth = radius[link] - found.distance
-        height = position[2, link] + found.s * half[2]
-        touch = (depth > 0.0) & (height - radius[link] < shape.height[which])
+        bottom = position[2, link] + axis[2] - radius[link]
+        touch = (depth > 0.0) & (bottom < shape.height[which])
         if not touch.any():
             return None
         normal = np.zeros((3, int(touch.sum())))
         normal[:2] = found.normal[:, touch]
-        return _Touch(link[touch], (found.s * half)[:, touch], normal, depth[touch])
+        return _Touch(link[touch], axis[:, touch], normal, depth[touch])
 
     def contact(
         position: FloatArray, quaternion: FloatArray, velocity: FloatArray, spin: FloatArray
@@ -175,9 +178,13 @@ class _Round:
         x, y = position - self._centre
         return x * x + y * y < self._reach
 
-    def closest(self, which: IntArray, middle: FloatArray, half: FloatArray) -> Closest:
-        """Closest points of pairs."""
-        return to_circles(middle, half, self._shapes.centre[:, which], self._shapes.radius[which])
+    def closest(
+        self, which: IntArray, middle: FloatArray, half: FloatArray, reach: FloatArray
+    ) -> tuple[IntArray, Closest]:
+        """Closest points of those pairs that may be within a reach of each other."""
+        found = to_circles(middle, half, self._shapes.centre[:, which], self._shapes.radius[which])
+        pair = np.flatnonzero(found.distance < reach)
+        return pair, Closest(found.s[pair], found.distance[pair], found.normal[:, pair])
 
 
 class _Square:
@@ -195,13 +202,18 @@ class _Square:
         x, y = np.abs(into_axes(self._axis, position - self._centre)) < self._reach
         return x & y
 
-    def closest(self, which: IntArray, middle: FloatArray, half: FloatArray) -> Closest:
-        """Closest points of pairs."""
-        axis, centre = self._shapes.axis[:, which], self._shapes.centre[:, which]
-        found = to_rectangles(
-            into_axes(axis, middle - centre), into_axes(axis, half), self._shapes.half[:, which]
+    def closest(
+        self, which: IntArray, middle: FloatArray, half: FloatArray, reach: FloatArray
+    ) -> tuple[IntArray, Closest]:
+        """Closest points of those pairs that may be within a reach of each other."""
+        axis, size = self._shapes.axis[:, which], self._shapes.half[:, which]
+        middle, half = (
+            into_axes(axis, middle - self._shapes.centre[:, which]),
+            into_axes(axis, half),
         )
-        return found._replace(normal=out_of_axes(axis, found.normal))
+        pair = np.flatnonzero(rectangle_gaps(middle, half, size).max(axis=0) < reach)
+        found = to_rectangles(middle[:, pair], half[:, pair], size[:, pair])
+        return pair, found._replace(normal=out_of_axes(axis[:, pair], found.normal))
 
 
 def _forward(quaternion: FloatArray) -> FloatArray:

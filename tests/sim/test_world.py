@@ -147,7 +147,7 @@ def test_a_field_keeps_its_distances(seed):
 
 def test_a_field_follows_the_seed_and_is_stored_as_its_obstacles():
     scenario = parse_scenario(HEAD + FIELD, "x.toml")
-    assert "field" not in scenario.toml()
+    assert "[world.field]" not in scenario.toml()
     assert parse_scenario(scenario.toml(), "y.toml") == scenario
     assert scenario.world.field == RandomField(
         12, (4.0, 3.0), (1.8, 0.0), (0.05, 0.12), clear=0.25, gap=0.15
