@@ -8,14 +8,17 @@ import threading
 import time
 from contextlib import contextmanager
 
+import can
 import numpy as np
 import pytest
 
 import undulog as front
 from capture import Session, load_robot
+from capture.bus.encoding import BusEncoder
 from capture.errors import SourceError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import DIR_TX
+from capture.robot import Direction, Quantity
 from capture.sources.address import parse_address
 from capture.sources.events import Tally
 from sim import load_scenario
@@ -177,6 +180,34 @@ def test_a_dry_run_sends_nothing_and_says_what_it_would(tmp_path, capsys):
         assert session.channels["/dry_run/joint_commands"].count > 1
         assert session.channels["/joint_states"].count > 1  # it listened
         assert not (session.frames("/can/can0")["dir"] == DIR_TX).any()
+
+
+def test_a_dry_run_listens_to_any_bus_and_puts_nothing_on_it(capsys):
+    robot = load_robot("snake25")
+    frames = BusEncoder(robot, Direction.RX).encode({("joint01", Quantity.POSITION, ""): 0.1})
+    message = can.Message(
+        arbitration_id=int(frames["id_flags"][0]), data=frames["data"][0], is_extended_id=False
+    )
+    with can.Bus(interface="virtual", channel="drive-dry") as other:
+        ended = threading.Event()
+
+        def talk():
+            while not ended.wait(0.005):
+                other.send(message)
+
+        talker = threading.Thread(target=talk)
+        talker.start()
+        try:
+            words = ["drive", "flat", "--on", "can:virtual:drive-dry", "--duration", "0.3"]
+            assert front.run([*words, "--json"]) == 0
+        finally:
+            ended.set()
+            talker.join()
+        assert other.recv(0.1) is None
+    report = json.loads(capsys.readouterr().out)
+    assert (report["armed"], report["sent"]) == (False, 0)
+    assert report["decoded"] == report["received"] > 3
+    assert report["first_frames"][:2] == ["101#0000", "102#0000"]
 
 
 def test_asked_to_stop_the_robot_comes_to_rest_within_a_second(tmp_path):
