@@ -212,6 +212,8 @@ class _Square:
             into_axes(axis, half),
         )
         pair = np.flatnonzero(rectangle_gaps(middle, half, size).max(axis=0) < reach)
+        if not len(pair):
+            return pair, Closest(reach[:0], reach[:0], middle[:, :0])
         found = to_rectangles(middle[:, pair], half[:, pair], size[:, pair])
         return pair, found._replace(normal=out_of_axes(axis[:, pair], found.normal))
 
