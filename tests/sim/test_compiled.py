@@ -1,6 +1,8 @@
 """The compiled kernels against the NumPy laws, our own kinematics, and the engine link by link."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import pytest
 from capture import Session
 from capture.robot import Link
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
-from sim import FrictionLaw, Ground, World
+from sim import FrictionLaw, Ground, World, load_scenario
 from sim.physics.bullet import BulletEngine
 from sim.physics.compiled_bullet import CompiledBulletEngine
 from sim.physics.compiled_laws import CompiledLaws
@@ -132,3 +134,29 @@ def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
         facts = session.metadata["undulog"]
     assert facts["kernels"] == "numba"
     assert "numba" in set(facts) - {"kernels"}
+
+
+@pytest.mark.parametrize(
+    ("package", "words"),
+    [("numba", "--kernels numba"), ("mujoco", ""), ("numba", "--kernels auto")],
+    ids=["numba", "mujoco", "auto"],
+)
+def test_a_missing_extra_is_named_and_auto_goes_without(tmp_path, package, words):
+    engine = "mujoco" if package == "mujoco" else "bullet"
+    scenario = dataclasses.replace(
+        load_scenario("flat").changed(duration_s=0.02), engine=EngineKind(engine)
+    )
+    (tmp_path / "a.toml").write_text(scenario.toml())
+    code = (
+        f"import sys; sys.modules[{package!r}] = None; import undulog\n"
+        f"sys.exit(undulog.run(['sim', 'run', 'a.toml', '-o', 'a.mcap', *{words.split()!r}]))"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    if words.endswith("auto"):
+        assert (said.returncode, said.stderr) == (0, "")
+    else:
+        assert said.returncode == 2
+        assert f"needs the package {package}, which is not installed" in said.stderr
+        assert f"pip install 'undulog[{package}]'" in said.stderr
