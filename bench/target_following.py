@@ -6,10 +6,10 @@ told), or at the limit; then time and energy of the walk are at least what was s
 ratios. Ratios are paired by seed: random walk over target following. Their medians' intervals are
 those of the sign test, which needs no assumption on how they are spread.
 
-Seeds 1 to 16 served for tuning. Each run is a process of its own; results are kept in the output
-file as they come, and runs that it holds already are not repeated.
+Seeds 1 to 16 served for tuning. Results are kept in the output file as they come, and runs that it
+holds already are not repeated.
 
-Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--limit 45] [-o FILE.json]
+Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--limit 30] [-o FILE.json]
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import argparse
 import json
 import math
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +157,7 @@ def study(
     results = [r for r in results if ids.get((r["controller"], r["seed"])) == r["session_id"]]
     held = {(r["controller"], r["seed"]) for r in results}
     left = [one for one in wanted if one not in held]
-    with ProcessPoolExecutor(jobs, max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         runs = [pool.submit(run, name, seed, limit_s, kernels) for name, seed in left]
         for done in as_completed(runs):
             results.append(done.result())
@@ -171,7 +172,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--limit", type=float, default=45.0, help="longest run [s]")
+    parser.add_argument("--limit", type=float, default=30.0, help="longest run [s]")
     parser.add_argument("--kernels", choices=list(Kernels), default=Kernels.NUMPY)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/target_following.json"))
     options = parser.parse_args()
