@@ -100,7 +100,7 @@ class SocketcandServer:
             if client is None:
                 self._accept()
                 continue
-            if mask & selectors.EVENT_READ:
+            if mask & selectors.EVENT_READ and client.number in self._clients:
                 self._read(client)
             if mask & selectors.EVENT_WRITE and client.number in self._clients:
                 self._write(client)
@@ -149,7 +149,8 @@ class SocketcandServer:
         for client in list(self._clients.values()):
             client.held_until = 0.0
             self._write(client)
-            self._forget(client)
+            if client.number in self._clients:
+                self._forget(client)
         self._selector.close()
         self._listener.close()
 
@@ -188,9 +189,8 @@ class SocketcandServer:
             if client.number not in self._clients:
                 return
             self._hear(client, message)
-        if not chunk and client.number in self._clients:
-            self._say("info", f"{client.peer} is gone")
-            self._forget(client)
+        if not chunk:
+            self._lose(client)
         elif len(self._sent) >= MOST_SENT:
             for each in self._clients.values():
                 self._watch(each)
@@ -215,8 +215,7 @@ class SocketcandServer:
                 self._give(client, b"< ok >")
             else:
                 self._give(client, b"< error could not open bus >")
-                if client.number in self._clients:
-                    self._drop(client, f"asked for {message!r}; there is only {self._bus}")
+                self._drop(client, f"asked for {message!r}; there is only {self._bus}")
         elif word in ("rawmode", "bcmmode"):
             self._give(client, b"< ok >")
             client.raw = word == "rawmode"
@@ -229,6 +228,8 @@ class SocketcandServer:
             self._give(client, b"< error unknown command >")
 
     def _give(self, client: BusClient, text: bytes) -> None:
+        if client.number not in self._clients:
+            return  # gone meanwhile
         client.out += text
         if len(client.out) > MOST_BYTES:
             self._drop(client, "does not take its frames and was let go")
@@ -243,8 +244,7 @@ class SocketcandServer:
             except BlockingIOError:
                 pass
             except OSError:
-                self._say("info", f"{client.peer} is gone")
-                self._forget(client)
+                self._lose(client)
                 return
         self._watch(client)
 
@@ -266,12 +266,18 @@ class SocketcandServer:
         client.watched = events
 
     def _drop(self, client: BusClient, why: str) -> None:
-        self.dropped += 1
-        self._say("warn", f"{client.peer} {why}")
-        self._forget(client)
+        if client.number in self._clients:
+            self.dropped += 1
+            self._say("warn", f"{client.peer} {why}")
+            self._forget(client)
+
+    def _lose(self, client: BusClient) -> None:
+        if client.number in self._clients:
+            self._say("info", f"{client.peer} is gone")
+            self._forget(client)
 
     def _forget(self, client: BusClient) -> None:
+        del self._clients[client.number]
         if client.watched:
             self._selector.unregister(client.sock)
         client.sock.close()
-        del self._clients[client.number]

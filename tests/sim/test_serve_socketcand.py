@@ -109,7 +109,8 @@ class Serving:
         return np.concatenate([empty_frames(0), *self.pulled])
 
     def raw(self):
-        return sum(client.raw for client in self.server._clients.values())
+        with self.lock:
+            return sum(client.raw for client in self.server._clients.values())
 
     def close(self):
         self.ended = True
