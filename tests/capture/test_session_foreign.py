@@ -12,9 +12,7 @@ from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 
 from capture import Session
-from capture.errors import (
-    MissingChannelError,
-)
+from capture.errors import MissingChannelError
 from capture.log.cdr import encode
 from capture.log.schemas import message_type, schema_text
 
@@ -62,6 +60,29 @@ def test_a_changed_joint_set_is_told_and_read(tmp_path: Path) -> None:
         assert [len(t) for t in signals.t_ns] == [100, 50, 50]
         np.testing.assert_array_equal(signals.values[0], np.arange(100.0))
         assert any("set of joints changes" in w and "b, c" in w for w in session.warnings)
+
+
+def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path: Path) -> None:
+    messages, step_ns = [], 100_000_000
+    for tick in range(600):
+        t_ns = EPOCH_NS + tick * step_ns
+        names = ["a", "b"] if tick < 300 else ["b", "c"]  # messages of one length
+        messages.append(("/joint_states", t_ns, joint_state(t_ns, names, [tick, -tick])))
+    write_foreign(tmp_path / "f.mcap", messages)
+    with Session.open(tmp_path / "f.mcap") as session:
+        for first in (100, 450, 100, 295, 450, 295):
+            start_ns = EPOCH_NS + first * step_ns
+            found = session.joints(
+                "/joint_states", start_ns=start_ns, stop_ns=start_ns + 10 * step_ns
+            )
+            inside = range(first, first + 10)
+            truth = {
+                "a": [tick for tick in inside if tick < 300],
+                "b": [-tick if tick < 300 else tick for tick in inside],
+                "c": [-tick for tick in inside if tick >= 300],
+            }
+            read = dict(zip(found.names, (v.tolist() for v in found.values), strict=True))
+            assert read == {name: truth[name] for name in truth if truth[name] or name in read}
 
 
 def test_duplicate_and_backward_stamps_are_told(tmp_path: Path) -> None:
