@@ -17,6 +17,7 @@ mode     ``text``                                     ``/gait/mode``
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol, cast
 
@@ -29,12 +30,16 @@ from .control import LATER, Handler
 OPERATOR = "operator"
 """Who says on ``/rosout`` what came in by the control socket."""
 
+_PLANES = ("horizontal", "vertical")
 GAIT_NAMES = tuple(
     f"{plane}.{quantity}"
-    for plane in ("horizontal", "vertical")
+    for plane in _PLANES
     for quantity in ("A", "omega", "lag", "offset", "phase")
 )
-"""Values that ``/gait`` can have; see the log contract."""
+"""Values of a plane that ``/gait`` can have; see the log contract. Further values, of joints or of
+what a controller does, have names of the same form: ``joint03.A``, ``steer.offset``."""
+
+_FURTHER = re.compile(r"[A-Za-z][A-Za-z0-9_-]*(?:\.[A-Za-z0-9_-]+)+", re.ASCII)
 
 _GAIT_UNIT = "rad, omega in rad/s"
 _LEVELS = ("info", "warn", "error")
@@ -143,7 +148,7 @@ class OperatorLog:
         """Write one sample to ``/gait``.
 
         Args:
-            values: Name of :data:`GAIT_NAMES` to value; the same names throughout a session.
+            values: Name, see :data:`GAIT_NAMES`, to value; the same names throughout a session.
             t_ns: When the controller meant it [Unix ns]; now if None.
 
         Raises:
@@ -160,7 +165,8 @@ class OperatorLog:
                 "valid: Unix time in ns"
             )
         if self._gait is None:
-            names = tuple(name for name in GAIT_NAMES if name in values)
+            of_planes = [name for name in GAIT_NAMES if name in values]
+            names = tuple(dict.fromkeys([*of_planes, *values]))
             self._gait = names, self._writer.joint_state("/gait", names, unit=_GAIT_UNIT)
         names, channel = self._gait
         if set(values) != set(names):
@@ -257,13 +263,20 @@ def _gait_values(request: Mapping[str, Any]) -> dict[str, float]:
         raise _invalid("values", found, 'an object such as {"horizontal.A": 0.4}')
     checked: dict[str, float] = {}
     for name, value in cast("dict[str, object]", values).items():
-        if name not in GAIT_NAMES:
-            raise _invalid("values", name, listed(GAIT_NAMES, name))
-        number = _finite(value)
+        if not _is_gait_name(name):
+            others = "others as NAME.VALUE, e.g. joint03.A"
+            raise _invalid("values", name, f"{listed(GAIT_NAMES, name)}; {others}")
+        number = math.nan if value is None else _finite(value)
         if number is None:
-            raise _invalid(f"values.{name}", value, "a finite number")
+            raise _invalid(f"values.{name}", value, "a finite number, or null for none")
         checked[name] = number
     return checked
+
+
+def _is_gait_name(name: str) -> bool:
+    if name.partition(".")[0] in _PLANES:
+        return name in GAIT_NAMES
+    return _FURTHER.fullmatch(name) is not None
 
 
 def _finite(value: object) -> float | None:

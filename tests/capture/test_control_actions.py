@@ -1,5 +1,6 @@
 """What a running recorder can be asked, and what the session has of it then."""
 
+import math
 import runpy
 from pathlib import Path
 
@@ -87,6 +88,18 @@ def test_a_controller_s_gait_is_in_the_session_as_it_was_said(session):
     assert list(found[0][1].name) == ["horizontal.A", "horizontal.phase"]
 
 
+def test_values_of_joints_and_of_a_controller_come_behind_those_of_the_planes(session):
+    path, writer, _, server, _ = session
+    values = {"steer.offset": 0.1, "joint03.A": None, "horizontal.omega": 3.0, "horizontal.A": 0.4}
+    with polled(server), ControlClient(server.path) as client:
+        client.ask({"do": "gait", "values": values})
+    writer.close()
+    ((_, state),) = read(path, "/gait")
+    assert list(state.name) == ["horizontal.A", "horizontal.omega", "steer.offset", "joint03.A"]
+    assert list(state.position[:3]) == [0.4, 3.0, 0.1]
+    assert math.isnan(state.position[3])  # null: it has none
+
+
 def test_notes_marks_and_modes_are_in_the_session(session):
     path, writer, actions, server, clock = session
     with polled(server), ControlClient(server.path) as client:
@@ -132,6 +145,7 @@ def test_notes_marks_and_modes_are_in_the_session(session):
         ({"do": "gait"}, "values: found nothing"),
         ({"do": "gait", "values": {}}, "values: found a table"),
         ({"do": "gait", "values": {"vertical.omegas": 1}}, "did you mean vertical.omega?"),
+        ({"do": "gait", "values": {"speed": 1}}, "others as NAME.VALUE, e.g. joint03.A"),
         ({"do": "gait", "values": {"horizontal.A": "1"}}, "values.horizontal.A: found"),
         ({"do": "gait", "values": {"horizontal.A": True}}, "a finite number"),
         ({"do": "gait", "values": {"horizontal.A": 10**400}}, "a finite number"),
