@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from capture.arrays import FloatArray
-from capture.robot import Robot
+from capture.robot import Plane, Robot
 
 from ..gait import Gait, GaitTick
 from ..gait.limits import smoothstep
@@ -17,7 +17,8 @@ FADE_S = 1.0
 STOP = "stop"
 """The mode of a gait that comes to rest."""
 
-_FADED = ("A", "offset")
+_ROUNDING_S = 1e-9  # a tick that is due when the fade ends is in time
+_FADED = ("A", "offset")  # of a plane or a joint, not of what a controller tells of itself
 
 
 class FadingGait:
@@ -37,10 +38,14 @@ class FadingGait:
             fade_s: T [s].
         """
         self._gait, self._fade_s = gait, fade_s
+        waves = {*Plane, *robot.joint_names}
+        parts = [name.rpartition(".") for name in gait.names]
+        faded = [wave in waves and value in _FADED for wave, _, value in parts]
+        self._faded = np.array(faded, dtype=np.bool_)
         self._rest = np.clip(np.zeros(len(robot.joints)), *robot.limits())
         self._asked = False
         self._begun_s: float | None = None
-        self._time_s = 0.0
+        self._passed = 0.0  # share of the fade's time
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -50,7 +55,7 @@ class FadingGait:
     @property
     def at_rest(self) -> bool:
         """Whether the last command was the pose at rest, to be held from then on."""
-        return self._begun_s is not None and self._time_s - self._begun_s >= self._fade_s
+        return self._passed == 1.0
 
     def begin(self) -> None:
         """Come to rest from the next step on; safe to call again."""
@@ -67,13 +72,14 @@ class FadingGait:
             Commands and values.
         """
         tick = self._gait.step(time_s, readings)
-        self._time_s = time_s
         if not self._asked:
             return tick
         if self._begun_s is None:
             self._begun_s = time_s
-        share = 1.0 - smoothstep((time_s - self._begun_s) / self._fade_s)
+        elapsed_s = time_s - self._begun_s + _ROUNDING_S
+        self._passed = min(elapsed_s / self._fade_s, 1.0)
+        share = 1.0 - smoothstep(self._passed)
         command: FloatArray = self._rest + share * (tick.command - self._rest)
-        faded = [name.rpartition(".")[2] in _FADED for name in self.names]
-        values = np.where(faded, share * tick.values, tick.values)
+        values = tick.values.copy()
+        values[self._faded] *= share
         return GaitTick(command, values, STOP, tick.clamped)

@@ -6,6 +6,7 @@ to be told. A recorder that goes, refuses or is slow never holds the loop up.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from capture.daemon.control_client import ControlClient
-from capture.daemon.control_requests import GAIT_NAMES
 from capture.errors import ControlError
 
 from ..gait import GaitTick
@@ -38,7 +38,7 @@ class GaitTeller:
 
         Args:
             path: The recorder's control socket.
-            names: Names of the gait's values; the recorder takes those of the planes.
+            names: Names of the gait's values.
 
         Raises:
             ControlError: If nobody listens there.
@@ -46,7 +46,7 @@ class GaitTeller:
         self.told = self.dropped = 0
         self.error: str | None = None
         self._client = ControlClient(path)
-        self._chosen = [(i, name) for i, name in enumerate(names) if name in GAIT_NAMES]
+        self._names = tuple(names)
         self._mode = ""
         self._held: deque[Mapping[str, Any]] = deque()
         self._ended = threading.Event()
@@ -72,14 +72,15 @@ class GaitTeller:
         if tick.mode != self._mode:
             self._mode = tick.mode
             self._held.append({"do": "mode", "text": tick.mode})
-        if not self._chosen or self.error is not None:
+        if not self._names or self.error is not None:
             return
         if len(self._held) >= _MOST_HELD:
             self.dropped += 1
             return
         values: list[float] = tick.values.tolist()
-        told = {name: values[i] for i, name in self._chosen}
-        self._held.append({"do": "gait", "values": told, "t_ns": t_ns})
+        told = [value if math.isfinite(value) else None for value in values]  # as JSON has it
+        named = dict(zip(self._names, told, strict=True))
+        self._held.append({"do": "gait", "values": named, "t_ns": t_ns})
 
     def close(self) -> None:
         """Tell what is left, for a few seconds, and disconnect; safe to call twice."""

@@ -17,6 +17,7 @@ from capture.robot import Plane
 from sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from sim.drive.command_session import CommandReplay, RecordedCommands
 from sim.drive.fading import FadingGait
+from sim.gait import GaitTick
 
 COLUMNS = (
     ("/joint_commands", "position"),
@@ -199,18 +200,39 @@ def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
     wave = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 1.0, 0.5, offset=0.1)}, ramp_s=0.0)
     own, faded = SerpentineGait(wave, robot), FadingGait(SerpentineGait(wave, robot), robot, 0.5)
     knows = Readings.nothing(robot)
-    for k in range(160):
+    for k in range(160):  # whatever the rounding of times: 0.5 s are 50 ticks
         expected, tick = own.step(k / 100, knows), faded.step(k / 100, knows)
         if k == 99:
             faded.begin()
         x = min(max((k - 100) / 50, 0.0), 1.0)
         share = 1.0 - x * x * (3.0 - 2.0 * x)
-        np.testing.assert_allclose(tick.command, share * expected.command, atol=1e-15)
+        np.testing.assert_allclose(tick.command, share * expected.command, atol=1e-8)
         np.testing.assert_allclose(
-            tick.values, expected.values * [share, 1, 1, share, 1], atol=1e-15
+            tick.values, expected.values * [share, 1, 1, share, 1], atol=1e-8
         )
         assert tick.mode == ("walk" if k < 100 else "stop")
         assert faded.at_rest == (k >= 150)
+
+
+class Told:
+    """A gait that tells what a controller may: values of joints, and infinity."""
+
+    names = ("horizontal.A", "joint02.offset", "joint02.phase", "steer.offset", "steer.distance")
+
+    def step(self, time_s, readings):
+        del time_s, readings
+        return GaitTick(np.full(4, 0.2), np.array([0.4, 0.1, 2.0, 0.3, np.inf]), "avoid", ())
+
+
+def test_fading_leaves_what_a_controller_tells_of_itself(make_robot):
+    robot = make_robot(5)
+    gait = FadingGait(Told(), robot)
+    gait.begin()
+    first, half, last = (gait.step(t, Readings.nothing(robot)) for t in (0.0, 0.5, 1.0))
+    assert first.values.tolist() == [0.4, 0.1, 2.0, 0.3, np.inf]
+    assert half.values == pytest.approx([0.2, 0.05, 2.0, 0.3, np.inf])
+    assert last.values.tolist() == [0.0, 0.0, 2.0, 0.3, np.inf]
+    assert half.command == pytest.approx(np.full(4, 0.1))
 
 
 def written(path, rows, names=("joint01", "joint02"), **options):

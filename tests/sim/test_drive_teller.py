@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from capture.daemon.control import ControlServer
-from capture.daemon.control_requests import GAIT_NAMES
 from capture.errors import ControlError
 from sim.drive.gait_teller import GaitTeller
 from sim.gait import GaitTick
@@ -71,12 +70,15 @@ def test_everything_is_told_in_order(tmp_path):
     ]
 
 
-def test_values_of_single_joints_are_not_for_the_recorder(tmp_path):
+def test_what_json_has_no_number_for_is_null(tmp_path):
+    names = (*NAMES, "joint01.A", "steer.distance")
+    values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, np.nan, np.inf])
     with control_socket(tmp_path / "a.sock") as (heard, _):
-        teller = GaitTeller(tmp_path / "a.sock", (*NAMES, "joint01.A", "joint03.A"))
-        teller.tell(tick(0, count=7), 1)
+        teller = GaitTeller(tmp_path / "a.sock", names)
+        teller.tell(GaitTick(np.zeros(25), values, "walk", ()), 1)
         teller.close()
-    assert set(heard[-1]["values"]) == set(NAMES) <= set(GAIT_NAMES)
+    told = [1.0, 2.0, 3.0, 4.0, 5.0, None, None]
+    assert heard[-1]["values"] == dict(zip(names, told, strict=True))
 
 
 def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
