@@ -150,6 +150,7 @@ def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[s
         "samples": recording.sample_count,
         "energy_j": recording.energy,
         "energy_closure": _closure(recording),
+        "obstacle_contact_s": recording.contact_s,
         "real_time_factor": factor,
     }
 
@@ -172,5 +173,16 @@ def _told(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
     lines = [first, who, work]
     if closure is not None:
         lines.append(f"energy ledger closes within {100 * closure:.2g} % of the absolute work")
+    if scenario.world.obstacles:
+        lines.append(_touched(recording.contact_s))
     lines.append(f"simulated at {factor:.1f} x real time")
     return lines
+
+
+def _touched(contact_s: dict[str, float]) -> str:
+    """What to say of the links that touched obstacles."""
+    if not contact_s:
+        return "no link touched an obstacle"
+    longest = max(contact_s, key=contact_s.__getitem__)
+    links = "1 link" if len(contact_s) == 1 else f"{len(contact_s)} links"
+    return f"{links} touched obstacles, {longest} longest: {contact_s[longest]:.3g} s"

@@ -31,6 +31,7 @@ class Recording:
         duration_s: Simulated time from the first sample to the last.
         complete: Whether the run reached its planned end.
         energy: The ledger at the end [J], by term.
+        contact_s: For how long each link touched an obstacle [s], those that did, by name.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class Recording:
     duration_s: float
     complete: bool
     energy: dict[str, float]
+    contact_s: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,8 @@ def record(
     """
     sample: Sample | None = None
     session_id = scenario.session_id if driver is None else driver.session_id(scenario)
+    if kernels is not Kernels.NUMPY:  # they round otherwise
+        session_id = hashlib.sha256(f"{session_id}\0{kernels}".encode()).hexdigest()[:32]
     with (
         Twin(scenario, None if driver is None else driver.gait, kernels=kernels) as twin,
         SessionWriter(
@@ -154,4 +158,9 @@ def record(
         duration_s=sample.time_s,
         complete=complete,
         energy=dict(zip(TERMS, sample.energy.tolist(), strict=True)),
+        contact_s={
+            link.name: seconds
+            for link, seconds in zip(scenario.robot.links, sample.contact_s.tolist(), strict=True)
+            if seconds > 0.0
+        },
     )

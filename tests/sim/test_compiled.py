@@ -132,6 +132,7 @@ def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
     assert paths[0].read_bytes() == paths[1].read_bytes()
     with Session.open(paths[0]) as session:
         facts = session.metadata["undulog"]
+        assert session.session_id != scenario.session_id
     assert facts["kernels"] == "numba"
     assert "numba" in set(facts) - {"kernels"}
 

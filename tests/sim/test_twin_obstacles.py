@@ -1,6 +1,7 @@
 """The twin among obstacles: collisions in closed form, the energy balance, and both engines."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -126,3 +127,36 @@ def test_obstacles_out_of_reach_change_nothing(make_scenario, make_robot):
     for one, other in zip(run(scenario), run(far), strict=True):
         np.testing.assert_array_equal(one.step.body.position, other.step.body.position)
         np.testing.assert_array_equal(one.energy, other.energy)
+
+
+def test_the_command_line_tells_the_time_in_contact(tmp_path, capsys):
+    import undulog as front
+
+    text = """
+description = "Past a peg."
+robot = "snake13"
+duration_s = 0.3
+[gait]
+ramp_s = 0.0
+[gait.horizontal]
+amplitude = 0.4
+frequency_hz = 1.0
+lag = 1.0
+[[world.obstacles]]
+shape = "cylinder"
+position = [-0.12, 0.06]
+radius = 0.03
+"""
+    path, words = tmp_path / "peg.toml", ["-o", str(tmp_path / "a.mcap"), "--force"]
+    path.write_text(text)
+    assert front.run(["sim", "run", str(path), *words, "--json"]) == 0
+    touched = json.loads(capsys.readouterr().out)["obstacle_contact_s"]
+    assert touched
+    assert all(0.0 < seconds <= 0.3 for seconds in touched.values())
+    longest = max(touched, key=touched.get)
+    assert front.run(["sim", "run", str(path), *words]) == 0
+    said = capsys.readouterr().out
+    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in said
+    path.write_text(text.replace("0.06]", "2.0]"))
+    assert front.run(["sim", "run", str(path), *words]) == 0
+    assert "no link touched an obstacle\n" in capsys.readouterr().out
