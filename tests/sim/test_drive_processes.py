@@ -104,6 +104,7 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
     for place, name in enumerate(("joint01", "joint03", "joint05")):
         meant = a * np.sin(phase + place * lag) + offset
         given = commands.signal(name).values
+        given = given[~np.isnan(given)]  # a tick's frames that came more than 0.1 s apart
         assert len(given) == report["ticks"]
         assert np.abs(given - meant).max() <= STEP / 2 * (1 + 1e-6)
 
