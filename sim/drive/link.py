@@ -18,7 +18,7 @@ from typing import Protocol
 
 from capture.errors import SourceError, UsageError
 from capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray
-from capture.sources.contract import Source, SourceAddress, SourceContext
+from capture.sources.contract import Polled, Source, SourceAddress, SourceContext
 from capture.sources.events import Tally
 from capture.sources.socketcand import connect, enter_raw_mode, read_answer, server_of
 from capture.sources.socketcand_text import SocketcandText
@@ -71,7 +71,7 @@ class ListeningLink:
         self._source = source
         source.start(context)
         if not source.connected:
-            self._lost()
+            self._lost(source.poll())
 
     def receive(self) -> Sequence[FrameArray]:
         """Take what has come, without waiting.
@@ -84,15 +84,15 @@ class ListeningLink:
         """
         polled = self._source.poll()
         if not self._source.connected:
-            self._lost()
+            self._lost(polled)
         return (*polled.frames, *polled.fd_frames)
 
     def close(self) -> None:
         """Release it; safe to call twice."""
         self._source.stop()
 
-    def _lost(self) -> None:
-        told = [event.text for event in self._source.poll().events]
+    def _lost(self, polled: Polled) -> None:
+        told = [event.text for event in polled.events if event.level != "info"]
         self._source.stop()
         raise SourceError(self.place, "; ".join(told) or "the connection is gone")
 

@@ -242,6 +242,12 @@ def test_a_robot_that_goes_away_is_told_by_its_bus(tmp_path, capsys):
         assert session.channels["/joint_commands"].count == 11
 
 
+def test_a_bus_that_goes_away_ends_a_dry_run(capsys):
+    with alive(load_scenario("flat").changed(duration_s=1.5), lockstep=False) as (on, _):
+        assert front.run(["drive", "flat", "--on", on, "--duration", "60"]) == 1
+    assert "closed the connection" in capsys.readouterr().err
+
+
 @contextmanager
 def plain_server(answers, stream=()):
     """A server of one client: answers each message by its first word, then sends a stream."""
