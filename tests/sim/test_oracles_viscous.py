@@ -167,3 +167,13 @@ def test_what_is_left_over_goes_with_the_step():
     whole, half = (run_twin(*case, rate_hz=rate)[0] - chain for rate in (400, 800))
     assert whole == pytest.approx(2 * half, rel=0.1)
     assert abs(2 * half - whole) < 1e-5 * chain  # what would be left without a step
+
+
+@pytest.mark.slow
+def test_at_small_amplitude_speed_goes_with_its_square():
+    # Liljebäck et al., IROS 2010, of viscous ground: twice the amplitude, four times the speed.
+    links, lag, a = 13, math.radians(30), 0.03
+    small, large = (run_twin(links, lag, one)[0] for one in (a, 2 * a))
+    chain, larger = (overdamped_chain(links, lag, one)[0] for one in (a, 2 * a))
+    assert large / small == pytest.approx(larger / chain, rel=5e-3)
+    assert large / small == pytest.approx(4.0, rel=0.03)
