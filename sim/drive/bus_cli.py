@@ -53,8 +53,6 @@ def on_bus(
     """
     if armed and recorder is None:
         recorder = _only_recorder()
-        if recorder is None and output is None:
-            sys.stderr.write("note: no recorder runs and there is no -o: /gait is not recorded\n")
     plan = bus_plan(
         driven,
         on,
@@ -64,6 +62,8 @@ def on_bus(
         recorder=recorder if armed else None,
         force=force,
     )
+    if armed and recorder is None and output is None:
+        sys.stderr.write("note: no recorder runs and there is no -o: /gait is not recorded\n")
     start = time.monotonic()
     with interruptible() as stop, progress(driven.name, plan.duration_s) as bar:
 

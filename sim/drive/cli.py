@@ -65,7 +65,9 @@ def drive(
             )
         refuse_existing(output, force=force)
     scheme, colon, rest = on.partition(":")
-    if scheme != _TWIN or (colon and not rest):
+    if scheme == _TWIN and colon and not rest:
+        raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
+    if scheme != _TWIN:
         from .bus_cli import on_bus
 
         return on_bus(

@@ -24,7 +24,7 @@ from capture.sources.contract import SourceAddress, SourceContext
 from capture.sources.events import Tally
 from capture.sources.registry import open_source
 
-from ..scenario import CONTROL_RATE_HZ, Scenario
+from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .bus_session import BusSession, NowhereSink, stamped
 from .driven import Driven
 from .fading import FadingGait
@@ -105,7 +105,7 @@ def bus_plan(
         The plan.
 
     Raises:
-        UsageError: If the address is none, the robot has no bus, or the duration is too short.
+        UsageError: If the address is none, the robot has no bus, or the duration can't be.
     """
     address = parse_address(on) if ":" in on else None
     if address is None or address.scheme != "can":
@@ -115,8 +115,10 @@ def bus_plan(
             f"{driven.robot.name} has no bus map: {driven.name} can't be driven on one"
         )
     length = driven.duration_s if duration_s is None else duration_s
-    if length < 1 / CONTROL_RATE_HZ:
-        raise UsageError(f"a duration of {length:g} s; it can be {1 / CONTROL_RATE_HZ:g} s or more")
+    if not 1 / CONTROL_RATE_HZ <= length <= LONGEST_S:
+        raise UsageError(
+            f"a duration of {length:g} s; it can be {1 / CONTROL_RATE_HZ:g} to {LONGEST_S:g} s"
+        )
     return BusPlan(driven, address, length, armed, output, recorder, force)
 
 

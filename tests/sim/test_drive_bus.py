@@ -299,6 +299,8 @@ def test_commands_go_to_no_other_server_than_the_virtual_robots(capsys):
         (("--on", "unix:/tmp/a.sock"), "expected twin, twin:SCENARIO or can:"),
         (("--on", "can:nothing:x"), "no CAN interface 'nothing'"),
         (("--on", "can:virtual:bus", "--duration", "0"), "a duration of 0 s"),
+        (("--on", "can:virtual:bus", "--duration", "nan"), "a duration of nan s"),
+        (("--on", "twin:"), "names no scenario"),
         (("--on", "twin", "--arm", "-o", "a.mcap"), "--arm and --recorder are for a bus"),
     ],
 )
