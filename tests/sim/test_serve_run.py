@@ -322,6 +322,19 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
         assert session.channels["/gait"].count > 20
 
 
+@pytest.mark.slow
+def test_the_manuals_own_controller_moves_the_robot():
+    page = (ROOT / "docs" / "virtual-robot.md").read_text()
+    (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    with robot_process("flat", "--wait") as (robot, ready):
+        snippet = snippet.replace("29536", str(ready["port"])).replace("range(1000)", "range(50)")
+        subprocess.run([sys.executable, "-c", snippet], check=True, timeout=PATIENCE_S)
+        robot.send_signal(signal.SIGTERM)
+        end = json.loads(robot.communicate(timeout=60)[0])
+    assert end["commands"] == 50 * 13
+    assert end["ticks"] > 10
+
+
 def test_what_cannot_be_served_is_said_at_once(capsys):
     for words, said in (
         (["flat"], "give --socketcand PORT or --unix PATH"),
