@@ -1,11 +1,12 @@
 """Cost of a physics step: the twin, against PyBullet's own contacts and motors on the same body.
 
 All step the shipped 25-joint snake at 1 kHz through the same commands, in turn, in one process. The
-twin computes ground, servos, all sensors and the energy ledger itself, with NumPy or compiled with
-numba, on PyBullet's dynamics or MuJoCo's; PyBullet's own way has capsules on a plane with its
-anisotropic friction, POSITION_CONTROL motors, and the links read at every step. Then the same
-without sensors for chains of 12 to 100 joints. Processor time, the least of several runs: other
-programs on the machine can only add to it.
+twin computes ground, servos, what the servos report and the energy ledger itself, with NumPy or
+compiled with numba, on PyBullet's dynamics or MuJoCo's; with all sensors, too, which PyBullet's own
+way has not: that is capsules on a plane with its anisotropic friction, POSITION_CONTROL motors, and
+the links read at every step. Then the same for chains of 12 to 100 joints. Processor time, the
+least of several runs: other programs on the machine can only add to it. Look at the load before you
+believe an absolute number.
 
 Run: python bench/twin_step.py [--seconds 1] [--runs 5]
 """
@@ -155,15 +156,18 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--runs", type=int, default=5)
     options = parser.parse_args()
-    flat = load_scenario("flat").changed(duration_s=options.seconds)
+    whole = load_scenario("flat").changed(duration_s=options.seconds)
+    flat = dataclasses.replace(whole, sensing=dataclasses.replace(whole.sensing, enabled=False))
     mujoco = dataclasses.replace(flat, engine=EngineKind.MUJOCO)
     step_twin(flat.changed(duration_s=0.05), Kernels.NUMBA)  # compiles, the first time
     each = least(
         {
             NUMPY: lambda: step_twin(flat, Kernels.NUMPY),
             NUMBA: lambda: step_twin(flat, Kernels.NUMBA),
-            "twin, NumPy, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMPY),
-            "twin, numba, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMBA),
+            f"{NUMPY}, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMPY),
+            f"{NUMBA}, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMBA),
+            f"{NUMPY}, all sensors": lambda: step_twin(whole, Kernels.NUMPY),
+            f"{NUMBA}, all sensors": lambda: step_twin(whole, Kernels.NUMBA),
             BUILT_IN: lambda: step_builtin(flat),
         },
         options.runs,
@@ -176,7 +180,7 @@ def main() -> None:
     )
     for name, step_us in each.items():
         print(f"{name:<27} {step_us:7.0f} us a step  {1e3 / step_us:5.1f} x real time")
-    print(f"\n{'joints, without sensors':<27}" + "".join(f"{n:>9}" for n in LENGTHS))
+    print(f"\n{'us a step, by joints':<27}" + "".join(f"{n:>9}" for n in LENGTHS))
     rows: dict[str, list[float]] = {NUMPY: [], NUMBA: [], BUILT_IN: []}
     for n in LENGTHS:
         scenario = dataclasses.replace(
@@ -193,7 +197,7 @@ def main() -> None:
         for name, step_us in found.items():
             rows[name].append(step_us)
     for name, costs in rows.items():
-        print(f"{name + ', us a step':<27}" + "".join(f"{cost:9.0f}" for cost in costs))
+        print(f"{name:<27}" + "".join(f"{cost:9.0f}" for cost in costs))
     print(f"\nload average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
