@@ -48,7 +48,7 @@ class VirtualBus:
             try:
                 sender.send(empty_frames(0))
             except OSError as error:
-                raise UsageError(f"{sender.path}: {error.strerror}") from error
+                raise UsageError(f"{sender.path}: {error.strerror or error}") from error
 
     @property
     def waiting(self) -> int:
@@ -149,7 +149,7 @@ class VirtualBus:
         try:
             self._sender.send(frames)
         except OSError as error:
-            self._say("error", f"{self._sender.path} is given up: {error.strerror}")
+            self._say("error", f"{self._sender.path} is given up: {error.strerror or error}")
             self._sender = None
             return
         if self._sender.connected is not self._recorder:

@@ -345,6 +345,7 @@ def test_what_cannot_be_served_is_said_at_once(capsys):
         (["flat", "--unix", "x", "--lockstep"], "give --socketcand PORT"),
         (["flat", "--socketcand", "0", "--fault", "lsot:0.1"], "did you mean lost?"),
         (["flat", "--socketcand", "0", "--duration", "0"], "a duration of 0 s"),
+        (["flat", "--unix", "x" * 200], "AF_UNIX path too long"),
     ):
         assert front.run(["sim", "serve", *words]) == 2
         assert said in capsys.readouterr().err
