@@ -22,7 +22,7 @@ from .physics.engine import EngineKind
 from .sensing import Noise, SensorModels
 from .serve.faults import BusFault
 from .toml_text import toml_text
-from .world import World
+from .world import Push, World
 from .world.toml import body_length, world_table
 
 CONTROL_RATE_HZ = 100
@@ -48,6 +48,7 @@ class Scenario:
         noise: What the servos' readings carry.
         sensing: How its sensors measure.
         modules: Its servos and links that differ from the robot's own.
+        disturbances: What pushes it.
         seed: Of all that is drawn at random.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
@@ -67,6 +68,7 @@ class Scenario:
     noise: Noise = field(default_factory=Noise)
     sensing: SensorModels = field(default_factory=SensorModels)
     modules: Modules = field(default_factory=Modules)
+    disturbances: tuple[Push, ...] = ()
     seed: int = 1
     epoch_s: int = 1_735_689_600  # 2025-01-01T00:00:00Z: near zero, viewers misread stamps
     physics_rate_hz: int = 1000
@@ -142,6 +144,8 @@ class Scenario:
         }
         if self.controller is not None:
             values["controller"] = controller_table(self.controller)
+        if self.disturbances:
+            values["disturbances"] = [dataclasses.asdict(push) for push in self.disturbances]
         if self.faults:
             values["faults"] = [fault.as_table() for fault in self.faults]
         return toml_text(values)

@@ -70,6 +70,12 @@ A scenario::
     dead_band = 0.0                 # rad, of the encoders
     command_resolution = 0.0        # rad, step in which the servos take commands
 
+    [[disturbances]]                # a push from outside
+    link = "link07"
+    force = [0.0, 2.0, 0.0]         # N, in the world, on the link's centre
+    start_s = 10.0
+    duration_s = 0.5
+
     [[faults]]                      # of the bus that `sim serve` offers: see sim.serve.faults
     kind = "lost"
     joint = "joint07"
@@ -98,6 +104,7 @@ from .physics.engine import EngineKind
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .sensing.toml import read_noise, read_sensing
 from .serve.faults import read_faults
+from .world.push import read_pushes
 from .world.toml import read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
@@ -162,6 +169,7 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
         "noise": read_noise(top.table("noise")),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "modules": read_modules(top, robot),
+        "disturbances": read_pushes(top, robot),
         "faults": read_faults(top, robot),
         "seed": seed,
         "engine": (top.choice("engine", EngineKind) if "engine" in top else None)

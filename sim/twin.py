@@ -44,7 +44,7 @@ class Sample(NamedTuple):
         step: Body, ground, rotors and servos at this instant.
         sensed: The sensors' samples that have arrived since the tick before; the newest ones
             arrive after the run, by :meth:`Twin.flush`.
-        energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (22,).
+        energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (23,).
         contact_s: For how long each link has touched an obstacle so far [s], shape (n,).
     """
 

@@ -7,7 +7,8 @@ and rotors follow, what is left over is a boundary term that does not grow.
 
 Two balances close over any stretch of time::
 
-    mechanical_net = friction_tangential + friction_normal + contact_damping
+    mechanical_net + push_work
+                   = friction_tangential + friction_normal + contact_damping
                      + obstacle_friction + obstacle_damping
                      + change of (kinetic + potential + contact_spring + obstacle_spring)
     electrical_net = mechanical_net + copper + viscous + coulomb + gear_damping
@@ -47,6 +48,9 @@ GROUND_TERMS = ("friction_tangential", "friction_normal", "contact_damping")
 OBSTACLE_TERMS = ("obstacle_friction", "obstacle_damping")
 """What the obstacles take [J], cumulative."""
 
+PUSH_TERMS = ("push_work",)
+"""What disturbances do to the robot [J], cumulative."""
+
 STORED_TERMS = (
     *("kinetic", "potential", "contact_spring", "obstacle_spring"),
     *("rotor_kinetic", "gear_spring"),
@@ -56,7 +60,7 @@ STORED_TERMS = (
 RESIDUAL_TERMS = ("mechanical_residual", "electrical_residual")
 """Left side minus right side of the two balances since the start [J]: the ledger's own error."""
 
-TERMS = JOINT_TERMS + GROUND_TERMS + OBSTACLE_TERMS + STORED_TERMS + RESIDUAL_TERMS
+TERMS = JOINT_TERMS + GROUND_TERMS + OBSTACLE_TERMS + PUSH_TERMS + STORED_TERMS + RESIDUAL_TERMS
 """All terms, in the order of :meth:`Ledger.read`."""
 
 
@@ -141,6 +145,21 @@ def obstacle_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
     return taken
 
 
+def push_flow(steps: Steps, dt: float) -> float:
+    """Energy that disturbances bring in during consecutive steps.
+
+    Args:
+        steps: k + 1 steps; the last one closes the one before it.
+        dt: Step [s].
+
+    Returns:
+        Energy [J].
+    """
+    if steps.pushes is None:
+        return 0.0
+    return dt * float((steps.pushes[:-1] * _middle(steps.stacked.body.velocity)).sum())
+
+
 class Ledger:
     """Adds up flows and reads off stored energies."""
 
@@ -179,6 +198,7 @@ class Ledger:
         self._joints = np.zeros((len(JOINT_TERMS), len(robot.joints)))
         self._ground = np.zeros(len(GROUND_TERMS))
         self._obstacles = np.zeros(len(OBSTACLE_TERMS))
+        self._push_work = 0.0
         self._contact_s = np.zeros(len(robot.links))
         self._start = self.stored(start)
 
@@ -203,6 +223,7 @@ class Ledger:
         else:
             self._joints += joint_flows(steps, self._servos, self._dt)
             self._ground += ground_flows(steps, self._stiffness, self._dt)
+        self._push_work += push_flow(steps, self._dt)
         if any(len(contact.link) for contact in steps.obstacles):
             self._obstacles += obstacle_flows(steps, self._obstacle_stiffness, self._dt)
             for contact in steps.obstacles[:-1]:
@@ -257,17 +278,18 @@ class Ledger:
             step: The instant, up to which all steps are booked.
 
         Returns:
-            Energies [J], as :data:`TERMS`, shape (22,).
+            Energies [J], as :data:`TERMS`, shape (23,).
         """
         joints = self._joints.sum(axis=1)
         stored = self.stored(step)
         change = stored - self._start
         net, electrical, losses = joints[0], joints[3], joints[5:].sum()
         residuals = (
-            net - self._ground.sum() - self._obstacles.sum() - change[:4].sum(),
+            net + self._push_work - self._ground.sum() - self._obstacles.sum() - change[:4].sum(),
             electrical - net - losses - change[4:].sum(),
         )
-        return np.concatenate((joints, self._ground, self._obstacles, stored, residuals))
+        flows = (joints, self._ground, self._obstacles, (self._push_work,))
+        return np.concatenate((*flows, stored, residuals))
 
 
 def _middle(series: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from capture.arrays import FloatArray
 
 from ..scenario import CONTROL_RATE_HZ, Scenario
 from ..world.obstacle_contact import obstacle_law
+from ..world.push import pushes_during
 from .engine import Kernels, engine_type
 from .laws import laws_for
 from .servo import Servos
@@ -56,6 +57,9 @@ class Plant:
         count = scenario.physics_rate_hz // CONTROL_RATE_HZ
         self._period = Steps.empty(count + 1, len(robot.links), len(robot.joints))
         self._rows = tuple(self._period)
+        self._disturbances = scenario.disturbances
+        self._link_names = [link.name for link in robot.links]
+        self._periods = 0  # gone through
         self._laws = laws_for(
             self._period, robot, world.ground, self.servos, dt=self.dt, kernels=kernels
         )
@@ -86,6 +90,10 @@ class Plant:
             Its steps from its start to its end, both included, in a table of their own; all of
             them, even where the state became impossible on the way.
         """
+        first = self._periods * (len(self._rows) - 1)
+        times_s = self.dt * np.arange(first, first + len(self._rows), dtype=np.float64)
+        self._period.pushes = pushes_during(self._disturbances, self._link_names, times_s)
+        self._periods += 1
         with np.errstate(all="ignore"):  # whoever looks at the steps finds what overflows
             for k in range(1, len(self._rows)):
                 self._push(k - 1)
@@ -98,12 +106,14 @@ class Plant:
         return steps
 
     def _push(self, k: int) -> None:
-        """Let ground and obstacles act on the links."""
+        """Let ground, obstacles and disturbances act on the links."""
         step = self._rows[k]
         self._engine.push(step.contact.force, step.body.position + self._below)
         if self._obstacle_law is not None:
             for force, point in self._period.obstacles[k].layers(self._period.link_count):
                 self._engine.push(force, point)
+        if self._period.pushes is not None:
+            self._engine.push(self._period.pushes[k], step.body.position)
 
     def _look(self, k: int) -> None:
         """Fill in the body, and what obstacles do to it."""

@@ -39,6 +39,7 @@ class Steps(Sequence[Step]):
         link_count: n.
         joint_count: m.
         obstacles: What touches obstacles, one entry a step.
+        pushes: Forces on the links' centres from outside [N], shape (k, 3, n); None for none.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Steps(Sequence[Step]):
         link_count: int,
         joint_count: int,
         obstacles: list[ObstacleContact] | None = None,
+        pushes: FloatArray | None = None,
     ) -> None:
         """Wrap a table.
 
@@ -55,8 +57,10 @@ class Steps(Sequence[Step]):
             link_count: n.
             joint_count: m.
             obstacles: What touches obstacles, one entry a step; nothing by default.
+            pushes: Forces on the links' centres from outside [N], shape (k, 3, n).
         """
         self.table = table
+        self.pushes = pushes
         self.obstacles = [NO_CONTACT] * len(table) if obstacles is None else obstacles
         self.link_count = link_count
         self.joint_count = joint_count
@@ -78,7 +82,13 @@ class Steps(Sequence[Step]):
 
     def copy(self) -> Steps:
         """The same steps in a table of their own."""
-        return Steps(self.table.copy(), self.link_count, self.joint_count, self.obstacles.copy())
+        return Steps(
+            self.table.copy(),
+            self.link_count,
+            self.joint_count,
+            self.obstacles.copy(),
+            self.pushes,
+        )
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -92,7 +102,11 @@ class Steps(Sequence[Step]):
         """One step, or a stretch of them; views, not copies."""
         if isinstance(index, slice):
             return Steps(
-                self.table[index], self.link_count, self.joint_count, self.obstacles[index]
+                self.table[index],
+                self.link_count,
+                self.joint_count,
+                self.obstacles[index],
+                None if self.pushes is None else self.pushes[index],
             )
         step = _fields(self.table[index], self.link_count, self.joint_count)
         return step._replace(obstacles=self.obstacles[index])

@@ -4,6 +4,7 @@ from .field import RandomField
 from .ground import FrictionLaw, Ground
 from .model import World
 from .obstacles import Box, Cylinder, Obstacle, ObstacleMaterial, Target, Wall
+from .push import Push
 
 __all__ = [
     "Box",
@@ -12,6 +13,7 @@ __all__ = [
     "Ground",
     "Obstacle",
     "ObstacleMaterial",
+    "Push",
     "RandomField",
     "Target",
     "Wall",
