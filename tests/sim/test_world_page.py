@@ -20,9 +20,10 @@ from sim import (
 PAGE = (Path(__file__).parents[2] / "docs" / "twin-world.md").read_text()
 
 
-def test_the_example_is_a_scenario():
-    (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
-    scenario = parse_scenario(text, "example.toml")
+def test_the_examples_make_a_scenario():
+    examples = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    scenario = parse_scenario("\n".join(examples), "x.toml")
+    assert [push.link for push in scenario.disturbances] == ["link07"]
     assert len(scenario.world.obstacles) == 10
     assert scenario.sensing.ir.noise_v == 0.058
 
