@@ -142,8 +142,10 @@ class BulletEngine:
         pybullet.setTimeStep(dt, physicsClientId=self._client)
 
     def close(self) -> None:
-        """Free the physics world."""
-        pybullet.disconnect(physicsClientId=self._client)
+        """Free the physics world; safe to call twice."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
 
     def read(self, into: BodyState | None = None) -> BodyState:
         """The present state.

@@ -12,6 +12,8 @@ from capture.errors import UsageError
 from capture.robot import Link
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 from sim.physics.bullet import BulletEngine
+from sim.physics.engine import EngineKind, Kernels, engine_type
+from sim.physics.steps import Steps
 from sim.twin import Twin
 from sim.urdf import frame_origins, urdf
 
@@ -99,6 +101,36 @@ def test_a_thrown_body_flies_a_parabola(make_robot):
     t, dt = 0.5, 1e-3
     assert state.position[2] == pytest.approx(1.0 + 2 * t - 9.81 * t * (t + dt) / 2, abs=1e-12)
     assert not np.abs(state.spin).max() > 1e-9
+
+
+@pytest.mark.parametrize("kind", EngineKind)
+@pytest.mark.parametrize("kernels", Kernels)
+def test_an_engine_may_be_closed_twice(make_robot, kind, kernels):
+    start = {"height": 1, "heading": 0, "velocity": (0, 0, 0)}
+    body = engine_type(kind, kernels)(make_robot(3), gravity=(0, 0, 0), dt=1e-3, **start)
+    other = engine_type(kind, kernels)(make_robot(4), gravity=(0, 0, 0), dt=1e-3, **start)
+    body.close()
+    body.close()
+    assert other.read().position.shape == (3, 4)  # nobody else's world was freed
+    other.close()
+
+
+def test_steps_are_views_of_one_table():
+    steps = Steps.empty(4, 3, 2)
+    steps.table[:] = np.arange(steps.table.size).reshape(steps.table.shape)
+    stacked = steps.stacked
+    for k, step in enumerate(steps):
+        for group, all_of_it in zip(step[:4], stacked[:4], strict=True):
+            for field, all_times in zip(group, all_of_it, strict=True):
+                assert np.shares_memory(field, steps.table)
+                np.testing.assert_array_equal(field, all_times[k])
+    # Every number of a row is in one field.
+    fields = [field.ravel() for group in steps[1][:4] for field in group]
+    assert sorted(np.concatenate(fields)) == steps.table[1].tolist()
+    part = steps[1:3].copy()
+    part.table[:] = 0.0
+    assert len(part) == 2
+    assert steps.table[1:].all()
 
 
 def test_the_engine_cannot_hold_every_robot(make_robot):
