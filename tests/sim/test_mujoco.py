@@ -45,12 +45,16 @@ def apart(ones, others):
     return max(np.abs(a.step.body.position - b.step.body.position).max() for a, b in pairs)
 
 
-@pytest.mark.parametrize("law", FrictionLaw)
 @pytest.mark.parametrize(
-    "gait",
+    ("gait", "law"),
     [
-        pytest.param(LATERAL, id="lateral"),
-        pytest.param(SIDEWINDING, id="sidewinding", marks=pytest.mark.slow),
+        pytest.param(LATERAL, FrictionLaw.ELLIPSE, id="lateral-ellipse"),
+        *(
+            pytest.param(gait, law, id=f"{name}-{law}", marks=pytest.mark.slow)
+            for name, gait in (("lateral", LATERAL), ("sidewinding", SIDEWINDING))
+            for law in FrictionLaw
+            if (gait, law) != (LATERAL, FrictionLaw.ELLIPSE)
+        ),
     ],
 )
 def test_engines_agree_after_six_seconds_on_the_ground(make_scenario, make_robot, law, gait):

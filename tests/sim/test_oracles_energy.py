@@ -87,11 +87,25 @@ def folding(make_robot, make_scenario):
 @pytest.mark.parametrize(
     "servo",
     [
-        {"stall_torque": 0.25, "gear_stiffness": 10.0, "gear_damping": 0.2},
-        {"stall_torque": 1.5, "gear_stiffness": 20.0, "gear_damping": 0.02},
-        {"stall_torque": 0.5, "torque_constant": 0.3, "coulomb_friction": 0.1, "gear_damping": 0.5},
+        pytest.param(
+            {"stall_torque": 0.25, "gear_stiffness": 10.0, "gear_damping": 0.2}, id="weak"
+        ),
+        pytest.param(
+            {"stall_torque": 1.5, "gear_stiffness": 20.0, "gear_damping": 0.02},
+            id="strong",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {
+                "stall_torque": 0.5,
+                "torque_constant": 0.3,
+                "coulomb_friction": 0.1,
+                "gear_damping": 0.5,
+            },
+            id="sticky",
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["weak", "strong", "sticky"],
 )
 def test_every_flow_and_store_of_the_joints_is_exact(folding, servo):
     parameters, whole = folding(4000, **servo)

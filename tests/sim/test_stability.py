@@ -49,7 +49,7 @@ def largest(scenario):
     return max(use.share for use in stability(scenario).values())
 
 
-@pytest.mark.parametrize("links", [2, 3, 7])
+@pytest.mark.parametrize("links", [2, 5])
 @pytest.mark.parametrize("planar", [True, False], ids=["planar", "alternating"])
 def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
     # k_g and c_g in proportion, and the motor's damping small: so is the share.
@@ -65,7 +65,6 @@ def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
     assert likely_cause(scaled(1.03)).startswith("likely cause: servo.gear_damping is too stiff")
 
 
-@pytest.mark.parametrize("links", [2, 5])
 @pytest.mark.parametrize(
     ("ground", "name"),
     [
@@ -76,13 +75,13 @@ def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name, links):
+def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name):
     # Thrown flat on the ground with a little speed all ways.
     def scaled(share, one=1.0):
         field = {name: getattr(ground, name) * share / one}
         world = World(velocity=(1e-4, 1e-4, -1e-4), ground=dataclasses.replace(ground, **field))
         gear = {"gear_stiffness": 1.0, "gear_damping": 1e-4}
-        return nudged(links, planar=False, world=world, **gear)
+        return nudged(3, planar=False, world=world, **gear)
 
     one = largest(scaled(1.0))
     calm, wild = scaled(0.95, one), scaled(1.05, one)
