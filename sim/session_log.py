@@ -11,6 +11,7 @@ the same bytes.
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -174,6 +175,10 @@ class SessionLog:
         """Say what deserves saying about a sample."""
         if sample.tick == round(self._scenario.settle_s * CONTROL_RATE_HZ):
             self.say("info", f"settled: {self._scenario.settle_s:g} s have passed")
+        target = self._scenario.world.target
+        head = sample.step.body.position[:2, 0]
+        if target is not None and math.dist(head, target.position) <= target.radius:
+            self.say("info", "the head has met the target")
         for name in sample.gait.clamped:
             self.say("warn", f"{name} clamped to the joint limits")
         angle = sample.step.body.angle

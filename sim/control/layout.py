@@ -11,8 +11,6 @@ from capture.arrays import BoolArray, FloatArray
 from capture.robot import Robot, Sensor, SensorKind
 
 _RANGING = (SensorKind.IR, SensorKind.SONAR)
-_AHEAD = math.radians(15.0)
-"""A head sensor within this of straight ahead looks at neither side."""
 _SIDEWAYS = math.radians(22.5)
 """A sensor within this of square to the body looks sideways."""
 
@@ -35,25 +33,16 @@ class Layout:
     """The roles of a robot's range sensors.
 
     Attributes:
-        ahead: Names of those that look straight ahead from the head.
-        left: Of those that look ahead and to the left.
-        right: Of those that look ahead and to the right.
+        head: Names of those that look ahead from the first link.
         tail: Of those on the last link.
         sides: Those that look sideways, with the joints beside them.
         fold_m: Name to the distance below which a sensor folds back [m], 0 if it does not.
     """
 
-    ahead: tuple[str, ...]
-    left: tuple[str, ...]
-    right: tuple[str, ...]
+    head: tuple[str, ...]
     tail: tuple[str, ...]
     sides: tuple[SideSensor, ...]
     fold_m: dict[str, float]
-
-    @property
-    def head(self) -> tuple[str, ...]:
-        """Names of all that look ahead."""
-        return self.ahead + self.left + self.right
 
 
 def layout(robot: Robot) -> Layout:
@@ -75,12 +64,9 @@ def layout(robot: Robot) -> Layout:
     sideways = [s for s in sensors if abs(abs(bearings[s.name]) - math.pi / 2) <= _SIDEWAYS]
     others = [sensor for sensor in sensors if sensor not in sideways]
     first, last = robot.links[0].name, robot.links[-1].name
-    head = {s.name: bearings[s.name] for s in others if s.link == first}
-    head = {name: angle for name, angle in head.items() if abs(angle) < math.pi / 2}
+    head = [s.name for s in others if s.link == first and abs(bearings[s.name]) < math.pi / 2]
     return Layout(
-        ahead=tuple(name for name, angle in head.items() if abs(angle) <= _AHEAD),
-        left=tuple(name for name, angle in head.items() if angle > _AHEAD),
-        right=tuple(name for name, angle in head.items() if angle < -_AHEAD),
+        head=tuple(head),
         tail=tuple(s.name for s in others if s.link == last and s.name not in head),
         sides=tuple(
             side

@@ -57,8 +57,7 @@ def driven(gait, seconds, ranges):
 
 def test_every_sensor_of_the_shipped_robot_has_its_role():
     roles = layout(SNAKE)
-    assert set(roles.ahead) == {"ir01", "sonar"}
-    assert (roles.left, roles.right) == (("ir02",), ("ir03",))
+    assert roles.head == ("ir01", "ir02", "ir03", "sonar")
     assert roles.tail == ("ir14", "ir15")
     beside = {side.name: (np.flatnonzero(side.beside) + 1).tolist() for side in roles.sides}
     # Every fourth link has a pair; the joints go to the nearest, two links and a half at most.
@@ -87,7 +86,7 @@ def test_roles_follow_from_the_description_of_any_robot(make_robot):
         ),
     )
     roles = layout(robot)
-    assert (roles.ahead, roles.left, roles.right) == (("ir01",), (), ())
+    assert roles.head == ("ir01",)
     assert roles.tail == ("ir07",)
     beside = {side.name: (np.flatnonzero(side.beside) + 1).tolist() for side in roles.sides}
     # Noses at 0: ir03 at 0.03 m, ir04 at 0.31 m, half their gap 0.14 m; joint i at 0.06 i m.
