@@ -8,8 +8,10 @@ their device times are the sampling times.
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,7 +142,7 @@ class VirtualRobot:
             UsageError: If the engine cannot hold the robot.
         """
         last = -1
-        with Twin(self._scenario, self) as self._twin:
+        with Twin(self._scenario, self) as self._twin, _quick_collections():
             ready()
             try:
                 for sample in self._twin.samples():
@@ -278,3 +280,14 @@ class VirtualRobot:
         """Some joints by name."""
         names = [n for n, is_one in zip(self._robot.joint_names, chosen, strict=True) if is_one]
         return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+
+
+@contextmanager
+def _quick_collections() -> Generator[None]:
+    """Garbage is looked for among new objects only: all of them at once take longer than a tick."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
