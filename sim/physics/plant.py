@@ -73,7 +73,7 @@ class Plant:
     @property
     def now(self) -> Step:
         """The present instant, in arrays of its own."""
-        return self._period[:1].copy()[0]
+        return self._period.taken(0)
 
     def command(self, reference: FloatArray) -> None:
         """Give the servos a command, which they hold until the next.

@@ -80,6 +80,30 @@ class Steps(Sequence[Step]):
         width = 22 * link_count + 7 * joint_count
         return cls(np.zeros((count, width)), link_count, joint_count)
 
+    @property
+    def motion(self) -> FloatArray:
+        """Joint angles and rates of all steps, a view, shape (k, 2, m)."""
+        start, m = 13 * self.link_count, self.joint_count
+        return self.table[:, start : start + 2 * m].reshape(-1, 2, m)
+
+    @property
+    def drives(self) -> FloatArray:
+        """Voltages, currents and torques of all steps, a view, shape (k, 3, m)."""
+        m = self.joint_count
+        return self.table[:, -3 * m :].reshape(-1, 3, m)
+
+    def taken(self, k: int) -> Step:
+        """One step, in arrays of its own.
+
+        Args:
+            k: Its row.
+
+        Returns:
+            A copy.
+        """
+        step = _fields(self.table[k].copy(), self.link_count, self.joint_count)
+        return step._replace(obstacles=self.obstacles[k])
+
     def copy(self) -> Steps:
         """The same steps in a table of their own."""
         return Steps(

@@ -35,7 +35,7 @@ class _Period(NamedTuple):
 
     Attributes:
         motion: Angles and rates at the n + 1 instants, shape (n + 1, 2, m).
-        drive: Torque, current and voltage during the n steps, shape (n, 3, m).
+        drive: Voltage, current and torque during the n steps, shape (n, 3, m).
     """
 
     motion: FloatArray
@@ -86,11 +86,8 @@ class JointPolling:
         Returns:
             The cycle that started one control period before it, once there is one.
         """
-        body, drive = steps.stacked.body, steps.stacked.drive
-        motion = np.stack([body.angle, body.rate], axis=1)
-        acting = np.stack([drive.torque, drive.current, drive.voltage], axis=1)[:-1]
         self._first += len(self._kept) == self._kept.maxlen
-        self._kept.append(_Period(motion, acting))
+        self._kept.append(_Period(steps.motion, steps.drives[:-1]))
         return [self._sample()] if self._next < self._ended else []
 
     def flush(self) -> list[JointSample]:
@@ -126,12 +123,12 @@ class JointPolling:
         if self._at_once:  # at a step, so nothing is to be interpolated
             position, velocity = motion[start]
             first, last = max(start - n // 2, 0), min(start + n // 2, end)
-            effort, current, voltage = drive[first:last].sum(axis=0) / (last - first)
+            voltage, current, effort = drive[first:last].sum(axis=0) / (last - first)
         else:
             position, velocity = _between(motion, at)
             summed = np.concatenate([np.zeros((1, *drive.shape[1:])), np.cumsum(drive, axis=0)])
             lower, upper = np.maximum(at - n / 2, 0.0), np.minimum(at + n / 2, end)
-            effort, current, voltage = (_between(summed, upper) - _between(summed, lower)) / (
+            voltage, current, effort = (_between(summed, upper) - _between(summed, lower)) / (
                 upper - lower
             )
         reported = np.array([position, velocity, effort])
