@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -39,6 +39,19 @@ from .windows import Stretch, whole_cycles
 _NS = 1e9
 
 
+@dataclass(frozen=True)
+class Examined:
+    """One session's numbers, and the fit that an experiment of several sessions builds on.
+
+    Attributes:
+        analysis: The numbers.
+        gait: The fitted gait, or None.
+    """
+
+    analysis: Analysis
+    gait: GaitFit | None
+
+
 def analyse_session(session: Session, options: Options | None = None) -> Analysis:
     """Compute everything that one session can tell.
 
@@ -48,6 +61,24 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
 
     Returns:
         The result. What can't be computed is None, and a warning says why.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
+    return examine_session(session, options).analysis
+
+
+def examine_session(session: Session, options: Options | None = None) -> Examined:
+    """Compute what one session tells, and keep the fit.
+
+    Args:
+        session: An open session.
+        options: What the user chose; the defaults choose by themselves.
+
+    Returns:
+        The result and the fitted gait.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.
@@ -83,7 +114,7 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
     _warn_flags(joints, gait, warn)
     body = body_motion(session, responses, gait, span, warn)
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
-    return Analysis(
+    analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,
             path=str(session.path),
@@ -100,6 +131,7 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
         warnings=(*session.warnings, *warnings),
         provenance=_provenance(session, options),
     )
+    return Examined(analysis, gait)
 
 
 def _series(

@@ -18,12 +18,9 @@ from scipy.special import chdtr, chndtrinc, fdtrc, ndtri, stdtr
 
 from capture.arrays import FloatArray
 
+from .equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from .response import CONFIDENCE, Response, around, t_factor
 from .result import Index, Interval
-
-EQUIVALENT_GAIN = 0.02
-EQUIVALENT_LAG_RAD = np.pi / 180
-"""Default margins of the equivalence test: 2 % in gain, 1 degree in lag."""
 
 ENDS = 2
 MIDDLE = 5
@@ -268,16 +265,10 @@ def _t_p(value: float, error: float, dof: float) -> float:
 def _equivalence(
     deviation: FloatArray, variance: FloatArray, dof: FloatArray, margin: float
 ) -> tuple[float, None, float]:
-    """Two one-sided tests (Schuirmann 1987) that every joint is within a margin of the mean.
-
-    Claimed for all joints at once, so the largest p counts and needs no correction (intersection
-    union test, Berger 1982).
-    """
+    """Largest deviation from the mean, and the equivalence test that all are within a margin."""
     m = deviation.size
     error = np.sqrt(variance * (1 - 2 / m) + variance.sum() / m**2)
-    room = margin - np.abs(deviation)
-    score = np.divide(room, error, out=np.sign(room) * np.inf, where=error > 0)
-    return float(np.max(np.abs(deviation))), None, float(np.max(stdtr(dof, -score)))
+    return float(np.max(np.abs(deviation))), None, equivalence_p(deviation, error, dof, margin)
 
 
 def _cv(values: FloatArray) -> float:
