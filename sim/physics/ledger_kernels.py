@@ -1,4 +1,4 @@
-"""The ledger's sums, compiled: the same as :mod:`sim.physics.ledger`'s within rounding."""
+"""The ledger's sums, compiled: the same as :mod:`sim.physics.energy_flows`'s within rounding."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_joint_flows(
         m: Number of joints.
         servos: :attr:`sim.physics.servo.Servos.table`.
         dt: Step [s].
-        flows: Added to: rows as :data:`sim.physics.ledger.JOINT_TERMS` [J], shape (9, m).
+        flows: Added to: rows as :data:`sim.physics.energy_flows.JOINT_TERMS` [J], shape (9, m).
     """
     for k in range(len(table) - 1):
         rates, rates_after = table[k, 13 * n + m :], table[k + 1, 13 * n + m :]
@@ -59,7 +59,7 @@ def add_ground_flows(
         m: Number of joints.
         stiffness: Of the ground [N/m].
         dt: Step [s].
-        flows: Added to: as :data:`sim.physics.ledger.GROUND_TERMS` [J], shape (3,).
+        flows: Added to: as :data:`sim.physics.energy_flows.GROUND_TERMS` [J], shape (3,).
     """
     start = 13 * n + 2 * m
     for k in range(len(table) - 1):

@@ -15,7 +15,8 @@ from scipy.integrate import solve_ivp
 
 from capture.robot import Link, Plane
 from sim import PlaneGait, Serpentine, World, load_scenario
-from sim.physics.ledger import JOINT_TERMS, TERMS
+from sim.physics.energy_flows import JOINT_TERMS
+from sim.physics.ledger import TERMS
 from sim.twin import Twin
 
 MASS, LENGTH, INERTIA = 0.5, 0.2, 2e-3
