@@ -24,6 +24,7 @@ from capture.sources.contract import SourceAddress, SourceContext
 from capture.sources.events import Tally
 from capture.sources.registry import open_source
 
+from ..garbage import quick_collections
 from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .bus_session import BusSession, NowhereSink, stamped
 from .driven import Driven
@@ -177,6 +178,7 @@ def drive_bus(
             on_tick=on_tick,
         )
         report = BusReport(LoopTally(), lockstep)
+        opened.enter_context(quick_collections())
         begun = time.monotonic()
         try:
             tell.begin()

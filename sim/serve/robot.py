@@ -8,10 +8,8 @@ their device times are the sampling times.
 
 from __future__ import annotations
 
-import gc
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +20,7 @@ from capture.robot import Robot
 from capture.sources.records import records
 
 from ..gait import GaitTick
+from ..garbage import quick_collections
 from ..readings import Readings
 from ..scenario import CONTROL_RATE_HZ, Scenario
 from ..sensing.contract import SensorSample
@@ -142,7 +141,7 @@ class VirtualRobot:
             UsageError: If the engine cannot hold the robot.
         """
         last = -1
-        with Twin(self._scenario, self) as self._twin, _quick_collections():
+        with Twin(self._scenario, self) as self._twin, quick_collections():
             ready()
             try:
                 for sample in self._twin.samples():
@@ -280,14 +279,3 @@ class VirtualRobot:
         """Some joints by name."""
         names = [n for n, is_one in zip(self._robot.joint_names, chosen, strict=True) if is_one]
         return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-
-
-@contextmanager
-def _quick_collections() -> Generator[None]:
-    """Garbage is looked for among new objects only: all of them at once take longer than a tick."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
