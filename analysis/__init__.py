@@ -19,16 +19,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .analyse import analyse_session
+    from .experiment import analyse_experiment
     from .result import Analysis, Estimate, Index, JointResult
+    from .result_experiment import Experiment, Reversal
     from .stretch import Options
     from .table import render
 
 __all__ = [
     "Analysis",
     "Estimate",
+    "Experiment",
     "Index",
     "JointResult",
     "Options",
+    "Reversal",
+    "analyse_experiment",
     "analyse_session",
     "render",
 ]
@@ -36,9 +41,12 @@ __all__ = [
 _HOMES = {
     "Analysis": "result",
     "Estimate": "result",
+    "Experiment": "result_experiment",
     "Index": "result",
     "JointResult": "result",
     "Options": "stretch",
+    "Reversal": "result_experiment",
+    "analyse_experiment": "experiment",
     "analyse_session": "analyse",
     "render": "table",
 }

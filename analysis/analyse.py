@@ -223,14 +223,10 @@ def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Str
 
 def _provenance(session: Session, options: Options) -> Provenance:
     """What makes the same numbers again."""
-    command = ["undulog", "analyse", str(session.path)]
-    chosen = {key: value for key, value in asdict(options).items() if value != _DEFAULTS[key]}
-    for key, value in chosen.items():
-        command += [f"--{key.removesuffix('_s').replace('_', '-')}", str(value)]
     with session.path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return Provenance(
-        command=shlex.join(command),
+        command=shlex.join(["undulog", "analyse", str(session.path), *options.arguments()]),
         versions=base_versions(),
         inputs={str(session.path): digest},
         options={
@@ -244,6 +240,3 @@ def _provenance(session: Session, options: Options) -> Provenance:
             "drag_ratio": drag_ratio(session),
         },
     )
-
-
-_DEFAULTS = asdict(Options())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -36,6 +36,16 @@ class Options:
     stop_s: float | None = None
     command_topic: str = COMMAND_TOPIC
     response_topic: str = RESPONSE_TOPIC
+
+    def arguments(self) -> list[str]:
+        """What to give on the command line for these options, defaults left out."""
+        arguments: list[str] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value != field.default:
+                option = field.name.removesuffix("_s").replace("_", "-")
+                arguments += [f"--{option}", str(value)]
+        return arguments
 
 
 def choose_stretch(session: Session, columns: Columns, options: Options, warn: Warn) -> Stretch:

@@ -256,7 +256,7 @@ def test_the_first_line_is_the_answer_and_the_last_the_method(twin, capsys):
 def test_files_and_options_of_the_verb(twin, tmp_path, capsys):
     out = tmp_path / "result.json"
     assert undulog.run(["analyse", str(twin), str(twin), "-o", str(out)]) == 0
-    assert len(json.loads(out.read_text())) == 2
+    assert len(json.loads(out.read_text())["sessions"]) == 2
     assert f"Result: {out}" in capsys.readouterr().out
     assert undulog.run(["analyse", str(twin), "-o", str(out)]) == 2
     assert "exists already" in capsys.readouterr().err

@@ -1,0 +1,189 @@
+"""Several sessions of one experiment in, one answer out."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from capture import Session
+from capture.environment import base_versions
+from capture.errors import UsageError
+from capture.robot import Robot
+
+from .analyse import Examined, examine_session
+from .coupling import one_gait_coupling
+from .equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
+from .experiment_answer import experiment_answer
+from .experiment_indices import experiment_indices
+from .experiment_runs import (
+    SAME_COMMAND,
+    SAME_FREQUENCY,
+    GaitRun,
+    Role,
+    gait_run,
+    mirror_fault,
+    responses,
+    sort_runs,
+)
+from .reading import Warn
+from .response import CONFIDENCE
+from .result import Analysis, Provenance
+from .result_experiment import Experiment, Reversal, Run
+from .reversal import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
+from .reversal_modules import SIGNIFICANT, reversal_of
+from .reversal_shares import RESAMPLES
+from .stretch import Options
+
+_LOW_FLOOR = 0.01
+"""A p-value that can't go below this leaves little room under the level."""
+
+
+def analyse_experiment(sessions: Iterable[Session], options: Options | None = None) -> Experiment:
+    """Compute what several sessions tell together.
+
+    Args:
+        sessions: Open sessions, each used once and in turn, so they may be opened one by one.
+        options: What the user chose, for each of them.
+
+    Returns:
+        The result. What can't be computed is None, and a warning says why.
+
+    Raises:
+        MissingChannelError: If a session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If there is no session, or the options leave nothing of one.
+    """
+    options = options or Options()
+    examined: list[Examined] = []
+    robots: list[Robot | None] = []
+    for session in sessions:
+        examined.append(examine_session(session, options))
+        robots.append(session.robot)
+    if not examined:
+        raise UsageError("an experiment needs at least one session")
+    warnings: list[str] = []
+    runs = [
+        gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait)
+        for one, robot in zip(examined, robots, strict=True)
+    ]
+    roles, why = sort_runs(runs)
+    for k, reason in why.items():
+        warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
+    chosen = [runs[k] for k in roles]
+    names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
+    ways = list(roles.values())
+    forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
+    robot = robots[next(iter(roles))] if roles else None
+    reversal = None
+    if _both_ways(chosen, ways, names, robot, warnings.append):
+        reversal = reversal_of(names, forward, reverse)
+        _warn_floor(reversal, warnings.append)
+    return Experiment(
+        answer=experiment_answer(reversal, roles),
+        sessions=tuple(one.analysis for one in examined),
+        runs=tuple(_run(k, runs, examined, roles, why) for k in range(len(runs))),
+        heterogeneity=experiment_indices(forward, reverse, reversal),
+        reversal=reversal,
+        coupling=one_gait_coupling(len(names)),
+        warnings=tuple(warnings),
+        provenance=_provenance([one.analysis for one in examined], options),
+    )
+
+
+def _both_ways(
+    runs: Sequence[GaitRun],
+    ways: Sequence[Role],
+    names: Sequence[str],
+    robot: Robot | None,
+    warn: Warn,
+) -> bool:
+    """Whether the reversal test can be made; warns why not, and of what it takes on trust."""
+    counts = {role: sum(way is role for way in ways) for role in Role}
+    if not any(counts.values()):
+        warn("no run with a travelling wave: the reversal test can't be made")
+        return False
+    if min(counts.values()) < MIN_RUNS:
+        warn(
+            f"boundary or module: not separable from {counts[Role.FORWARD]} independent runs with "
+            f"the wave from head to tail and {counts[Role.REVERSE]} from tail to head; record at "
+            "least 6 of each"
+        )
+        return False
+    fault = mirror_fault(robot, runs[0].names)
+    if fault is not None:
+        warn(f"the robot is not its own mirror image, so a profile need not mirror: {fault}")
+        return False
+    if len(names) < 2:
+        warn("fewer than two joints have gain and lag in every run: nothing can be mirrored")
+        return False
+    if len(names) < len(runs[0].names):
+        lost = [name for name in runs[0].names if name not in names]
+        warn(f"without gain and lag at it or its mirror joint in every run: {', '.join(lost)}")
+    if robot is None:
+        warn("no robot description: the log's order of joints is taken as a chain, head to tail")
+    starts = {
+        role: [run.start_ns for run, way in zip(runs, ways, strict=True) if way is role]
+        for role in Role
+    }
+    first, second = sorted(starts.values(), key=min)
+    if max(first) < min(second):
+        warn(
+            "all runs one way come before all runs the other way: warming up looks like a "
+            "difference of direction; let them alternate"
+        )
+    return True
+
+
+def _warn_floor(reversal: Reversal, warn: Warn) -> None:
+    if reversal.p_floor <= _LOW_FLOOR:
+        return
+    never = ", so no difference can be shown" if reversal.p_floor >= SIGNIFICANT else ""
+    warn(
+        f"p can't go below {reversal.p_floor:.2g} with {reversal.forward_runs} + "
+        f"{reversal.reverse_runs} runs{never}; record at least 6 of each"
+    )
+
+
+def _run(
+    k: int,
+    runs: Sequence[GaitRun],
+    examined: Sequence[Examined],
+    roles: Mapping[int, Role],
+    why: Mapping[int, str],
+) -> Run:
+    session = examined[k].analysis.session
+    role = roles.get(k)
+    return Run(
+        session.id,
+        session.path,
+        runs[k].wave,
+        None if role is None else role.value,
+        why.get(k),
+    )
+
+
+def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
+    paths = [one.session.path for one in analyses]
+    return Provenance(
+        command=shlex.join(["undulog", "analyse", *paths, *options.arguments()]),
+        versions=base_versions(),
+        inputs={
+            path: one.provenance.inputs[path] for path, one in zip(paths, analyses, strict=True)
+        },
+        options={
+            **asdict(options),
+            "confidence": CONFIDENCE,
+            "level": SIGNIFICANT,
+            "same_command": SAME_COMMAND,
+            "same_frequency": SAME_FREQUENCY,
+            "most_labellings": MOST_LABELLINGS,
+            "random_labellings": RANDOM_LABELLINGS,
+            "bootstrap_resamples": RESAMPLES,
+            "margin_gain": EQUIVALENT_GAIN,
+            "margin_lag_rad": EQUIVALENT_LAG_RAD,
+        },
+    )

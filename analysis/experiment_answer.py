@@ -1,0 +1,71 @@
+"""The answer of an experiment in one sentence: boundary or module?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from . import formats
+from .experiment_runs import Role
+from .result import Estimate
+from .result_experiment import Reversal
+from .reversal_modules import SIGNIFICANT
+
+
+def experiment_answer(reversal: Reversal | None, roles: Mapping[int, Role]) -> str:
+    """Answer from the reversal.
+
+    Args:
+        reversal: Its result, or None.
+        roles: Of the runs that have one.
+
+    Returns:
+        One sentence without its full stop, intervals in square brackets.
+    """
+    if not roles:
+        return "no gait with a travelling wave in these sessions: nothing to compare"
+    if len(set(roles.values())) == 1:
+        return "one direction only: not separable; record the reverse"
+    if reversal is None:
+        return "both directions, but not separable from these sessions"
+    return _different(reversal) if reversal.p < SIGNIFICANT else _bounded(reversal)
+
+
+def percent(share: Estimate) -> str:
+    """A share with its interval.
+
+    Args:
+        share: 0 to 1.
+
+    Returns:
+        For example ``97 % [91, 99]``; an en dash where it is missing.
+    """
+    return formats.estimate(formats.scaled(share, 100.0), " %", most=1)
+
+
+def _different(reversal: Reversal) -> str:
+    p = formats.p_value(reversal.p)
+    told = f"p {p}" if p.startswith("<") else f"p = {p}"
+    if not reversal.weak:
+        return (
+            f"the two directions differ ({told}), but not as a module would make them: check that "
+            "ground and body are alike fore and aft"
+        )
+    others = len(reversal.weak) - 1
+    also = f"; {others} more pair{'s differ' if others > 1 else ' differs'}, by less"
+    return f"the modules differ: {reversal.weak[0].name} is weak ({told}){also if others else ''}"
+
+
+def _bounded(reversal: Reversal) -> str:
+    bound = (
+        "no module differs from its mirror by more than "
+        f"{formats.number(100 * reversal.gain_bound, 1)} % in gain and "
+        f"{formats.number(math.degrees(reversal.lag_bound_rad), 1)}° in lag"
+    )
+    share = reversal.boundary_share
+    if share.value is None:
+        return f"{bound}: the joints' spread is no more than noise"
+    told = f"share {percent(share)}"
+    if share.ci95 is not None and share.ci95[0] > 0.5:
+        return f"{bound}: the pattern is boundary ({told})"
+    return f"{bound}: boundary or module is still open (boundary {told}); record more runs"

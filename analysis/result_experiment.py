@@ -1,0 +1,173 @@
+"""What several sessions of one experiment say together.
+
+``Experiment.to_dict`` is the object that ``undulog analyse A.mcap B.mcap ... --json`` prints. As in
+:mod:`analysis.result`, what could not be computed is None (null), and ``warnings`` says why.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from .result import Analysis, Coupling, Estimate, Index, Provenance
+
+BLIND = (
+    "blind to what is alike at both joints of a mirror pair and to the middle joint of an odd "
+    "number; for those, swap modules and record again"
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One session's part in the experiment.
+
+    Attributes:
+        id: Session id.
+        path: The file.
+        wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
+        role: ``forward`` (wave from head to tail), ``reverse``, or None where it has none.
+        why: Why it has none.
+    """
+
+    id: str
+    path: str
+    wave: str | None
+    role: str | None
+    why: str | None = None
+
+
+@dataclass(frozen=True)
+class MirrorJoint:
+    """d_i: a joint in the forward runs minus its mirror joint in the reverse runs.
+
+    All intervals of a reversal hold together at 95 %.
+
+    Attributes:
+        name: The joint.
+        mirror: The joint as far from the tail as this one is from the head.
+        log_gain_difference: Of ln gain [1].
+        lag_difference_rad: Positive = the joint is later than its mirror joint [rad].
+        p: Family-wise, of gain and lag together.
+    """
+
+    name: str
+    mirror: str
+    log_gain_difference: Estimate
+    lag_difference_rad: Estimate
+    p: float
+
+
+@dataclass(frozen=True)
+class WeakModule:
+    """A joint that answers less or later than its mirror joint, whichever way the wave runs.
+
+    Attributes:
+        name: The joint.
+        mirror: Its mirror joint.
+        by: ``gain`` or ``lag``: which of them says so more clearly.
+        log_gain_contrast: ln gain of the joint minus that of its mirror joint, mean of both ways.
+        lag_contrast_rad: The same of the lag [rad].
+        p: Family-wise, of the pair.
+    """
+
+    name: str
+    mirror: str
+    by: str
+    log_gain_contrast: Estimate
+    lag_contrast_rad: Estimate
+    p: float
+
+
+@dataclass(frozen=True)
+class Reversal:
+    """Test of H1, that the modules are identical, by running the wave both ways.
+
+    Attributes:
+        forward_runs: Independent runs with the wave from head to tail.
+        reverse_runs: The same from tail to head.
+        statistic: T, the largest studentised difference of all joints, gain and lag.
+        p: Of H1; exact, family-wise.
+        p_floor: The smallest p that so many runs can give.
+        labellings: Ways to deal out the labels.
+        labellings_tried: All of them, or a random subset.
+        joints: In chain order, head to tail.
+        weak: The largest contrast first; empty where none is shown.
+        gain_bound: No joint's gain differs from its mirror's by a larger share (95 %).
+        lag_bound_rad: No joint's lag differs from its mirror's by more (95 %) [rad].
+        equivalence_gain_p: Of 'some pair differs by 2 % or more'.
+        equivalence_lag_p: Of 'some pair differs by 1 degree or more'.
+        module_variance: V_module of ln(response/command), gain and lag together.
+        boundary_variance: V_boundary.
+        noise_variance: Of a mean profile.
+        module_share: V_module / (V_module + V_boundary).
+        boundary_share: The rest.
+        blind: What the test can't see.
+    """
+
+    forward_runs: int
+    reverse_runs: int
+    statistic: float
+    p: float
+    p_floor: float
+    labellings: int
+    labellings_tried: int
+    joints: tuple[MirrorJoint, ...]
+    weak: tuple[WeakModule, ...]
+    gain_bound: float
+    lag_bound_rad: float
+    equivalence_gain_p: float
+    equivalence_lag_p: float
+    module_variance: Estimate
+    boundary_variance: Estimate
+    noise_variance: float
+    module_share: Estimate
+    boundary_share: Estimate
+    blind: str = BLIND
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All numbers of several sessions.
+
+    Attributes:
+        answer: One sentence: boundary or module?
+        sessions: Each session by itself.
+        runs: Each session's part in the experiment, in the same order.
+        heterogeneity: Index name to index, from all runs together.
+        reversal: None where it can't be tested; a warning says why.
+        coupling: Identifiable or not.
+        warnings: One sentence each.
+        provenance: How it was made.
+    """
+
+    answer: str
+    sessions: tuple[Analysis, ...]
+    runs: tuple[Run, ...]
+    heterogeneity: dict[str, Index]
+    reversal: Reversal | None
+    coupling: Coupling
+    warnings: tuple[str, ...]
+    provenance: Provenance
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain JSON values.
+
+        An estimate becomes an object of ``value`` and ``ci95``; each session is the object that
+        it gives by itself.
+
+        Returns:
+            A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
+        """
+        return {
+            "answer": self.answer,
+            "sessions": [session.to_dict() for session in self.sessions],
+            "runs": [dataclasses.asdict(run) for run in self.runs],
+            "heterogeneity": {
+                name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
+            },
+            "reversal": None if self.reversal is None else dataclasses.asdict(self.reversal),
+            "coupling": dataclasses.asdict(self.coupling),
+            "warnings": list(self.warnings),
+            "provenance": dataclasses.asdict(self.provenance),
+        }
