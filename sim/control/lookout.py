@@ -88,7 +88,7 @@ class Lookout:
             if read == self._last.get(name):
                 continue  # the sensor has not measured anew
             self._last[name] = read
-            if math.isfinite(read):
+            if read < math.inf:  # false for NaN; -inf is too near to tell (REP 117)
                 ray = np.array([math.cos(angle), math.sin(angle)])
-                point = pose.place + turned(mount + read * ray, pose.heading)
+                point = pose.place + turned(mount + max(read, 0.0) * ray, pose.heading)
                 self._seen.append((now.time_s, point))

@@ -136,6 +136,7 @@ def test_a_swinging_head_sees_what_is_in_the_way_and_on_which_side():
     assert seen(math.pi / 4, {"ir01": 0.6})[0].nearest == math.inf  # beside the way
     assert seen(0.3, {"ir01": 0.6})[0].left < 0.6
     assert seen(0.3, {"ir01": math.inf, "ir02": math.nan})[0].nearest == math.inf
+    assert seen(0.0, {"sonar": -math.inf})[0].nearest == 0.0  # too near to tell
 
 
 def test_an_echo_is_kept_in_its_place_for_one_swing():
