@@ -120,7 +120,7 @@ class AdaptiveGait:
             wanted = HASTEN
         elif self._shrinking is not None and self._shrinking.shrinking:
             wanted = SHRINK
-        elif abs(self._steering.values[0]) > _TURNING:
+        elif abs(self._steering.offset) > _TURNING:
             wanted = TURN
         if wanted != self._mode and time_s - self._mode_since_s >= _MODE_HOLD_S:
             self._mode, self._mode_since_s = wanted, time_s
