@@ -142,14 +142,12 @@ def test_a_controller_needs_its_sensors_its_target_and_a_horizontal_gait():
     assert "snake13" in told
 
 
-@pytest.mark.parametrize("kind", ["serpentine", "delay-blocks"])
-@pytest.mark.parametrize("controller", list(ControllerKind))
-def test_every_controller_wraps_every_generator(kind, controller):
-    base = BASE.replace("[gait.horizontal]", f'[gait]\nkind = "{kind}"\n[gait.horizontal]')
-    if kind == "delay-blocks":
-        base = base.replace("lag = 0.5", "delay_s = 0.16")
-    scenario = parsed(f'[controller]\nkind = "{controller}"', base)
-    assert build_gait(dataclasses.replace(scenario, controller=None)).names[0] == "horizontal.A"
+@pytest.mark.parametrize("gait", ["flat", "delay-blocks", "oscillators"])
+@pytest.mark.parametrize("kind", list(ControllerKind))
+def test_every_controller_wraps_every_generator(gait, kind):
+    controlled = parsed(f'[controller]\nkind = "{kind}"')
+    scenario = dataclasses.replace(controlled, gait=load_scenario(gait).gait)
+    assert "steer.offset" not in build_gait(dataclasses.replace(scenario, controller=None)).names
     one, two = build_gait(scenario), build_gait(scenario)
     nothing = Readings.nothing(scenario.robot)
     for k in range(5):
