@@ -212,7 +212,8 @@ def label_scores(runs: FloatArray, labels: BoolArray) -> FloatArray:
     """
     plus = labels.astype(np.float64)
     r1, r2 = plus[0].sum(), (1 - plus[0]).sum()
-    centred = runs - runs.mean(axis=-2, keepdims=True)
+    centred = runs - runs[..., :1, :]  # first of all, so that runs that agree give exact zeros
+    centred -= centred.mean(axis=-2, keepdims=True)
     size = np.sqrt(np.sum(centred**2, axis=-2, keepdims=True))
     z = np.divide(centred, size, out=np.zeros_like(centred), where=size > 0)
     # All sums from those of '+' alone: z sums to 0 and its squares to 1.

@@ -22,7 +22,7 @@ from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from .response import CONFIDENCE
 from .result import Estimate, Interval
 
-RESAMPLES = 4_000
+RESAMPLES = 2_000
 
 
 @dataclass(frozen=True)

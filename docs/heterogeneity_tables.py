@@ -1,0 +1,140 @@
+"""The figures of docs/heterogeneity.md: level and power of the reversal test.
+
+``.venv/bin/python docs/heterogeneity_tables.py`` prints them; it takes about two minutes, most of
+it for eight runs of the 25-joint twin.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from analysis import analyse_session
+from analysis.reversal import family_wise_p, label_scores, labellings, mirror_test, parts
+from analysis.reversal_modules import weak_modules
+from capture import Session
+from sim import load_scenario
+from sim.modules import Modules
+from sim.record import record
+
+LEVEL = 0.05
+WAYS = ("weak-servo-pi3", "weak-servo-pi3-reverse")
+WEAK = "joint05"
+
+
+def boundary_pattern(joints):
+    """Response of identical modules that lag more in the middle, and not mirror-symmetric."""
+    place = np.linspace(0.0, 1.0, joints)
+    lag = np.radians(7.5 + 6.2 * np.sin(np.pi * place) + 3.0 * place)
+    return (1.07 - 0.14 * np.sin(np.pi * place)) * np.exp(-1j * lag)
+
+
+def sensed(random, ratio, *, sets, runs, ar=0.0, sigma=0.01, noisy=None):
+    """Responses of runs whose encoders carry noise, fitted over four cycles of 10 samples.
+
+    Args:
+        random: Generator.
+        ratio: Response over command without noise, shape (m,).
+        sets: Experiments.
+        runs: Runs in each.
+        ar: Coefficient of the noise's autoregression; 0 is white.
+        sigma: Its standard deviation [rad]; the commands' amplitude is 0.4 rad.
+        noisy: Index of a joint whose noise is three times as large.
+
+    Returns:
+        ln(response/command), shape (sets, runs, m).
+    """
+    wave = np.exp(-2j * np.pi * 4 * np.arange(40) / 40)
+    noise = random.normal(size=(sets, runs, ratio.size, 40 + 40))
+    if ar:
+        noise = lfilter([(1 - ar**2) ** 0.5], [1.0, -ar], noise)
+    noise = sigma * noise[..., 40:]  # the filter has settled
+    if noisy is not None:
+        noise[:, :, noisy] *= 3
+    return np.log(ratio + 2 / 40 * (noise @ wave) / 0.4)
+
+
+def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
+    """Share of experiments with identical modules in which a difference is claimed."""
+    random = np.random.default_rng(seed)
+    forward = boundary_pattern(joints)
+    labels = labellings(runs, runs)
+    claimed = 0
+    for _ in range(sets // 100):
+        one = sensed(random, forward, sets=100, runs=runs, **noise)
+        other = sensed(random, forward[::-1], sets=100, runs=runs, **noise)
+        claimed += np.count_nonzero(_p(one, other, labels) < LEVEL)
+    return claimed / sets
+
+
+def _p(forward, reverse, labels):
+    """Family-wise p of each of many experiments, shape (sets,)."""
+    runs = parts(np.concatenate([forward, reverse[..., ::-1]], axis=1))
+    return family_wise_p(np.abs(label_scores(runs, labels))).min(axis=-1)
+
+
+def twin_profile(scenario, weakened, folder):
+    """Responses of the yaw joints of the 25-joint twin, one servo weakened by a share."""
+    chosen = load_scenario(scenario)
+    stall = chosen.modules.servo["stall_torque"]
+    modules = Modules(chosen.modules.servo, {WEAK: {"stall_torque": stall * (1 - weakened)}})
+    chosen = dataclasses.replace(chosen, modules=modules, robot=modules.fitted(chosen.robot))
+    path = Path(folder) / f"{scenario}-{weakened:g}.mcap"
+    record(chosen, path)
+    with Session.open(path) as session:
+        joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
+    y = [np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints]
+    return [one.name for one in joints], np.array(y)
+
+
+def power(names, forward, reverse, scatter, *, runs=6, sets=500, seed=1):
+    """Share of experiments in which a difference is found, and in which the right joint is named.
+
+    Args:
+        names: Joints.
+        forward: y without noise, shape (m,).
+        reverse: The same the other way.
+        scatter: Standard deviation of a run's log gain, and of its lag [rad].
+        runs: Runs each way.
+        sets: Experiments.
+        seed: Of the noise.
+
+    Returns:
+        The two shares.
+    """
+    random = np.random.default_rng(seed)
+    found = named = 0
+    for _ in range(sets):
+        draw = random.normal(0.0, scatter, (2, 2, runs, len(names)))
+        noise = draw[0] + 1j * draw[1]
+        test = mirror_test(forward + noise[0], reverse + noise[1])
+        weak = weak_modules(names, test)
+        found += test.p < LEVEL
+        named += bool(weak) and weak[0].name == WEAK
+    return found / sets, named / sets
+
+
+def main():
+    """Print the tables."""
+    print("false positives at 5 %, 13 identical joints, 5000 experiments each")
+    for label, noise in (
+        ("white noise", {}),
+        ("AR(0.9) noise", {"ar": 0.9}),
+        ("white, one joint three times as noisy", {"noisy": 2}),
+    ):
+        print(f"  {label}: {100 * false_positives(13, **noise):.1f} %")
+    print(f"{WEAK} weakened; scatter of a run; difference found; {WEAK} named")
+    with tempfile.TemporaryDirectory() as folder:
+        for weakened in (0.0, 0.05, 0.1, 0.2):
+            (names, forward), (_, reverse) = (twin_profile(way, weakened, folder) for way in WAYS)
+            for scatter in (0.05, 0.1, 0.3, 1.0):
+                found, named = power(names, forward, reverse, np.radians(scatter))
+                print(f"  {100 * weakened:3.0f} %  {scatter:4.2f}°  {found:6.1%}  {named:6.1%}")
+
+
+if __name__ == "__main__":
+    main()
