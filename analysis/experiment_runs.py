@@ -16,6 +16,7 @@ import numpy as np
 from capture.arrays import ComplexArray, FloatArray
 from capture.robot import Robot
 
+from . import formats
 from .fitting import GaitFit
 from .gait import phase_step, wave_name
 from .reading import by_plane
@@ -196,15 +197,17 @@ def _difference(run: GaitRun, model: GaitRun) -> str | None:
     if abs(run.frequency_hz - model.frequency_hz) > SAME_FREQUENCY * model.frequency_hz:
         return f"has {run.frequency_hz:.4g} Hz, {model.label} {model.frequency_hz:.4g} Hz"
     command = run.command if run.wave == model.wave else run.command[::-1]
-    turned = command * np.exp(-1j * np.angle(np.vdot(model.command, command)))
-    deviation = np.abs(turned - model.command) / np.abs(model.command)
+    change: ComplexArray = command / model.command
+    change *= np.exp(-1j * np.angle(change.sum()))
+    change *= np.exp(-1j * np.median(np.angle(change)))  # as if the odd joint weren't there
+    deviation = np.abs(change - 1)
     worst = int(np.argmax(deviation))
     if deviation[worst] <= SAME_COMMAND:
         return None
-    change = turned[worst] / model.command[worst]
     joint = run.names[worst if run.wave == model.wave else -1 - worst]
+    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
+    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
     return (
-        f"commands another gait than {model.label}: at {joint} the amplitude differs by "
-        f"{100 * (abs(change) - 1):+.1f} % and the phase by {np.degrees(np.angle(change)):+.1f} "
-        "degrees"
+        f"commands another gait than {model.label}: at {joint} the amplitude is {percent} % and "
+        f"the phase {degrees} degrees off"
     )

@@ -1,0 +1,226 @@
+"""Several sessions as one experiment: which of them belong, and what is said of them."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+import undulog
+from analysis import analyse_experiment
+from analysis.experiment_runs import mirror_fault
+from analysis.experiment_table import render_experiment
+from capture import Session, SessionWriter, load_robot
+from capture.errors import UsageError
+from capture.robot import Plane
+
+EPOCH_NS = 1_735_689_600_000_000_000
+ROBOT = load_robot("snake25")
+YAW = ROBOT.joint_indices(Plane.HORIZONTAL)
+M = len(YAW)
+PLACE = np.arange(M) / (M - 1)
+BOUNDARY = np.log(0.9 + 0.05 * PLACE) - 1j * (0.1 + 0.1 * np.sin(np.pi * PLACE) + 0.03 * PLACE)
+
+
+def write_run(
+    path,
+    seed,
+    *,
+    wave="head-to-tail",
+    module=0.0,
+    amplitude=0.3,
+    frequency=1.0,
+    step=math.pi / 3,
+    kick=None,
+    sigma=0.003,
+    start_s=0.0,
+):
+    """Four cycles of a wave, answered as ``BOUNDARY`` + ``module`` say, without physics."""
+    rng = np.random.default_rng(seed)
+    ahead = -1 if wave == "head-to-tail" else 1
+    command = amplitude * np.exp(1j * (ahead * step * np.arange(M) + rng.uniform(-np.pi, np.pi)))
+    if kick is not None:
+        command[kick[0]] *= kick[1]
+    identical = BOUNDARY if ahead < 0 else BOUNDARY[::-1]
+    answer = command * np.exp(identical + module)
+    names = ROBOT.joint_names
+    epoch_ns = EPOCH_NS + round(start_s * 1e9)
+    with SessionWriter(path, session_id=f"run{seed}", epoch_ns=epoch_ns, robot=ROBOT) as writer:
+        commands = writer.joint_state("/joint_commands", names, unit="rad")
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        for k in range(round(4 / frequency * 50)):
+            turn = np.exp(2j * np.pi * frequency * k / 50)
+            asked, seen = np.zeros(25), rng.normal(0.0, sigma, 25)
+            asked[YAW] = np.real(command * turn)
+            seen[YAW] += np.real(answer * turn)
+            t_ns = epoch_ns + k * 20_000_000
+            commands.write(t_ns, asked)
+            states.write(t_ns, seen)
+    return path
+
+
+def write_ways(folder, runs=6, **how):
+    """Runs of both ways in turn, as they should be recorded."""
+    return [
+        write_run(
+            folder / f"{wave}-{k}.mcap",
+            1000 + 2 * k + way,
+            wave=wave,
+            start_s=20.0 * (2 * k + way),
+            **how,
+        )
+        for k in range(runs)
+        for way, wave in enumerate(("head-to-tail", "tail-to-head"))
+    ]
+
+
+def experiment(paths):
+    def opened():
+        for path in paths:
+            with Session.open(path) as session:
+                yield session
+
+    return analyse_experiment(opened())
+
+
+@pytest.fixture(scope="module")
+def alike(tmp_path_factory):
+    return write_ways(tmp_path_factory.mktemp("alike"))
+
+
+@pytest.fixture(scope="module")
+def weak(tmp_path_factory):
+    module = np.zeros(M, dtype=complex)
+    module[3] = math.log(0.96) - 0.02j
+    return write_ways(tmp_path_factory.mktemp("weak"), module=module)
+
+
+def test_identical_modules_with_a_boundary_pattern(alike):
+    result = experiment(alike)
+    reversal = result.reversal
+    assert (reversal.forward_runs, reversal.reverse_runs) == (6, 6)
+    assert reversal.p > 0.05
+    assert reversal.weak == ()
+    # What identical modules differ by is 0; what the bound says lies above the noise.
+    error = 0.003 * (2 / 200) ** 0.5 / 0.27 * (2 / 6) ** 0.5
+    assert 2 * error < reversal.lag_bound_rad < 8 * error
+    assert reversal.boundary_share.value > 0.99
+    assert result.answer.startswith("no module differs from its mirror by more than")
+    assert (
+        ": the pattern is boundary (share 9" in result.answer or "(share 100.0 %" in result.answer
+    )
+    assert result.heterogeneity["common_response"].p < 1e-6
+    assert result.heterogeneity["mirror_response"].p == reversal.p
+    assert result.heterogeneity["equivalence_mirror_lag"].p < 0.05
+    assert result.warnings == ()
+
+
+def test_a_weak_module_is_named(weak):
+    result = experiment(weak)
+    assert result.answer == "the modules differ: joint07 is weak (p = 0.002)"
+    (one,) = result.reversal.weak
+    assert (one.name, one.mirror) == ("joint07", "joint19")
+    for estimate, truth in ((one.log_gain_contrast, math.log(0.96)), (one.lag_contrast_rad, 0.02)):
+        low, high = estimate.ci95
+        assert low < truth < high
+        assert high - low < 0.01
+    by_name = {joint.name: joint for joint in result.reversal.joints}
+    assert by_name["joint07"].lag_difference_rad.value == pytest.approx(0.02, abs=0.002)
+    assert by_name["joint19"].lag_difference_rad.value == pytest.approx(-0.02, abs=0.002)
+    assert by_name["joint13"].mirror == "joint13"
+
+
+def test_one_direction_is_not_separable(alike):
+    result = experiment(alike[::2])
+    assert result.answer == "one direction only: not separable; record the reverse"
+    assert result.reversal is None
+    assert result.heterogeneity["module_share"].value is None
+    assert result.heterogeneity["common_response"].p < 1e-6
+    (warning,) = result.warnings
+    assert "6 independent runs with the wave from head to tail and 0 from tail to head" in warning
+
+
+def test_sessions_that_do_not_belong_are_named(alike, tmp_path):
+    odd = {
+        "has 1.2 Hz, head-to-tail-0.mcap 1 Hz": {"frequency": 1.2},
+        "the amplitude is 4.0 % and the phase 0.0 degrees off": {"amplitude": 0.312},
+        "has no travelling wave": {"step": 0.0},
+        "at joint07 the amplitude is 0.0 % and the phase 2.9 degrees off": {
+            "kick": (3, np.exp(0.05j))
+        },
+    }
+    others = [
+        write_run(tmp_path / f"odd{k}.mcap", 100 + k, **how) for k, how in enumerate(odd.values())
+    ]
+    result = experiment([*alike, *others, alike[0]])
+    assert [run.role for run in result.runs[:12]] == ["forward", "reverse"] * 6
+    assert all(run.role is None for run in result.runs[12:])
+    assert (result.reversal.forward_runs, result.reversal.reverse_runs) == (6, 6)
+    for k, said in enumerate(odd):
+        assert said in result.runs[12 + k].why
+        assert any(w.startswith(f"odd{k}.mcap ") for w in result.warnings)
+    assert "a copy is not a run of its own" in result.runs[-1].why
+
+
+def test_runs_that_are_too_few_or_not_in_turn(alike):
+    result = experiment(alike[:6])
+    assert any(
+        "p can't go below 0.1 with 3 + 3 runs, so no difference" in w for w in result.warnings
+    )
+    grouped = experiment([*alike[0:6:2], *alike[7::2]])
+    assert any("let them alternate" in w for w in grouped.warnings)
+    single = experiment(alike[:3])
+    assert single.reversal is None
+    assert single.answer == "both directions, but not separable from these sessions"
+    with pytest.raises(UsageError, match="at least one session"):
+        experiment([])
+
+
+def test_a_robot_that_is_not_its_own_mirror_image():
+    driven = [ROBOT.joint_names[k] for k in YAW]
+    assert mirror_fault(ROBOT, driven) is None
+    assert mirror_fault(None, driven) is None
+    assert "not their own mirror image" in mirror_fault(ROBOT, driven[:-1])
+    alternate = load_robot("snake13")  # 6 + 6 joints: a yaw joint at the head, a pitch joint behind
+    assert "come in another order" in mirror_fault(alternate, alternate.joint_names[::2])
+    links = list(ROBOT.links)
+    links[2] = dataclasses.replace(links[2], mass=2 * links[2].mass)
+    assert "mass or inertia" in mirror_fault(dataclasses.replace(ROBOT, links=tuple(links)), driven)
+
+
+def test_the_json_object(weak, capsys, tmp_path):
+    out = tmp_path / "experiment.json"
+    assert undulog.run(["analyse", *map(str, weak), "--json", "-o", str(out)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert json.loads(out.read_text()) == printed
+    assert list(printed) == [
+        "answer",
+        "sessions",
+        "runs",
+        "heterogeneity",
+        "reversal",
+        "coupling",
+        "warnings",
+        "provenance",
+    ]
+    assert [one["session"]["path"] for one in printed["sessions"]] == [str(path) for path in weak]
+    assert printed["reversal"]["p"] == pytest.approx(2 / 924)
+    assert printed["reversal"]["weak"][0]["name"] == "joint07"
+    assert len(printed["reversal"]["joints"]) == M
+    assert printed["coupling"]["identifiable"] is False
+    assert set(printed["provenance"]["inputs"]) == {str(path) for path in weak}
+    for index in printed["heterogeneity"].values():
+        assert {"value", "ci95", "p", "unit", "label"} == set(index)
+
+
+def test_the_first_line_is_the_answer(weak, alike, capsys):
+    assert undulog.run(["analyse", *map(str, weak)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "12 sessions: the modules differ: joint07 is weak (p = 0.002)."
+    assert any("blind to what is alike at both joints of a mirror pair" in line for line in lines)
+    assert lines[-1].startswith("Method: reversal, 6 + 6 runs")
+    assert "all 924" in lines[-1]
+    text = render_experiment(experiment(alike[::2]), width=80)
+    assert text.startswith("6 sessions: one direction only: not separable; record the reverse.\n")
+    assert max(len(line) for line in text.splitlines()[1:]) <= 80
