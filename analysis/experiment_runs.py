@@ -42,6 +42,7 @@ class GaitRun:
 
     Attributes:
         label: The file's name, for messages.
+        robot: Name of the robot, or None.
         start_ns: When it started [Unix ns].
         names: Driven joints, head to tail, m; none where there is no gait.
         planes: Planes they are in.
@@ -52,6 +53,7 @@ class GaitRun:
     """
 
     label: str
+    robot: str | None
     start_ns: int
     names: tuple[str, ...]
     planes: tuple[str, ...]
@@ -73,20 +75,21 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
     Returns:
         The run.
     """
-    start_ns = analysis.session.start_ns
+    name, start_ns = analysis.session.robot, analysis.session.start_ns
     if gait is None or not gait.driven:
         nothing = np.zeros(0, dtype=np.complex128)
-        return GaitRun(label, start_ns, (), (), 0.0, nothing, None, nothing)
+        return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, nothing)
     count = len(gait.driven)
     command = gait.fit.fundamental[:count]
     ratio = np.full(count, np.nan, dtype=np.complex128)
     known = {joint.name for joint in analysis.joints if joint.gain.value is not None}
     if gait.response is not None:
-        for name, one in zip(gait.answered, gait.response.ratio, strict=True):
-            if name in known:
-                ratio[gait.command_of(name)] = one
+        for joint, one in zip(gait.answered, gait.response.ratio, strict=True):
+            if joint in known:
+                ratio[gait.command_of(joint)] = one
     return GaitRun(
         label=label,
+        robot=name,
         start_ns=start_ns,
         names=gait.driven,
         planes=tuple(by_plane(robot, gait.driven)),
@@ -192,6 +195,8 @@ def _unfit(run: GaitRun) -> str | None:
 
 def _difference(run: GaitRun, model: GaitRun) -> str | None:
     """What makes a run another gait than the model's or its reverse; None if nothing does."""
+    if run.robot != model.robot:
+        return f"is of {run.robot or 'no known robot'}, {model.label} of {model.robot or 'none'}"
     if run.names != model.names:
         return f"drives other joints than {model.label}"
     if abs(run.frequency_hz - model.frequency_hz) > SAME_FREQUENCY * model.frequency_hz:

@@ -35,6 +35,7 @@ def write_run(
     kick=None,
     sigma=0.003,
     start_s=0.0,
+    robot=ROBOT,
 ):
     """Four cycles of a wave, answered as ``BOUNDARY`` + ``module`` say, without physics."""
     rng = np.random.default_rng(seed)
@@ -46,7 +47,7 @@ def write_run(
     answer = command * np.exp(identical + module)
     names = ROBOT.joint_names
     epoch_ns = EPOCH_NS + round(start_s * 1e9)
-    with SessionWriter(path, session_id=f"run{seed}", epoch_ns=epoch_ns, robot=ROBOT) as writer:
+    with SessionWriter(path, session_id=f"run{seed}", epoch_ns=epoch_ns, robot=robot) as writer:
         commands = writer.joint_state("/joint_commands", names, unit="rad")
         states = writer.joint_state("/joint_states", names, unit="rad")
         for k in range(round(4 / frequency * 50)):
@@ -146,6 +147,7 @@ def test_sessions_that_do_not_belong_are_named(alike, tmp_path):
         "has 1.2 Hz, head-to-tail-0.mcap 1 Hz": {"frequency": 1.2},
         "the amplitude is 4.0 % and the phase 0.0 degrees off": {"amplitude": 0.312},
         "has no travelling wave": {"step": 0.0},
+        "is of no known robot, head-to-tail-0.mcap of snake25": {"robot": None},
         "at joint07 the amplitude is 0.0 % and the phase 2.9 degrees off": {
             "kick": (3, np.exp(0.05j))
         },
