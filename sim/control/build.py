@@ -29,8 +29,8 @@ def build_gait(scenario: Scenario) -> Gait:
     robot, controller = scenario.robot, scenario.controller
     if controller is None:
         return generator(scenario.gait, robot)
-    apart = controller.side is not None
-    wave = generator(scenario.gait, robot, per_joint=apart)
+    # A controller bends and shrinks joint by joint, and the log is to hold what each was given.
+    wave = generator(scenario.gait, robot, per_joint=True)
     return AdaptiveGait(wave, controller, _course(scenario), robot)
 
 
