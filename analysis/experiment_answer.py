@@ -43,9 +43,21 @@ def percent(share: Estimate) -> str:
     return formats.estimate(formats.scaled(share, 100.0), " %", most=1)
 
 
+def told_p(p: float) -> str:
+    """A p-value with its name.
+
+    Args:
+        p: 0 to 1.
+
+    Returns:
+        For example ``p = 0.013`` or ``p < 0.001``.
+    """
+    text = formats.p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
 def _different(reversal: Reversal) -> str:
-    p = formats.p_value(reversal.p)
-    told = f"p {p}" if p.startswith("<") else f"p = {p}"
+    told = told_p(reversal.p)
     if not reversal.weak:
         return (
             f"the two directions differ ({told}), but not as a module would make them: check that "

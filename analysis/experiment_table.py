@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import formats
-from .experiment_answer import percent
+from .experiment_answer import percent, told_p
 from .result import Estimate
 from .result_experiment import Experiment, Reversal
 from .reversal_modules import SIGNIFICANT
@@ -74,7 +75,7 @@ def _detail(reversal: Reversal) -> Iterable[str]:
         yield (
             f"{weak.name} against its mirror {weak.mirror}, over both directions: "
             f"{_gain(weak.log_gain_contrast)} in gain, {_lag(weak.lag_contrast_rad)} in lag "
-            f"(p {formats.p_value(weak.p)}, named by {weak.by})."
+            f"({told_p(weak.p)}, named by {weak.by})."
         )
     shares = (reversal.module_share, reversal.boundary_share)
     if shares[0].value is not None:
@@ -86,8 +87,17 @@ def _detail(reversal: Reversal) -> Iterable[str]:
     yield f"The test is {reversal.blind}."
 
 
+def _relative(log_gain: Estimate) -> Estimate:
+    """Gain over gain, less one, in percent."""
+    value, ci95 = log_gain.value, log_gain.ci95
+    return Estimate(
+        None if value is None else 100 * math.expm1(value),
+        None if ci95 is None else (100 * math.expm1(ci95[0]), 100 * math.expm1(ci95[1])),
+    )
+
+
 def _gain(log_gain: Estimate) -> str:
-    return formats.estimate(formats.scaled(log_gain, 100.0), " %", most=2)
+    return formats.estimate(_relative(log_gain), " %", most=2)
 
 
 def _lag(lag_rad: Estimate) -> str:
@@ -99,11 +109,11 @@ def _joint_table(reversal: Reversal) -> Table:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("forward", "reverse"):
+    for name in ("joint", "its mirror"):
         table.add_column(name, no_wrap=True)
     for name in ("gain % (95 %)", "lag° (95 %)", "p"):
         table.add_column(name, justify="right", no_wrap=True)
-    gains = [formats.scaled(one.log_gain_difference, 100.0) for one in reversal.joints]
+    gains = [_relative(one.log_gain_difference) for one in reversal.joints]
     lags = [formats.degrees(one.lag_difference_rad) for one in reversal.joints]
     digits = [formats.decimals_for(column, most=3) for column in (gains, lags)]
     for one, *pair in zip(reversal.joints, gains, lags, strict=True):
