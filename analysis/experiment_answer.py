@@ -71,8 +71,8 @@ def _different(reversal: Reversal) -> str:
 def _bounded(reversal: Reversal) -> str:
     bound = (
         "no module differs from its mirror by more than "
-        f"{formats.number(100 * reversal.gain_bound, 1)} % in gain and "
-        f"{formats.number(math.degrees(reversal.lag_bound_rad), 1)}° in lag"
+        f"{_at_most(100 * reversal.gain_bound)} % in gain and "
+        f"{_at_most(math.degrees(reversal.lag_bound_rad))}° in lag"
     )
     share = reversal.boundary_share
     if share.value is None:
@@ -81,3 +81,9 @@ def _bounded(reversal: Reversal) -> str:
     if share.ci95 is not None and share.ci95[0] > 0.5:
         return f"{bound}: the pattern is boundary ({told})"
     return f"{bound}: boundary or module is still open (boundary {told}); record more runs"
+
+
+def _at_most(bound: float) -> str:
+    """A bound with two digits, rounded up."""
+    digits = formats.decimals_for_values([bound], 2)
+    return formats.number(math.ceil(bound * 10**digits) / 10**digits, digits)

@@ -92,7 +92,8 @@ class Reversal:
         labellings: Ways to deal out the labels.
         labellings_tried: All of them, or a random subset.
         joints: In chain order, head to tail.
-        weak: The largest contrast first; empty where none is shown.
+        weak: The largest contrast first; empty where none is shown. Those after the first may be
+            what it does to its neighbours.
         gain_bound: No joint's gain differs from its mirror's by a larger share (95 %).
         lag_bound_rad: No joint's lag differs from its mirror's by more (95 %) [rad].
         equivalence_gain_p: Of 'some pair differs by 2 % or more'.
