@@ -17,6 +17,7 @@ from capture.sources.contract import (
     SourceEvent,
 )
 
+from .physics.engine import engine_type
 from .scenario import CONTROL_RATE_HZ, Scenario
 from .scenario_file import load_scenario
 from .session_log import SessionLog, session_facts
@@ -172,8 +173,11 @@ def open_twin(address: SourceAddress) -> TwinSource:
     Raises:
         UsageError: If there is no such scenario, or an option is given.
         ScenarioError: If the scenario's file has faults.
+        ImportError: If its engine is not installed.
     """
     if address.options:
         given = ", ".join(address.options)
         raise UsageError(f"{address.text}: a twin takes no options; found {given}")
-    return TwinSource(address, load_scenario(address.rest))
+    scenario = load_scenario(address.rest)
+    engine_type(scenario.engine)  # is told before a recording is begun
+    return TwinSource(address, scenario)

@@ -11,8 +11,8 @@ from ..strict_table import listed
 from .address import parse_address
 from .contract import ENTRY_POINTS, Source, SourceAddress
 
-_EXTRAS = {"twin": "sim"}
-"""Scheme to the extra that brings what it needs."""
+_EXTRAS = {"pybullet": "sim", "mujoco": "mujoco"}
+"""Optional package of a source to the extra that installs it."""
 
 
 def schemes() -> tuple[str, ...]:
@@ -38,7 +38,7 @@ def open_source(address: SourceAddress) -> Source:
     if not found:
         valid = listed(schemes(), address.scheme)
         raise UsageError(f"{address.text!r}: no kind of source {address.scheme!r}; valid: {valid}")
-    return _load(next(iter(found)))(address)
+    return _open(next(iter(found)), address)
 
 
 def open_sources(texts: Iterable[str]) -> list[Source]:
@@ -69,12 +69,11 @@ def open_sources(texts: Iterable[str]) -> list[Source]:
     return [open_source(address) for address in addresses]
 
 
-def _load(entry: EntryPoint) -> Callable[[SourceAddress], Source]:
+def _open(entry: EntryPoint, address: SourceAddress) -> Source:
     try:
-        return cast("Callable[[SourceAddress], Source]", entry.load())
+        return cast("Callable[[SourceAddress], Source]", entry.load())(address)
     except ModuleNotFoundError as error:
-        missing = error.name or entry.module
-        if entry.name not in _EXTRAS or missing.split(".")[0] == entry.module.split(".")[0]:
+        missing = (error.name or "").split(".")[0]
+        if missing not in _EXTRAS:
             raise  # a fault of the installation, not an extra left out
-        verb = f"a source {entry.name}:"
-        raise MissingExtraError(verb, _EXTRAS[entry.name], missing) from error
+        raise MissingExtraError(address.text, _EXTRAS[missing], missing) from error
