@@ -71,8 +71,9 @@ bench: $(READY)  ## speed, as ratios against named peers
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
 
-pictures: demo  ## the pictures of README and manual, from the demo's own session
+pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images
+	$(BIN)/python docs/paper_figures.py out/paper docs/images
 
 lock: $(READY)  ## renew requirements.lock (needs uv on the path)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \
