@@ -9,7 +9,7 @@ those of the sign test, which needs no assumption on how they are spread.
 Seeds 1 to 16 served for tuning. Results are kept in the output file as they come, and runs that it
 holds already are not repeated.
 
-Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--walk-limit 30] [-o FILE.json]
+Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--walk-limit 60] [-o FILE.json]
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def main() -> None:
     parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--follow-limit", type=float, default=90.0, help="longest run [s]")
-    parser.add_argument("--walk-limit", type=float, default=30.0, help="longest run [s]")
+    parser.add_argument("--walk-limit", type=float, default=60.0, help="longest run [s]")
     parser.add_argument("--kernels", choices=list(Kernels), default=Kernels.NUMPY)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/target_following.json"))
     options = parser.parse_args()
