@@ -228,11 +228,11 @@ def family_wise_p(scores: FloatArray) -> FloatArray:
     """Single-step max-T p-values.
 
     Args:
-        scores: |t| of k labellings and c quantities, the observed labelling first, shape
+        scores: abs(t) of k labellings and c quantities, the observed labelling first, shape
             (..., k, c).
 
     Returns:
-        Share of the labellings whose largest |t| reaches each observed |t|, shape (..., c).
+        Share of the labellings whose largest abs(t) reaches each observed abs(t), shape (..., c).
     """
     largest = scores.max(axis=-1)[..., :, None]
     return np.mean(largest >= scores[..., :1, :] * (1 - _TIE), axis=-2)
