@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shlex
 
 import numpy as np
 import pytest
@@ -191,9 +192,26 @@ def test_a_robot_that_is_not_its_own_mirror_image():
     assert "mass or inertia" in mirror_fault(dataclasses.replace(ROBOT, links=tuple(links)), driven)
 
 
+def test_bags_without_a_robot_are_taken_as_a_chain(tmp_path):
+    result = experiment(write_ways(tmp_path, runs=2, robot=None))
+    assert (result.reversal.forward_runs, result.reversal.reverse_runs) == (2, 2)
+    assert result.reversal.p_floor == pytest.approx(2 / 6)
+    assert any(w.startswith("no robot description") for w in result.warnings)
+
+
+def test_nothing_that_travels(tmp_path):
+    standing = [write_run(tmp_path / f"{k}.mcap", k, step=0.0) for k in (1, 2)]
+    result = experiment(standing)
+    assert result.answer.startswith("no gait with a travelling wave")
+    assert (result.reversal, result.heterogeneity["common_response"].value) == (None, None)
+    assert json.dumps(result.to_dict(), allow_nan=False)
+    assert render_experiment(result).startswith("2 sessions: no gait with a travelling wave")
+
+
 def test_the_json_object(weak, capsys, tmp_path):
     out = tmp_path / "experiment.json"
-    assert undulog.run(["analyse", *map(str, weak), "--json", "-o", str(out)]) == 0
+    words = ["analyse", *map(str, weak), "--start", "0.02"]
+    assert undulog.run([*words, "--json", "-o", str(out)]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert json.loads(out.read_text()) == printed
     assert list(printed) == [
@@ -211,6 +229,7 @@ def test_the_json_object(weak, capsys, tmp_path):
     assert printed["reversal"]["weak"][0]["name"] == "joint07"
     assert len(printed["reversal"]["joints"]) == M
     assert printed["coupling"]["identifiable"] is False
+    assert shlex.split(printed["provenance"]["command"]) == ["undulog", *words]
     assert set(printed["provenance"]["inputs"]) == {str(path) for path in weak}
     for index in printed["heterogeneity"].values():
         assert {"value", "ci95", "p", "unit", "label"} == set(index)
