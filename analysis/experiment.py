@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -29,6 +29,9 @@ from .experiment_runs import (
     responses,
     sort_runs,
 )
+from .kick_answer import kick_answer
+from .kick_coupling import kick_coupling
+from .kick_experiment import find_kicks
 from .reading import Warn
 from .response import CONFIDENCE
 from .result import Analysis, Provenance
@@ -70,7 +73,18 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
         gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait)
         for one, robot in zip(examined, robots, strict=True)
     ]
-    roles, why = sort_runs(runs)
+    kicks = find_kicks(runs, [one.gait for one in examined])
+    parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
+    rest = [k for k, part in enumerate(parts) if part in (None, "base")]
+    own_roles, own_why = sort_runs([runs[k] for k in rest])
+    roles = {rest[k]: role for k, role in own_roles.items()}
+    why = {rest[k]: reason for k, reason in own_why.items()}
+    # Kicks around one gait are asked about its coupling; the reversal only if it is there, too.
+    only_kicks = kicks is not None and len(set(roles.values())) < 2
+    if only_kicks:
+        why = {k: reason for k, reason in why.items() if parts[k] is None}
+    told = {k: part for k, part in enumerate(parts) if part is not None}
+    told |= {} if only_kicks else {k: role.value for k, role in roles.items()}
     for k, reason in why.items():
         warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
     chosen = [runs[k] for k in roles]
@@ -79,16 +93,22 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
     robot = robots[next(iter(roles))] if roles else None
     reversal = None
-    if _both_ways(chosen, ways, names, robot, warnings.append):
+    if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
         reversal = reversal_of(names, forward, reverse)
         _warn_floor(reversal, warnings.append)
+    coupling = (
+        one_gait_coupling(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
+    )
     return Experiment(
-        answer=experiment_answer(reversal, roles),
+        answer=kick_answer(coupling) if only_kicks else experiment_answer(reversal, roles),
         sessions=tuple(one.analysis for one in examined),
-        runs=tuple(_run(k, runs, examined, roles, why) for k in range(len(runs))),
+        runs=tuple(
+            _run(one.analysis, run, told.get(k), why.get(k))
+            for k, (one, run) in enumerate(zip(examined, runs, strict=True))
+        ),
         heterogeneity=experiment_indices(forward, reverse, reversal),
         reversal=reversal,
-        coupling=one_gait_coupling(len(names)),
+        coupling=coupling,
         warnings=tuple(warnings),
         provenance=_provenance([one.analysis for one in examined], options),
     )
@@ -148,22 +168,8 @@ def _warn_floor(reversal: Reversal, warn: Warn) -> None:
     )
 
 
-def _run(
-    k: int,
-    runs: Sequence[GaitRun],
-    examined: Sequence[Examined],
-    roles: Mapping[int, Role],
-    why: Mapping[int, str],
-) -> Run:
-    session = examined[k].analysis.session
-    role = roles.get(k)
-    return Run(
-        session.id,
-        session.path,
-        runs[k].wave,
-        None if role is None else role.value,
-        why.get(k),
-    )
+def _run(one: Analysis, run: GaitRun, role: str | None, why: str | None) -> Run:
+    return Run(one.session.id, one.session.path, run.wave, role, why if role is None else None)
 
 
 def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:

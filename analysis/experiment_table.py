@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 
 from . import formats
 from .experiment_answer import percent, told_p
+from .kick_answer import kick_detail
 from .result import Estimate
+from .result_coupling import LocalCoupling
 from .result_experiment import Experiment, Reversal
 from .reversal_modules import SIGNIFICANT
 from .table import UNLIMITED
@@ -55,6 +57,9 @@ def render_experiment(
             prose.print(line, markup=False)
         prose.print()
         wide.print(_joint_table(reversal))
+    if isinstance(experiment.coupling, LocalCoupling):
+        for line in kick_detail(experiment.coupling):
+            prose.print(line, markup=False)
     prose.print()
     wide.print(_run_table(experiment))
     prose.print()
@@ -66,7 +71,8 @@ def render_experiment(
     if not coupling.identifiable:
         record = f" To identify it, record {coupling.record}." if coupling.record else ""
         prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
-    prose.print(_method(reversal), style="dim", markup=False)
+    method = _kick_method(coupling) if isinstance(coupling, LocalCoupling) else _method(reversal)
+    prose.print(method, style="dim", markup=False)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
 
 
@@ -156,6 +162,15 @@ def _by_warning(experiment: Experiment) -> list[tuple[str, str]]:
         (warning, "all sessions" if len(names) == everyone else ", ".join(names))
         for warning, names in said.items()
     ]
+
+
+def _kick_method(coupling: LocalCoupling) -> str:
+    return (
+        f"Method: local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
+        "kick: central differences of each joint's phase and log amplitude, intervals one by one "
+        "at 95 % from the responses' noise (Student's t), those of indices at least 95 %; all four "
+        "matrices with --json."
+    )
 
 
 def _method(reversal: Reversal | None) -> str:

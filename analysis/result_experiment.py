@@ -26,7 +26,8 @@ class Run:
         id: Session id.
         path: The file.
         wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
-        role: ``forward`` (wave from head to tail), ``reverse``, or None where it has none.
+        role: ``forward`` (wave from head to tail), ``reverse``; among kicks ``base``, ``kick`` or
+            ``held-out``; or None where it has none.
         why: Why it has none.
     """
 
@@ -132,12 +133,13 @@ class Experiment:
     """All numbers of several sessions.
 
     Attributes:
-        answer: One sentence: boundary or module?
+        answer: One sentence: boundary or module? Or, of kicks, who follows whom?
         sessions: Each session by itself.
         runs: Each session's part in the experiment, in the same order.
         heterogeneity: Index name to index, from all runs together.
         reversal: None where it can't be tested; a warning says why.
-        coupling: Identifiable or not.
+        coupling: Identifiable or not; from kicks around one gait a
+            :class:`analysis.result_coupling.LocalCoupling`.
         warnings: One sentence each.
         provenance: How it was made.
     """

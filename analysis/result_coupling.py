@@ -1,0 +1,130 @@
+"""What kicks around one gait say of the coupling: frozen values, part of an experiment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .result import Coupling, Estimate
+
+Rows = tuple[tuple[float, ...], ...]
+
+LTI_LABEL = (
+    "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); how far it "
+    "is from that, the nonlinearity says"
+)
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Derivatives, row = responding joint, column = commanded joint.
+
+    Attributes:
+        value: Shape (m, m).
+        standard_error: Same shape.
+        ci95_half: Half widths of the 95 % intervals, one by one (Student's t), same shape.
+    """
+
+    value: Rows
+    standard_error: Rows
+    ci95_half: Rows
+
+
+@dataclass(frozen=True)
+class RowCheck:
+    """A joint's sum over the columns, which a time shift fixes whatever the system.
+
+    Attributes:
+        name: The responding joint.
+        expected: 1 for P, 0 for R.
+        total: With its 95 % interval.
+        standard_error: Of the sum.
+    """
+
+    name: str
+    expected: float
+    total: Estimate
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class Lti:
+    """H and its inverse X, a reading that holds for linear chains only.
+
+    Attributes:
+        label: Says so.
+        real: Real part of H, row = responding joint [rad/rad].
+        imag: Imaginary part of H.
+        condition_number: Of H: what inverting it may multiply relative errors by.
+        asymmetry: ||X - X'|| / ||X|| off the diagonal; 0 = reciprocal.
+        within_1: Share of X's off-diagonal energy within |i - j| <= 1.
+        within_2: Within 2.
+        within_3: Within 3.
+    """
+
+    label: str
+    real: Rows
+    imag: Rows
+    condition_number: float | None
+    asymmetry: Estimate
+    within_1: Estimate
+    within_2: Estimate
+    within_3: Estimate
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A run that was predicted, not used.
+
+    Attributes:
+        session: Its file.
+        size: Largest deviation of a command from the base [rad or log amplitude].
+        error: ||a - predicted|| / ||a||.
+        error_kept: The same of 'each joint keeps its response to its own command'.
+        noise: What the run's noise alone makes of either.
+    """
+
+    session: str
+    size: float
+    error: float
+    error_kept: float
+    noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalCoupling(Coupling):
+    """The answers of all joints to small kicks of each joint's command around one gait.
+
+    ``matrix`` is P, and ``condition_number`` that of the H that is inverted in ``lti``.
+
+    Attributes:
+        joints: Names, head to tail, m.
+        base_runs: Runs of the base gait.
+        kicked_runs: Runs with a kick.
+        P: d psi / d psi_c.
+        R: d ln|a| / d psi_c [1/rad].
+        G: d ln|a| / d ln|c|; None where amplitudes were not kicked.
+        S: d psi / d ln|c| [rad]; None where amplitudes were not kicked.
+        phase_rows: Of P, each sums to 1.
+        gain_rows: Of R, each sums to 0.
+        checks_pass: Whether all sums agree within their errors (family-wise 5 %) or 1e-2.
+        nonlinearity: ||(G - P, S + R)|| / ||(P, R)||; 0 = linear and time-invariant.
+        lti: The linear reading.
+        held_out: Predictions of runs that were not used.
+        valid_to: Largest deviation up to which all of them are predicted at least twice as well
+            as by 'each joint keeps its response'; None where there are none, or the first fails.
+    """
+
+    joints: tuple[str, ...]
+    base_runs: int
+    kicked_runs: int
+    P: Matrix
+    R: Matrix
+    G: Matrix | None
+    S: Matrix | None
+    phase_rows: tuple[RowCheck, ...]
+    gain_rows: tuple[RowCheck, ...]
+    checks_pass: bool
+    nonlinearity: Estimate
+    lti: Lti
+    held_out: tuple[HeldOut, ...]
+    valid_to: float | None
