@@ -43,6 +43,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "sim serve": ("sim.serve.cli:serve", "Be a robot on a bus, in real time."),
     "drive": ("sim.drive.cli:drive", "Drive a gait, a plan or recorded commands."),
     "analyse": ("analysis.cli:analyse", "Numbers: response, energy, spread over the segments."),
+    "plan phase-kicks": ("analysis.plan.cli:phase_kicks", "Commands that tell the coupling."),
+    "plan reversal": ("analysis.plan.cli:reversal", "Commands that tell boundary from module."),
     "report": ("analysis.report.cli:report", "The offline report, one HTML page."),
     "view": ("replay.cli:view", "See a session in Rerun."),
     "info": ("capture.environment:info", "Versions and extras, for a bug report."),
@@ -50,6 +52,7 @@ VERBS: dict[str, tuple[str, str]] = {
 """Verb to the function behind it and its line in the list of verbs."""
 
 _GROUPS = {
+    "plan": "Write the commands of an experiment around a recorded gait.",
     "record": "Record a robot; look after a running recording.",
     "log": "Look after sessions.",
     "sim": "The twin: simulate and record.",

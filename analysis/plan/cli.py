@@ -1,0 +1,118 @@
+"""The verbs ``plan ...``: from a recorded gait to the sessions of commands of an experiment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from capture.console import emit_json
+from capture.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .designs import PlannedRun
+    from .gait_base import BaseGait
+
+
+def phase_kicks(
+    *,
+    like: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    runs: int = 1,
+    settle: float = 10.0,
+    measure: float = 10.0,
+    json: bool = False,
+) -> None:
+    """Write the commands of kicks around a recorded gait, which tell its coupling.
+
+    One run as it is, four of each driven joint (phase +0.05 and -0.05 rad, amplitude +5 and
+    -5 %), three held-out random patterns. Drive each with `undulog drive`, then give all
+    recordings to `undulog analyse`.
+
+    Example: `undulog plan phase-kicks --like run.mcap -o kicks`
+
+    Args:
+        like: A session of the gait.
+        output: Folder for the sessions.
+        runs: How often each of them is run.
+        settle: Time before what is measured [s].
+        measure: Length of what is measured [s].
+        json: Print one JSON object.
+    """
+
+    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+        from .designs import phase_kicks as kicks
+
+        if len(base.driven) < 3:
+            raise UsageError(f"{like}: it drives {len(base.driven)} joints; kicks need at least 3")
+        return kicks(tuple(base.names[k] for k in base.driven), base.amplitude, runs)
+
+    _plan("phase-kicks", like, output, design, (runs, settle, measure), as_json=json)
+
+
+def reversal(
+    *,
+    like: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    runs: int = 6,
+    settle: float = 10.0,
+    measure: float = 10.0,
+    json: bool = False,
+) -> None:
+    """Write the commands of a recorded gait and of its reverse, which tell boundary from module.
+
+    Example: `undulog plan reversal --like run.mcap -o reversal`
+
+    Args:
+        like: A session of the gait.
+        output: Folder for the sessions.
+        runs: Runs each way.
+        settle: Time before what is measured [s].
+        measure: Length of what is measured [s].
+        json: Print one JSON object.
+    """
+
+    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+        from .designs import reversal as both_ways
+
+        return both_ways(base.amplitude, runs)
+
+    _plan("reversal", like, output, design, (runs, settle, measure), as_json=json)
+
+
+def _plan(
+    plan: str,
+    like: Path,
+    folder: Path,
+    design: Callable[[BaseGait], tuple[PlannedRun, ...]],
+    numbers: tuple[int, float, float],
+    *,
+    as_json: bool,
+) -> None:
+    runs, settle_s, measure_s = numbers
+    if runs < 1 or settle_s < 0 or measure_s <= 0:
+        raise UsageError("--runs is at least 1, --settle at least 0, --measure more than 0")
+    from capture import Session
+
+    from .gait_base import base_gait
+    from .write import write_plan
+
+    with Session.open(like) as session:
+        base = base_gait(session)
+        files = write_plan(
+            plan, base, design(base), session, folder, settle_s=settle_s, measure_s=measure_s
+        )
+    if as_json:
+        emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
+        return
+    print(
+        f"{folder}: {plan}, {len(files)} runs of {settle_s + measure_s:g} s, "
+        f"{len(files) * (settle_s + measure_s) / 60:.1f} min in all"
+    )
+    print(
+        "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
+        f"--start {settle_s:g} of all recordings"
+    )

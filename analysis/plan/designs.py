@@ -1,0 +1,78 @@
+"""Which runs an experiment needs, as deviations of the commands from a gait."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from capture.arrays import ComplexArray
+
+KICK = 0.05
+"""Of phase [rad] and of log amplitude."""
+
+HELD_OUT = (0.05, 0.1, 0.15)
+"""Largest random phase of each held-out pattern [rad]."""
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run's commands.
+
+    Attributes:
+        label: For its file name.
+        amplitude: Complex amplitudes of the driven joints' commands [rad], shape (m,).
+        facts: What it is, for its metadata record.
+    """
+
+    label: str
+    amplitude: ComplexArray
+    facts: dict[str, str] = field(default_factory=dict[str, str])
+
+
+def phase_kicks(
+    names: tuple[str, ...], amplitude: ComplexArray, repeats: int = 1, seed: int = 1
+) -> tuple[PlannedRun, ...]:
+    """One run as it is, each joint kicked four ways, and held-out patterns.
+
+    Args:
+        names: Of the m driven joints.
+        amplitude: Of the gait, shape (m,).
+        repeats: How often all of it is run.
+        seed: Of the held-out patterns and of the order.
+
+    Returns:
+        (4 m + 1 + 3) runs a repeat, in random order, so that warming up looks like no kick.
+    """
+    random = np.random.default_rng(seed)
+    runs: list[PlannedRun] = []
+    for _ in range(repeats):
+        once = [PlannedRun("base", amplitude, {"kind": "base"})]
+        for joint, name in enumerate(names):
+            for kind, step in (("phase", KICK * 1j), ("amplitude", KICK)):
+                for sign, word in ((1, "up"), (-1, "down")):
+                    off = np.zeros(len(names), dtype=np.complex128)
+                    off[joint] = sign * step
+                    facts = {"kind": kind, "joint": name, "sign": f"{sign:+d}"}
+                    label = f"{name}-{kind}-{word}"
+                    runs_amplitude = (amplitude * np.exp(off)).astype(np.complex128)
+                    once.append(PlannedRun(label, runs_amplitude, facts))
+        for size in HELD_OUT:
+            turned = amplitude * np.exp(1j * random.uniform(-size, size, len(names)))
+            once.append(PlannedRun("held-out", turned.astype(np.complex128), {"kind": "held-out"}))
+        runs += [once[k] for k in random.permutation(len(once))]
+    return tuple(runs)
+
+
+def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
+    """Runs of a wave and of its reverse, in turn.
+
+    Args:
+        amplitude: Of the gait, head to tail, shape (m,).
+        each: Runs each way.
+
+    Returns:
+        Twice as many runs.
+    """
+    ways = (("as-recorded", amplitude), ("reversed", amplitude[::-1]))
+    return tuple(PlannedRun(way, one, {"kind": way}) for _ in range(each) for way, one in ways)

@@ -1,0 +1,105 @@
+"""Plans: the commands that are written, read back as the experiment they are for."""
+
+import json
+
+import numpy as np
+import pytest
+
+import undulog
+from analysis.kick_runs import Kind, missing_kicks, sort_kicks
+from capture import Session, SessionWriter, load_robot
+from capture.robot import Plane
+
+ROBOT = load_robot("snake25")
+YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]
+EPOCH_NS = 1_735_689_600_000_000_000
+BASE = 0.3 * np.exp(-1j * np.pi / 3 * np.arange(4) + 0.7j)
+
+
+def write_gait(path, amplitude=BASE, overtone=0.0):
+    offset = np.linspace(-0.1, 0.1, 25)
+    names = ROBOT.joint_names
+    with SessionWriter(path, session_id="like", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
+        commands = writer.joint_state("/joint_commands", names, unit="rad")
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        for k in range(300):
+            asked = offset.copy()
+            turn = np.exp(2j * np.pi * 0.8 * k / 50)
+            asked[YAW] += np.real(amplitude * (turn + overtone * turn**2))
+            commands.write(EPOCH_NS + k * 20_000_000, asked)
+            states.write(EPOCH_NS + k * 20_000_000, asked)
+    return path
+
+
+def phasors(path, start_s):
+    """Demodulated over whole cycles, by a plain sum."""
+    with Session.open(path) as session:
+        signals = session.joints("/joint_commands")
+        columns = [signals.signal(name) for name in ROBOT.joint_names]
+        plan = dict(session.metadata["undulog.plan"])
+        started = session.start_ns
+    t = (columns[0].t_ns - started) * 1e-9
+    inside = (t >= start_s - 1e-9) & (t < start_s + 5.0 - 1e-9)  # four cycles of 0.8 Hz
+    values = np.stack([one.values for one in columns])[:, inside]
+    turn = np.exp(-2j * np.pi * 0.8 * t[inside])
+    return 2 * (values @ turn) / turn.size, values.mean(axis=1), plan
+
+
+@pytest.fixture(scope="module")
+def like(tmp_path_factory):
+    return write_gait(tmp_path_factory.mktemp("like") / "like.mcap")
+
+
+def planned(capsys, *words):
+    assert undulog.run(["plan", *map(str, words), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["files"]
+
+
+def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
+    words = ("--like", like, "-o", tmp_path / "kicks", "--settle", 3, "--measure", 5)
+    files = planned(capsys, "phase-kicks", *words)
+    assert len(files) == 4 * 4 + 1 + 3
+    found = [phasors(file, 3.0) for file in files]
+    command = np.stack([one[0][YAW] for one in found])
+    runs = sort_kicks(command)
+    assert (len(runs.base), len(runs.kicks), len(runs.patterns)) == (1, 16, 3)
+    for kind in Kind:
+        assert missing_kicks(list(runs.kicks.values()), kind, "abcd") == ()
+    np.testing.assert_allclose(np.abs(command[runs.base[0]]), 0.3, rtol=1e-5)
+    for k, kick in runs.kicks.items():
+        assert abs(abs(kick.size) - 0.05) < 1e-5
+        plan = found[k][2]
+        assert (plan["plan"], plan["kind"]) == ("phase-kicks", kick.kind.value)
+        assert plan["joint"] == ROBOT.joint_names[YAW[kick.joint]]
+        assert float(plan["sign"]) * kick.size > 0
+        assert plan["run"] == str(k)
+    assert len({one[2]["plan_id"] for one in found}) == 1
+    for _, offset, _ in found:
+        np.testing.assert_allclose(offset, np.linspace(-0.1, 0.1, 25), atol=1e-5)
+
+
+def test_a_reversal_alternates(like, tmp_path, capsys):
+    words = ("--like", like, "-o", tmp_path / "both", "--runs", 2, "--settle", 2, "--measure", 5)
+    files = planned(capsys, "reversal", *words)
+    assert len(files) == 4
+    command = [phasors(file, 2.0)[0][YAW] for file in files]
+    step = np.angle([one[1] / one[0] for one in command])
+    np.testing.assert_allclose(step, np.array([-1, 1, -1, 1]) * np.pi / 3, atol=1e-5)
+
+
+def test_what_is_refused(like, tmp_path, capsys):
+    folder = tmp_path / "kicks"
+    words = ["plan", "phase-kicks", "-o", str(folder), "--like"]
+    assert undulog.run([*words, str(like), "--runs", "0"]) == 2
+    high = write_gait(tmp_path / "high.mcap", amplitude=BASE * 1.65)
+    assert undulog.run([*words, str(high)]) == 2
+    assert "its limits are" in capsys.readouterr().err
+    odd = write_gait(tmp_path / "odd.mcap", overtone=0.1)
+    assert undulog.run([*words, str(odd)]) == 2
+    assert "is no sine" in capsys.readouterr().err
+    assert not folder.exists()
+    short = [str(like), "--settle", "1", "--measure", "1"]
+    assert undulog.run([*words, *short]) == 0
+    assert capsys.readouterr().out.startswith(f"{folder}: phase-kicks, 20 runs of 2 s")
+    assert undulog.run([*words, *short]) != 0
+    assert "exists" in capsys.readouterr().err
