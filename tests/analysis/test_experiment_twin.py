@@ -1,7 +1,10 @@
-"""The reversal test on recorded twins: a short chain on the ground, six runs each way."""
+"""Experiments on recorded twins, a short chain on the ground: six runs each way, and kicks."""
+
+import json
 
 import pytest
 
+import undulog
 from analysis import analyse_experiment
 from capture import Session
 from sim import load_scenario
@@ -102,3 +105,33 @@ def test_the_weak_servo_is_named(answered):
     assert (weak.name, weak.mirror) == ("joint03", "joint05")
     assert weak.lag_contrast_rad.ci95[0] > 0
     assert result.reversal.boundary_share.value > result.reversal.module_share.value
+
+
+def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
+    """From a recorded gait to its coupling, by the verbs: plan, drive, analyse."""
+    (tmp_path / "chain7.toml").write_text(ROBOT)
+    scenario = tmp_path / "wave.toml"
+    scenario.write_text(SCENARIO.format(wave="head-to-tail").replace("0.005", "0.0005"))
+    like, folder = tmp_path / "like.mcap", tmp_path / "kicks"
+    assert undulog.run(["sim", "run", str(scenario), "-o", str(like)]) == 0
+    words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]
+    assert undulog.run(["plan", "phase-kicks", *words]) == 0
+    driven = []
+    for k, commands in enumerate(sorted(folder.glob("*.mcap"))):
+        driven.append(str(tmp_path / f"{k:02d}.mcap"))
+        on = ["--on", f"twin:{scenario}", "-o", driven[-1]]
+        assert undulog.run(["drive", str(commands), *on]) == 0
+    capsys.readouterr()
+    assert undulog.run(["analyse", *driven, "--start", "4", "--json"]) == 0
+    coupling = json.loads(capsys.readouterr().out)["coupling"]
+    assert (coupling["base_runs"], coupling["kicked_runs"]) == (1, 16)
+    # Time shift, whatever the ground does.
+    for rows in ("phase_rows", "gain_rows"):
+        for row in coupling[rows]:
+            assert row["total"]["value"] == pytest.approx(row["expected"], abs=3e-3)
+    # Servos that the ground slows down are no linear chain.
+    assert coupling["nonlinearity"]["ci95"][0] > 0.02
+    assert len(coupling["held_out"]) == 3
+    for one in coupling["held_out"]:
+        assert 2 * one["error"] < one["error_kept"]
+    assert coupling["valid_to"] > 0.1
