@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .analyse import analyse_session
     from .experiment import analyse_experiment
     from .result import Analysis, Estimate, Index, JointResult
+    from .result_coupling import LocalCoupling
     from .result_experiment import Experiment, Reversal
     from .stretch import Options
     from .table import render
@@ -31,6 +32,7 @@ __all__ = [
     "Experiment",
     "Index",
     "JointResult",
+    "LocalCoupling",
     "Options",
     "Reversal",
     "analyse_experiment",
@@ -44,6 +46,7 @@ _HOMES = {
     "Experiment": "result_experiment",
     "Index": "result",
     "JointResult": "result",
+    "LocalCoupling": "result_coupling",
     "Options": "stretch",
     "Reversal": "result_experiment",
     "analyse_experiment": "experiment",

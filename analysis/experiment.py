@@ -30,8 +30,9 @@ from .experiment_runs import (
     sort_runs,
 )
 from .kick_answer import kick_answer
-from .kick_coupling import kick_coupling
+from .kick_coupling import ROW_TOLERANCE, kick_coupling
 from .kick_experiment import find_kicks
+from .kick_runs import MOST_KICK, MOST_PATTERN, SAME
 from .reading import Warn
 from .response import CONFIDENCE
 from .result import Analysis, Provenance
@@ -189,6 +190,10 @@ def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
             "most_labellings": MOST_LABELLINGS,
             "random_labellings": RANDOM_LABELLINGS,
             "bootstrap_resamples": RESAMPLES,
+            "same_kick": SAME,
+            "most_kick": MOST_KICK,
+            "most_pattern": MOST_PATTERN,
+            "row_tolerance": ROW_TOLERANCE,
             "margin_gain": EQUIVALENT_GAIN,
             "margin_lag_rad": EQUIVALENT_LAG_RAD,
         },

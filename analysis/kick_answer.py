@@ -54,13 +54,13 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
     lti = coupling.lti
     if lti.asymmetry.value is not None:
         bands = ", ".join(
-            f"{_percent(share)} within {k}"
+            f"{_percent(share)} within {k} joint{'s' if k > 1 else ''}"
             for k, share in enumerate((lti.within_1, lti.within_2, lti.within_3), start=1)
         )
         yield (
             "Read as a linear time-invariant chain, which it is not unless the nonlinearity is "
             f"small: X = H^-1 (condition number {coupling.condition_number:.3g}) has asymmetry "
-            f"{_percent(lti.asymmetry)}; off-diagonal energy {bands} of the diagonal."
+            f"{_percent(lti.asymmetry)}; off-diagonal energy {bands}."
         )
     for one in coupling.held_out:
         yield (

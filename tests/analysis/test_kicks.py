@@ -183,6 +183,29 @@ def test_the_linear_reading_gives_back_what_was_planted():
             assert share.value == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.parametrize("reciprocal", [True, False])
+def test_the_intervals_of_the_linear_reading_cover(reciprocal):
+    """Also where the truth is zero: a reciprocal chain has no asymmetry, noise has."""
+    H, command = planted(reciprocal=reciprocal)
+    X = np.linalg.inv(H)
+    off = X - np.diag(np.diag(X))
+    truth = [np.linalg.norm(off - off.T) / np.linalg.norm(off)]
+    truth += [
+        (np.linalg.norm(np.triu(np.tril(off, b), -b)) / np.linalg.norm(off)) ** 2 for b in (1, 2, 3)
+    ]
+    kicks = plan(size=0.01)
+    log = run_all(lambda c: H @ c, command, kicks)
+    rng = np.random.default_rng(9)
+    sigma, covered = 1e-4, np.zeros(4)
+    for _ in range(100):
+        noisy = log + sigma * (rng.normal(size=log.shape) + 1j * rng.normal(size=log.shape))
+        P, R, *_ = measure(noisy, kicks, sigma**2, 40.0)
+        reading = lti_reading(P, R, H @ command, command)
+        told = (reading.asymmetry, *reading.band_energy)
+        covered += [one.ci95[0] <= t <= one.ci95[1] for one, t in zip(told, truth, strict=True)]
+    assert covered.min() >= 95  # conservative by construction
+
+
 def test_an_asymmetric_p_is_not_directed_coupling():
     H, command = planted(reciprocal=True)
     kicks = plan(size=1e-4)
