@@ -1,6 +1,6 @@
 """How each joint's motion answers every joint's command, locally around one gait.
 
-With a_i = |a_i| exp(j psi_i) the response and c_j the command, one joint's command at a time is
+With ``a_i = |a_i| exp(j psi_i)`` the response and c_j the command, one joint's command at a time is
 kicked, up and down, and central differences give four m x m matrices::
 
     P = d psi / d psi_c      S = d psi / d ln|c|

@@ -56,7 +56,7 @@ class Lti:
         imag: Imaginary part of H.
         condition_number: Of H: what inverting it may multiply relative errors by.
         asymmetry: ||X - X'|| / ||X|| off the diagonal; 0 = reciprocal.
-        within_1: Share of X's off-diagonal energy within |i - j| <= 1.
+        within_1: Share of the off-diagonal energy of X within abs(i - j) <= 1.
         within_2: Within 2.
         within_3: Within 3.
     """
