@@ -1,7 +1,7 @@
 """The paper's controllers in the twin: what its figures show, measured from the log."""
 
 import dataclasses
-import importlib.util
+import importlib
 import math
 from pathlib import Path
 
@@ -137,18 +137,16 @@ def test_reckoning_and_course_lead_to_a_target_on_free_ground():
     assert np.nanmax(np.hypot(*(told - true).T)) < 0.05 * way
 
 
-def bench():
-    """The study's own script."""
-    path = Path(__file__).parents[2] / "bench" / "target_following.py"
-    spec = importlib.util.spec_from_file_location("target_following", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def study(monkeypatch):
+    """The study's own script, where its worker processes find it too."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "bench"))
+    return importlib.import_module("target_following")
 
 
-def test_the_median_interval_covers_as_often_as_it_says():
+def test_the_median_interval_covers_as_often_as_it_says(study):
     """Exact: the order statistics of 30 values cover their median in 1 - 2 P(X <= 9) of cases."""
-    median_interval, random = bench().median_interval, np.random.default_rng(4)
+    median_interval, random = study.median_interval, np.random.default_rng(4)
     hits = 0
     for _ in range(2000):
         median, low, high = median_interval(random.exponential(1.0, 30).tolist())
@@ -160,9 +158,8 @@ def test_the_median_interval_covers_as_often_as_it_says():
 
 
 @pytest.mark.slow
-def test_following_beats_walking_at_random_on_fresh_seeds():
+def test_following_beats_walking_at_random_on_fresh_seeds(study):
     """Six of the study's thirty seeds; walks are cut at 30 s, so the ratios are lower bounds."""
-    study = bench()
     limits_s = {"target-following": 90.0, "random-walk": 30.0}
     results = study.study(list(range(101, 107)), limits_s, 2, "numpy", None)
     told = study.summary(results)
