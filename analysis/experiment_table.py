@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from .result import Estimate
 from .result_coupling import LocalCoupling
 from .result_experiment import Experiment, Reversal
 from .reversal_modules import SIGNIFICANT
-from .table import UNLIMITED
+from .table import UNLIMITED, sheet
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -34,17 +33,7 @@ def render_experiment(
     Returns:
         Several lines, the last one ended.
     """
-    from rich.console import Console
-
-    text = StringIO()
-
-    def console(columns: int) -> Console:
-        system = "standard" if color else None
-        return Console(
-            file=text, width=columns, color_system=system, force_terminal=color, highlight=False
-        )
-
-    prose, wide = console(max(width, 40)), console(UNLIMITED)
+    text, prose, wide = sheet(width, color=color)
     count = len(experiment.sessions)
     wide.print(
         f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.",

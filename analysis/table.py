@@ -12,10 +12,34 @@ from .answer import answer
 from .result import Analysis, BodyResult, Estimate, Index, JointResult
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 UNLIMITED = 10_000
 """A width at which nothing wraps."""
+
+
+def sheet(width: int, *, color: bool) -> tuple[StringIO, Console, Console]:
+    """Where a result is set.
+
+    Args:
+        width: Columns of the terminal.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        The text, what writes sentences into it, wrapped, and what writes lines of any width.
+    """
+    from rich.console import Console
+
+    text = StringIO()
+
+    def console(columns: int) -> Console:
+        system = "standard" if color else None
+        return Console(
+            file=text, width=columns, color_system=system, force_terminal=color, highlight=False
+        )
+
+    return text, console(max(width, 40)), console(UNLIMITED)
 
 
 def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -> str:
@@ -29,17 +53,7 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     Returns:
         Several lines, the last one ended.
     """
-    from rich.console import Console
-
-    text = StringIO()
-
-    def console(columns: int) -> Console:
-        system = "standard" if color else None
-        return Console(
-            file=text, width=columns, color_system=system, force_terminal=color, highlight=False
-        )
-
-    prose, wide = console(max(width, 40)), console(UNLIMITED)
+    text, prose, wide = sheet(width, color=color)
     name, told = Path(analysis.session.path).name, answer(analysis)
     wide.print(f"{name}: {told.sentence}", style="bold", markup=False)
     prose.print(told.detail, markup=False)
