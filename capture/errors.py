@@ -10,6 +10,7 @@
     |- RobotFileError (ValueError)          a robot description with faults, all listed
     |- ScenarioError (ValueError)           a scenario file with faults, all listed
     |- PlanError (ValueError)               a drive plan with faults, all listed
+    |- NullModelError (ValueError)          a null model with faults, all listed
     |- SimulationError (ArithmeticError)    the twin blew up: time, link and likely cause
     |- DataError (ValueError)               samples unfit for what was asked
     |- SourceError                          a source that can't be opened or used
@@ -128,6 +129,12 @@ class PlanError(FaultyFileError):
     """A plan of what to drive, with faults."""
 
     kind = "plan"
+
+
+class NullModelError(FaultyFileError):
+    """A model of identical modules, with faults."""
+
+    kind = "null model"
 
 
 class SettingsError(UsageError):

@@ -23,6 +23,9 @@ from .read_ahead import Piece, ahead, helpers
 from .storage import LogFile
 
 ARENA_SIZE = 8 << 20
+SAME_SIZE = 9 << 18
+"""Bytes of blocks of one channel that share a buffer: about what a core's own cache holds. They
+have so many messages of a topic that more would save nothing."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +92,17 @@ def filled_arenas(
 def _runs(log_file: LogFile, blocks: Sequence[Block]) -> Iterator[list[Placed] | Block]:
     """Blocks that share a buffer, with their places in it, or one that comes alone."""
     run: list[Placed] = []
-    at = 0
+    at, former = 0, None
     for block in blocks:
         shares = log_file.inflates(block, ARENA_SIZE)
-        if run and not (shares and at + block.size <= ARENA_SIZE):
+        only = next(iter(block.index_at)) if len(block.index_at) == 1 else None
+        most = ARENA_SIZE if only is None else min(SAME_SIZE, ARENA_SIZE)
+        if run and not (shares and only == former and at + block.size <= most):
             yield run
             run, at = [], 0
         if shares:
             run.append(Placed(block, at, at + block.size))
-            at += block.size
+            at, former = at + block.size, only
         else:
             yield block
     if run:

@@ -19,8 +19,11 @@ from .storage import LogFile
 
 _START = struct.Struct("<BQ")  # of a record: opcode, length
 _START_KIND = np.dtype(f"V{_START.size}")
+_CHANNEL_START = struct.Struct("<BQH")  # of a message: opcode, length, channel
+_CHANNEL_START_KIND = np.dtype(f"V{_CHANNEL_START.size}")
 _LOG_TIME_AT = 15
 _LOG_TIME_KIND = np.dtype("<i8")
+_FAR = 1 << 62
 _LARGEST_COPIED = 2048
 """Records up to this many bytes are copied whole, before anything of them is looked at: then they
 lie side by side in the cache."""
@@ -85,7 +88,7 @@ def record_batches(
         A buffer, which is overwritten when the next is asked for, and the records of each topic.
     """
     ids = list(itertools.chain.from_iterable(wanted))
-    for data, placed in filled_arenas(log_file, ids, blocks, warn, threads):
+    for data, placed in filled_arenas(log_file, ids, _in_groups(blocks, wanted), warn, threads):
         try:
             found = _records(log_file, data, placed, wanted)
         except LogError:  # which block is it? the others are read
@@ -100,6 +103,22 @@ def record_batches(
             yield data, found
 
 
+def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequence[Block]:
+    """Blocks in an order that has those of one topic together, where topics don't share blocks.
+
+    Their records then come many at a time, and evenly spaced. The blocks of each topic stay in
+    file order.
+    """
+    topic_of = {channel_id: k for k, ids in enumerate(wanted) for channel_id in ids}
+    if not all(block.index_at for block in blocks):  # one without an index may have any of them
+        return blocks
+    had = [{topic_of[key] for key in block.index_at if key in topic_of} for block in blocks]
+    shared = set[int]().union(*(topics for topics in had if len(topics) > 1))
+    rows = [k for k, topics in enumerate(had) if topics]
+    rows.sort(key=lambda k: -1 if had[k] & shared else min(had[k]))
+    return [blocks[k] for k in rows]
+
+
 def _records(
     log_file: LogFile, data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[Records]:
@@ -108,28 +127,64 @@ def _records(
     Raises:
         LogError: If an index is damaged or points to something that is no message.
     """
-    offsets, limits, stops = _offsets(log_file, placed, wanted)
+    tiled = _tiled(data, placed, wanted)
+    if tiled is not None:
+        return tiled
     found: list[Records] = []
-    for a, b, lasts in zip(limits[:-1], limits[1:], stops, strict=True):
-        at = offsets[a:b]
-        records = _alike(data, at, lasts) if b > a else Records(at, at, None, Places(data, at))
+    for starts in _indexed(log_file, placed, wanted):
+        at = starts.offsets
+        records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
         if records is None:
-            _check_each(log_file, data, at, lasts)
+            _check_each(log_file, data, starts)
             log_ns = gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT)
             records = Records(at, log_ns, None, Places(data, at + BODY_AT))
         found.append(records)
     return found
 
 
-def _alike(data: Buffer, offsets: IntArray, stops: tuple[IntArray, IntArray]) -> Records | None:
+def _tiled(
+    data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+) -> list[Records] | None:
+    """The records of a topic that has the blocks for itself, found without the index.
+
+    Returns:
+        None unless whole messages of one length and channel fill the blocks to the last byte.
+    """
+    only = {key for one in placed for key in one.block.index_at}
+    base, stop = placed[0].base, placed[-1].stop
+    filled = sum(one.stop - one.base for one in placed)
+    if len(only) != 1 or filled != stop - base or filled < BODY_AT:
+        return None
+    start = bytes(data[base : base + _CHANNEL_START.size])
+    opcode, length, channel_id = _CHANNEL_START.unpack(start)
+    size = PREFIX_SIZE + length
+    if opcode != Opcode.MESSAGE or length < FIXED_SIZE or channel_id not in only:
+        return None
+    if any((one.stop - one.base) % size for one in placed):
+        return None
+    places = Places(data, np.arange(base, stop, size, dtype=np.int64), size)
+    if places.field(_CHANNEL_START_KIND, 0).tobytes() != start * len(places):
+        return None
+    nothing = np.empty(0, dtype=np.int64)
+    none = Records(nothing, nothing, None, Places(data, nothing))
+    own = _records_at(places.at, places, length)
+    return [own if channel_id in channel_ids else none for channel_ids in wanted]
+
+
+def _records_at(offsets: IntArray, places: Places, length: int) -> Records:
+    """Records of whole messages of one length: where they are in the buffer, and in a copy."""
+    log_ns = places.field(_LOG_TIME_KIND, _LOG_TIME_AT).copy()
+    bodies = Places(places.data, places.at + BODY_AT, places.step)
+    return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
+
+
+def _alike(data: Buffer, starts: _Starts) -> Records | None:
     """Records that are whole messages of one length; None where something doesn't fit."""
+    offsets = starts.offsets
     first = int(offsets[0])
     start = bytes(data[first : first + _START.size])
     opcode, length = _START.unpack(start)
-    lasts, ends = stops
-    # In file order the last record of a block reaches furthest.
-    room = int((ends - offsets[lasts]).min())
-    if opcode != Opcode.MESSAGE or not FIXED_SIZE <= length <= room - PREFIX_SIZE:
+    if opcode != Opcode.MESSAGE or not FIXED_SIZE <= length <= starts.room - PREFIX_SIZE:
         return None
     size = PREFIX_SIZE + length
     places = Places(data, offsets)
@@ -138,62 +193,78 @@ def _alike(data: Buffer, offsets: IntArray, stops: tuple[IntArray, IntArray]) ->
         places = Places(copied, np.arange(0, len(copied), size, dtype=np.int64), size)
     if places.field(_START_KIND, 0).tobytes() != start * len(offsets):
         return None
-    log_ns = places.field(_LOG_TIME_KIND, _LOG_TIME_AT)
-    bodies = Places(places.data, places.at + BODY_AT, places.step)
-    return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
+    return _records_at(offsets, places, length)
 
 
-def _check_each(
-    log_file: LogFile, data: Buffer, offsets: IntArray, stops: tuple[IntArray, IntArray]
-) -> None:
+def _check_each(log_file: LogFile, data: Buffer, starts: _Starts) -> None:
     """Raise LogError where a record is not a whole message."""
-    rows, ends = stops
-    stop = np.repeat(ends, np.diff(rows, prepend=-1))
-    heads = gather(data, offsets, HEAD)
-    lengths, room = heads["length"], (stop - offsets - PREFIX_SIZE).astype(np.uint64)
+    stop = np.repeat(starts.ends, starts.counts)
+    heads = gather(data, starts.offsets, HEAD)
+    lengths, room = heads["length"], (stop - starts.offsets - PREFIX_SIZE).astype(np.uint64)
     whole = (heads["opcode"] == Opcode.MESSAGE) & (lengths >= FIXED_SIZE) & (lengths <= room)
     if not whole.all():
         raise LogError(log_file.path, "a message index points to something that is not a message")
 
 
-def _offsets(
-    log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
-) -> tuple[IntArray, list[int], list[tuple[IntArray, IntArray]]]:
-    """Where the records start, topic by topic and each in file order; all heads lie in the blocks.
+@dataclass(frozen=True)
+class _Starts:
+    """Where the records of a topic start in a buffer; all heads lie in their blocks.
 
-    Returns:
-        The starts; the topics' limits in them; and for each topic, block by block, which of its
-        records is the last and where the payload ends.
+    Attributes:
+        offsets: The starts in file order, shape (n,).
+        room: Bytes from the last start in a block to the block's end, in the block with the least.
+        counts: How many records each piece of the index lists, shape (k,), in file order.
+        ends: Where the payload of that piece's block ends, shape (k,).
     """
-    ids = [channel_id for channel_ids in wanted for channel_id in channel_ids]
-    by_block = [log_file.entries(one.block, ids) for one in placed]
-    counts = np.array([[len(part) // 16 for part in parts] for parts in by_block], dtype=np.int64)
-    by_topic: list[bytes] = []
-    totals = np.empty((len(wanted), len(placed)), dtype=np.int64)
+
+    offsets: IntArray
+    room: int
+    counts: IntArray
+    ends: IntArray
+
+
+def _indexed(
+    log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+) -> list[_Starts]:
+    """Where the records of each topic start, by the blocks' indexes.
+
+    Raises:
+        LogError: If an index is damaged or points outside its block.
+    """
+    ids = list(itertools.chain.from_iterable(wanted))
+    indexes = [log_file.indexed(one.block, ids) for one in placed]
+    pieces: list[IntArray] = []
+    blocks: list[int] = []
+    limits = [0]  # of the topics, in pieces
     at = 0
-    for row, channel_ids in enumerate(wanted):
-        size = len(channel_ids)
-        by_topic += [part for parts in by_block for part in parts[at : at + size]]
-        totals[row] = counts[:, at : at + size].sum(axis=1)
-        at += size
-    offsets = np.frombuffer(b"".join(by_topic), dtype="<i8")[1::2]
-    each = totals.reshape(-1)
-    room = np.array([max(one.stop - one.base - BODY_AT, -1) for one in placed], dtype=np.int64)
-    # As unsigned numbers, negative offsets are beyond all room too.
-    limit = np.repeat(np.tile(room + 1, len(wanted)).view(np.uint64), each)
-    if (offsets.view(np.uint64) >= limit).any():
+    for channel_ids in wanted:
+        for number, index in enumerate(indexes):
+            for piece in index[at : at + len(channel_ids)]:
+                if len(piece):
+                    pieces.append(piece)
+                    blocks.append(number)
+        at += len(channel_ids)
+        limits.append(len(pieces))
+    if not pieces:
+        nothing = np.empty(0, dtype=np.int64)
+        return [_Starts(nothing, 0, nothing, nothing) for _ in wanted]
+    bounds = np.array([(one.base, one.stop) for one in placed], dtype=np.int64)[blocks]
+    bases, ends = bounds[:, 0], bounds[:, 1]
+    counts = np.array([len(piece) for piece in pieces], dtype=np.int64)
+    offsets = np.concatenate(pieces)
+    offsets += np.repeat(bases, counts)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    room = ends - np.maximum.reduceat(offsets, starts[:-1])
+    outside = np.minimum.reduceat(offsets, starts[:-1]) < bases  # so are sums that are too large
+    if outside.any() or int(room.min()) < BODY_AT:
         raise LogError(log_file.path, "a message index points outside its chunk")
-    bases = np.array([one.base for one in placed], dtype=np.int64)
-    offsets = offsets + np.repeat(np.tile(bases, len(wanted)), each)
-    limits: list[int] = [0, *np.cumsum(totals.sum(axis=1)).tolist()]
+    cuts = starts[limits].tolist()
     steps_back = offsets[1:] < offsets[:-1]
-    steps_back[[at - 1 for at in limits[1:-1] if 0 < at < len(offsets)]] = False
+    steps_back[[cut - 1 for cut in cuts[1:-1] if 0 < cut < len(offsets)]] = False
     if steps_back.any():  # an index that is not in file order, or a topic of several channels
-        for a, b in itertools.pairwise(limits):
-            offsets[a:b] = np.sort(offsets[a:b], kind="stable")
-    stops: list[tuple[IntArray, IntArray]] = []
-    ends = np.array([one.stop for one in placed], dtype=np.int64)
-    for row in totals:
-        filled = row > 0
-        stops.append((np.cumsum(row)[filled] - 1, ends[filled]))
-    return offsets, limits, stops
+        for a, b in itertools.pairwise(cuts):
+            offsets[a:b].sort()
+    return [
+        _Starts(offsets[a:b], int(room[p:q].min(initial=_FAR)), counts[p:q], ends[p:q])
+        for (a, b), (p, q) in zip(itertools.pairwise(cuts), itertools.pairwise(limits), strict=True)
+    ]

@@ -66,16 +66,16 @@ class BlockSource(Protocol):
         """
         ...
 
-    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """The message index of some channels in a block: log time and offset of each message.
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """Where the message records of some channels start in a block's payload, unchecked.
 
         Args:
             block: One of its blocks.
             channel_ids: The channels.
 
         Returns:
-            For each channel 16 bytes a message (two u64), in the order of the index; nothing is
-            checked but its size.
+            For each channel the offsets of its records' opcode bytes, shape (n,), in the order of
+            the index; they may be views of the file, to be let go of before it is closed.
 
         Raises:
             LogError: If the index or the payload is damaged.

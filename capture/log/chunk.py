@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import io
 import mmap
+import os
 import struct
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
 import lz4.frame  # pyright: ignore[reportMissingTypeStubs]
-import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 
@@ -25,6 +26,17 @@ PREFIX_SIZE = 9
 _NAME_AT = PREFIX_SIZE + 8 + 8 + 8 + 4  # of the compression's name in a chunk's record
 
 Buffer = bytes | bytearray | mmap.mmap
+
+
+class _Own(threading.local):
+    """Each thread's decompressor and compressed bytes, for one chunk after the other."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor()
+        self.raw = bytearray()
+
+
+_own = _Own()
 
 
 @dataclass
@@ -56,20 +68,6 @@ class Block:
     offsets: dict[int, IntArray] | None = None
     complete: bool = True
     part: int = 0
-
-
-def as_entries(offsets: IntArray) -> bytes:
-    """Message offsets as the entries of a message index, without log times.
-
-    Args:
-        offsets: Shape (n,).
-
-    Returns:
-        Two u64 a message, as in a file.
-    """
-    entries = np.zeros((len(offsets), 2), dtype="<i8")
-    entries[:, 1] = offsets
-    return entries.tobytes()
 
 
 def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
@@ -111,10 +109,34 @@ def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
     Raises:
         zstandard.ZstdError: If the frame is damaged.
     """
-    opened = zstandard.ZstdDecompressor().stream_reader(raw, closefd=False)
-    with cast("io.RawIOBase", opened) as reader:
+    with cast("io.RawIOBase", _own.decompressor.stream_reader(raw, closefd=False)) as reader:
         size = reader.readinto(room) or 0  # all at once, since there is room for the whole frame
         return size + len(reader.read(1) or b"")
+
+
+def read_at(descriptor: int, start: int, stop: int) -> memoryview:
+    """Read a stretch of a file that is looked at once.
+
+    Through a mapping its pages would stay in this process's memory, and each costs a fault.
+
+    Args:
+        descriptor: The file.
+        start: First byte.
+        stop: One past the last byte.
+
+    Returns:
+        The bytes, until this thread reads again; fewer than asked for where the file ends before.
+
+    Raises:
+        OSError: If it can't be read.
+    """
+    size, done = stop - start, 0
+    if len(_own.raw) < size:
+        _own.raw = bytearray(size)
+    room = memoryview(_own.raw)[:size]
+    while done < size and (got := os.preadv(descriptor, [room[done:]], start + done)):
+        done += got
+    return room[:done]
 
 
 def checks_itself(raw: memoryview) -> bool:

@@ -18,8 +18,8 @@ from ..arrays import IntArray
 from ..errors import DataError
 from .batches import Records, Window, blocks_in, record_batches
 from .cdr import Layout, layout_of
-from .chunk import Block, Buffer
-from .groups import Group, Matrix, fits_layout
+from .chunk import Buffer
+from .groups import Group, Matrix, Stamping, fits_layout
 from .message_heads import BODY_AT, FIXED_SIZE, Places
 from .rosmsg import MessageType
 from .storage import LogFile
@@ -99,8 +99,17 @@ def read_messages(
     """
     blocks = blocks_in(log_file, window_ns)
     shared: list[TimeStore] = []
+    stamping = Stamping()
+    stored = sum(block.stop - block.start for block in blocks)
     readers = [
-        _GroupReader(request, *_expected(log_file, request, blocks), shared) for request in requests
+        _GroupReader(
+            request,
+            _expected(log_file, request, len(blocks)),
+            _EXPANSION * stored,
+            shared,
+            stamping,
+        )
+        for request in requests
     ]
     wanted = [request.channel_ids for request in requests]
     for _, found in record_batches(log_file, wanted, blocks, warn, threads):
@@ -110,12 +119,11 @@ def read_messages(
     return [Messages(reader.groups, reader.unread) for reader in readers]
 
 
-def _expected(log_file: LogFile, request: Request, blocks: Sequence[Block]) -> tuple[int, int]:
-    """How many messages to expect, and for how many bytes of columns memory may be reserved."""
+def _expected(log_file: LogFile, request: Request, blocks: int) -> int:
+    """How many messages to expect of so many blocks."""
     counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
-    part = len(blocks) / max(len(log_file.blocks), 1)
-    stored = sum(block.stop - block.start for block in blocks)
-    return int(counted * min(part, 1.0)) + 1, _EXPANSION * stored
+    part = blocks / max(len(log_file.blocks), 1)
+    return int(counted * min(part, 1.0)) + 1
 
 
 def message_blocks(
@@ -160,13 +168,18 @@ class _GroupReader:
     """Sorts messages into groups by layout."""
 
     def __init__(
-        self, request: Request, expected: int, reserve: int, shared: list[TimeStore]
+        self,
+        request: Request,
+        expected: int,
+        reserve: int,
+        shared: list[TimeStore],
+        stamping: Stamping,
     ) -> None:
         self._type = request.message_type
         self._paths = None if request.paths is None else frozenset(request.paths)
         self._layouts = request.layouts
         self._expected, self._reserve = expected, reserve
-        self._shared = shared
+        self._shared, self._stamping = shared, stamping
         self._by_length: dict[int, list[Group]] = {}
         self._count = 0
         self.groups: list[Group] = []
@@ -229,7 +242,7 @@ class _GroupReader:
                 group = self._group(layout, self._capacity(length, int(fits.sum())))
                 known.append(group)
             else:
-                group = Group(layout, self._paths, 1)
+                group = Group(layout, self._paths, 1, stamping=self._stamping)
             self.groups.append(group)
             group.take(places.take(fits), log_ns[fits], order[fits])
             rest = ~fits
@@ -249,8 +262,8 @@ class _GroupReader:
     def _group(self, layout: Layout, capacity: int) -> Group:
         """A group; the first of a topic may have the times of another topic's first."""
         if self.groups:
-            return Group(layout, self._paths, capacity)
-        group = Group(layout, self._paths, capacity, tuple(self._shared))
+            return Group(layout, self._paths, capacity, stamping=self._stamping)
+        group = Group(layout, self._paths, capacity, tuple(self._shared), self._stamping)
         if len(self._shared) < _MAX_SHARED:
             self._shared.append(group.kept_times)
         return group

@@ -112,8 +112,9 @@ def check_chunk(path: Path, place: ChunkPlace) -> str | None:
     if place.compression:
         try:
             raw = inflate(place.compression, raw, place.size, whole=True)
-        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-            return f"{where} can't be decompressed: {error}"
+        except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+            told = str(error) or "it claims more bytes than there is memory"
+            return f"{where} can't be decompressed: {told}"
     if place.crc and zlib.crc32(raw) != place.crc:
         return _corrupt("the chunk", place.start)
     return None

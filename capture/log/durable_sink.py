@@ -15,6 +15,7 @@ from mcap.records import Header, Metadata
 
 from ..errors import DataError, LogWriteError, OutputExistsError, UndulogError
 from .ballast import Ballast
+from .chunk_groups import chunk_group
 from .disk_thread import DiskThread
 from .mcap_sink import PROFILE, library_name, write_description, write_error
 from .mcap_writer import McapWriter
@@ -55,10 +56,11 @@ class DurableSink:
             force: Replace existing files, and what a former recorder left in its write-ahead log.
             segment_size: Bytes of a segment of the write-ahead log; two are reserved at any time.
             split_size: Bytes of a part at which the next one begins; None for never. A part is
-                up to a chunk longer.
+                longer by the chunks that are open then.
             split_ns: Log time of a part [ns]; None for never.
-            flush_interval_s: Longest time that a message waits for its chunk to be full [s]; the
-                file lags behind by that, while the write-ahead log has everything.
+            flush_interval_s: Longest time that a message waits for its chunk to be full [s], and
+                twice the shortest that it may have to; the file lags behind by that, while the
+                write-ahead log has everything.
             sync_interval_s: What power loss costs at most, about [s].
             ballast: Bytes kept in reserve for finalising on a full disk.
 
@@ -76,8 +78,9 @@ class DurableSink:
         self._split_size = split_size
         self._split_ns = split_ns
         self._split_at_ns = _NEVER_NS if split_ns is None else 0
-        self._flush_interval_s = flush_interval_s
-        self._due = time.monotonic() + flush_interval_s
+        self._half_interval_s = flush_interval_s / 2
+        self._due = time.monotonic() + self._half_interval_s
+        self._mark = 0  # messages that the part had one half of the interval ago
         self._known: list[Description] = []
         self._messages: int = 0
         self._refused: LogWriteError | None = None
@@ -125,7 +128,7 @@ class DurableSink:
 
     @property
     def bytes_written(self) -> int:
-        """Bytes of MCAP so far, over all parts; the open chunk is not in it."""
+        """Bytes of MCAP so far, over all parts; the open chunks are not in it."""
         return self._disk.bytes_given
 
     @property
@@ -196,7 +199,7 @@ class DurableSink:
         self._messages += 1
         if part.size != size:
             self._chunk_done()
-        elif time.monotonic() >= self._due:
+        if time.monotonic() >= self._due:
             self._flush()
 
     def tick(self) -> None:
@@ -241,7 +244,7 @@ class DurableSink:
         for record in (*self._known, begin):
             write_description(self._writer, record)
         self._hand_over()
-        self._due = time.monotonic() + self._flush_interval_s
+        self._mark = 0
         return following.path
 
     def close(self, last: tuple[Metadata, ...]) -> None:
@@ -292,7 +295,7 @@ class DurableSink:
     # -- inside ----------------------------------------------------------------------------
 
     def _new_writer(self) -> McapWriter:
-        writer = McapWriter(self._part, chunk_size=CHUNK_SIZE)
+        writer = McapWriter(self._part, CHUNK_SIZE, chunk_group)
         writer.start(profile=PROFILE, library=library_name())
         return writer
 
@@ -301,15 +304,16 @@ class DurableSink:
         self._disk.write(self._part, 0)
 
     def _chunk_done(self) -> None:
-        self._due = time.monotonic() + self._flush_interval_s
-        self._disk.write(self._part, self._wal.position)
+        self._disk.write(self._part, self._part_began + self._writer.settled)
         if self._split_size is not None and self._part.size >= self._split_size:
             self._try_split()
 
     def _flush(self) -> None:
+        """Write the chunks that were begun before the last time: busy ones are not cut short."""
         size = self._part.size
-        self._writer.flush()
-        self._due = time.monotonic() + self._flush_interval_s
+        self._writer.settle(self._mark)
+        self._mark = self._writer.messages
+        self._due = time.monotonic() + self._half_interval_s
         if self._part.size != size:
             self._chunk_done()
 

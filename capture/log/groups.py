@@ -11,12 +11,59 @@ from numpy.typing import NDArray
 from ..arrays import IntArray
 from .cdr import Layout, Leaf
 from .message_heads import Places
-from .stores import ColumnStore, TimeStore
+from .stores import ColumnStore, Times, TimeStore
 
 _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 _NS = 1_000_000_000
+_COMPARED = 1 << 17
+"""Bytes of constant parts that are compared at once: few enough to stay in the cache."""
+
+_STAMP_KIND = np.dtype([("seconds", "<i4"), ("rest", "<u4")])
 
 Matrix = NDArray[np.uint8]
+
+
+class Stamping:
+    """Times of messages by their stamps; those of the last messages are kept.
+
+    All topics that one tick of a recorder writes have the same stamps and log times: then nothing
+    is to be worked out, and who has them twice need not compare them.
+    """
+
+    def __init__(self) -> None:
+        """Start with no messages."""
+        self._raw: NDArray[Any] = np.empty(0, dtype="<i8")
+        self._times: Times | None = None
+
+    def times(self, places: Places, log_ns: IntArray, stamp: tuple[Leaf, Leaf]) -> Times:
+        """Times of messages.
+
+        Args:
+            places: Where they start, n of them.
+            log_ns: Their log times [Unix ns], shape (n,); never written to afterwards.
+            stamp: Where their stamps are: seconds and nanoseconds.
+
+        Returns:
+            The times; the very same as before if they are equal.
+        """
+        seconds, rest = stamp
+        pair = (seconds.dtype, rest.dtype, rest.offset - seconds.offset)
+        if pair != ("<i4", "<u4", 4):
+            return Times.of(log_ns, _stamp_ns(places, seconds, rest))
+        raw = np.ascontiguousarray(places.field("V8", seconds.offset)).view("<i8")
+        known = self._times
+        if (
+            known is not None
+            and np.array_equal(raw, self._raw)
+            and np.array_equal(log_ns, known.log_ns)
+        ):
+            return known
+        halves = raw.view(_STAMP_KIND)
+        stamp_ns = halves["seconds"].astype(np.int64)
+        stamp_ns *= _NS
+        stamp_ns += halves["rest"]
+        self._raw, self._times = raw, Times.of(log_ns, stamp_ns)
+        return self._times
 
 
 class Group:
@@ -35,6 +82,7 @@ class Group:
         paths: frozenset[str] | None,
         capacity: int,
         others: Sequence[TimeStore] = (),
+        stamping: Stamping | None = None,
     ) -> None:
         """Start empty.
 
@@ -43,8 +91,10 @@ class Group:
             paths: Leaf paths to keep; None for all. A stamp is kept as a time, not as a leaf.
             capacity: Messages to expect.
             others: Times of other topics, which may be the same.
+            stamping: What works out the times, of other topics too; None for one of its own.
         """
         self.layout = layout
+        self._stamping = stamping or Stamping()
         leaves = layout.leaves
         stamps = [pair for pair in _STAMPS if all(path in leaves for path in pair)]
         self._stamp = (leaves[stamps[0][0]], leaves[stamps[0][1]]) if stamps else None
@@ -111,11 +161,13 @@ class Group:
             True if all do; False if some don't, or differ in padding.
         """
         for k, (start, run) in enumerate(self._hull):
-            width = run.itemsize
-            if len(self._tiles[k]) < width * len(places):
-                self._tiles[k] = self.layout.example[start : start + width] * (2 * len(places))
-            if not self._tiles[k].startswith(places.field(run, start).tobytes()):
-                return False
+            count = _COMPARED // run.itemsize + 1
+            if not self._tiles[k]:
+                self._tiles[k] = self.layout.example[start : start + run.itemsize] * count
+            found = places.field(run, start)
+            for first in range(0, len(found), count):
+                if not self._tiles[k].startswith(found[first : first + count].tobytes()):
+                    return False
         return True
 
     def take(self, places: Places, log_ns: IntArray, order: IntArray | range) -> None:
@@ -127,10 +179,10 @@ class Group:
             order: Their places in the topic, n of them.
         """
         self._order.append(order)
-        stamp_ns = None
         if self._stamp:
-            stamp_ns = _stamp_ns(places, *self._stamp)
-        self.kept_times.append(log_ns, stamp_ns)
+            self.kept_times.append(self._stamping.times(places, log_ns, self._stamp))
+        else:
+            self.kept_times.append(Times(log_ns))
         for kind, count, start, store in self._parts:
             store.append(places.rows(kind, count, start))
 

@@ -11,7 +11,9 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import mmap
+import os
 import struct
+import weakref
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -35,25 +37,27 @@ from mcap.records import (
     Statistics,
 )
 
-from ..arrays import IntArray
+from ..arrays import IntArray, frozen
 from ..errors import LogError, NotALogError
 from .chunk import (
     PREFIX_SIZE,
     Block,
     Buffer,
-    as_entries,
     checks_itself,
     inflate,
     inflate_zstd_into,
     next_chunk,
+    read_at,
     walk_records,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_SIZE = 1 + 8 + 20
 _CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
-_INDEX_OFFSET = np.dtype([("channel", "<u2"), ("at", "<u8")])
+_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
+_INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
 _INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, channel, entries' size
+_NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
 _MAX_BLOCK_SIZE = 1 << 30
 _CACHE_SIZE = 64 << 20
 
@@ -92,7 +96,9 @@ class McapFile:
         self.cut = ""  # why it was read record by record
         self._bare = bare
         self._cache: OrderedDict[int, Buffer] = OrderedDict()
-        self._buffer = self._map()
+        self._buffer, descriptor = self._map()
+        self._close_descriptor = weakref.finalize(self, os.close, descriptor)
+        self._descriptor = descriptor
         try:
             self._load()
         except BaseException:
@@ -103,6 +109,7 @@ class McapFile:
         """Release the mapping."""
         self._cache.clear()
         self._buffer.close()
+        self._close_descriptor()
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """See :meth:`BlockSource.payload`."""
@@ -141,27 +148,29 @@ class McapFile:
         """
         where = f"the chunk at byte {block.start}"
         try:
-            with memoryview(self._buffer) as whole, whole[block.start : block.stop] as raw:
+            with read_at(self._descriptor, block.start, block.stop) as raw:
                 size = inflate_zstd_into(raw, room)
                 checked = not block.crc or checks_itself(raw)
         except zstandard.ZstdError as error:
             raise LogError(self.path, f"{where} can't be decompressed: {error}") from error
+        except OSError as error:
+            raise LogError(self.path, f"{where} can't be read: {error.strerror}") from error
         if size != block.size:
             raise LogError(self.path, f"{where} has {size} bytes, not {block.size}")
         if not checked and zlib.crc32(room) != block.crc:
             raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
 
-    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """See :meth:`BlockSource.entries`."""
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """See :meth:`BlockSource.indexed`."""
         if block.offsets is not None or not block.index_at:
-            return [as_entries(self.offsets(block, channel_id)) for channel_id in channel_ids]
+            return [self.offsets(block, channel_id) for channel_id in channel_ids]
         buffer, end = self._buffer, len(self._buffer)
         head_size = _INDEX_HEAD.size
-        found: list[bytes] = []
+        found: list[IntArray] = []
         for channel_id in channel_ids:
             at = block.index_at.get(channel_id)
             if at is None:
-                found.append(b"")
+                found.append(_NO_OFFSETS)
                 continue
             if at + head_size > end:
                 raise LogError(self.path, f"an index points to byte {at}, where no record is")
@@ -170,7 +179,8 @@ class McapFile:
                 raise LogError(self.path, f"no message index at byte {at}")
             if found_id != channel_id or size + 6 != length or size % 16:
                 raise LogError(self.path, f"the message index at byte {at} is damaged")
-            found.append(buffer[at + head_size : at + head_size + size])
+            entries = np.frombuffer(buffer, "<i8", size // 8, at + head_size)
+            found.append(entries[1::2])  # log time and offset of each
         return found
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
@@ -183,12 +193,14 @@ class McapFile:
 
     # -- opening ---------------------------------------------------------------------------
 
-    def _map(self) -> mmap.mmap:
+    def _map(self) -> tuple[mmap.mmap, int]:
+        """The file in memory, and a descriptor of it."""
         try:
             with self.path.open("rb") as stream:
                 if not stream.read(1):
                     raise NotALogError(self.path, "the file is empty (0 bytes)")
-                return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                return data, os.dup(stream.fileno())
         except FileNotFoundError as error:
             raise LogError(self.path, "no such file") from error
         except OSError as error:
@@ -293,23 +305,24 @@ class McapFile:
         if entries_at > stop:
             raise LogError(self.path, "a chunk index is cut short")
         at, length, size = _CHUNK_INDEX.unpack_from(self._buffer, start)
-        if size % _INDEX_OFFSET.itemsize or entries_at + size > stop:
+        if size % _INDEX_OFFSET.size or entries_at + size > stop:
             raise LogError(self.path, "a chunk index is damaged")
         if not len(MAGIC) <= at <= at + length <= len(self._buffer):
             raise LogError(self.path, f"a chunk index points to byte {at}, outside the file")
         block = self._chunk_at(at + PREFIX_SIZE, at + length)
-        offsets = np.frombuffer(self._buffer[entries_at : entries_at + size], _INDEX_OFFSET)
-        block.index_at = dict(zip(offsets["channel"].tolist(), offsets["at"].tolist(), strict=True))
+        block.index_at = dict(
+            _INDEX_OFFSET.iter_unpack(self._buffer[entries_at : entries_at + size])
+        )
         return block
 
     def _chunk_at(self, start: int, stop: int) -> Block:
         """The block of the chunk record whose body is [start, stop), possibly cut short."""
-        fixed = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
-        begin, end, size, crc, name_size = fixed.unpack_from(self._buffer, start)
-        data_at = start + fixed.size + name_size + 8
+        begin, end, size, crc, name_size = _CHUNK_HEAD.unpack_from(self._buffer, start)
+        name_at = start + _CHUNK_HEAD.size
+        data_at = name_at + name_size + 8
         if data_at > stop:
             raise LogError(self.path, f"the chunk at byte {start} is cut in its header")
-        name = self._buffer[start + fixed.size : data_at - 8].decode("ascii", "replace")
+        name = self._buffer[name_at : data_at - 8].decode("ascii", "replace")
         (data_size,) = struct.unpack_from("<Q", self._buffer, data_at - 8)
         data_stop = min(data_at + data_size, stop)
         complete = data_at + data_size <= stop
@@ -405,7 +418,10 @@ class McapFile:
         data: Buffer | None = None,
     ) -> _Record:
         body = (self._buffer if data is None else data)[start:stop]
-        return read(ReadDataStream(BytesIO(body)))
+        try:
+            return read(ReadDataStream(BytesIO(body)))
+        except OverflowError as error:  # a length beyond all memory
+            raise LogError(self.path, f"the record at byte {start} is damaged") from error
 
     def _walk_block(self, block: Block) -> dict[int, IntArray]:
         """Offsets by channel of a payload without index; schemas and channels are noted."""
@@ -421,8 +437,7 @@ class McapFile:
         return {channel_id: np.array(at, dtype=np.int64) for channel_id, at in found.items()}
 
     def _message_index(self, block: Block, channel_id: int) -> IntArray:
-        (entries,) = self.entries(block, [channel_id])
-        offsets = np.frombuffer(entries, dtype="<i8")[1::2]
+        (offsets,) = self.indexed(block, [channel_id])
         if offsets.size and not 0 <= offsets.min() <= offsets.max() <= block.size - PREFIX_SIZE:
             raise LogError(
                 self.path, f"a message index of channel {channel_id} points outside its chunk"
@@ -438,8 +453,9 @@ class McapFile:
         raw = self._buffer[block.start : block.stop]
         try:
             data = inflate(block.compression, raw, block.size, whole=block.complete)
-        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-            raise LogError(self.path, f"{where} can't be decompressed: {error}") from error
+        except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+            told = str(error) or "it claims more bytes than there is memory"
+            raise LogError(self.path, f"{where} can't be decompressed: {told}") from error
         if not block.complete:
             return data
         if len(data) != block.size:

@@ -10,6 +10,7 @@ from typing import BinaryIO
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from ..errors import DataError, LogWriteError, OutputExistsError
+from .chunk_groups import chunk_group
 from .mcap_writer import McapWriter
 from .sink import Description
 
@@ -34,7 +35,7 @@ class McapSink:
         self.path = Path(path)
         self._open = True
         self._stream = create_file(self.path, force=force)
-        self._writer = McapWriter(_Guarded(self._stream, self.path))
+        self._writer = McapWriter(_Guarded(self._stream, self.path), group_of=chunk_group)
         self._writer.start(profile=PROFILE, library=library_name())
 
     def define(self, record: Description) -> None:

@@ -2,8 +2,10 @@
 
 A message is packed once, straight into the chunk, and its index entry into an array that is the
 index record's own content. Everything that is written once a chunk or once a file is left to the
-library's records. Each zstd frame has a checksum of its own beside the chunk's CRC: a reader gets
-it checked for a tenth of the time that the CRC takes. Format: https://mcap.dev/spec.
+library's records. Channels may be kept apart, in chunks of their own: who reads one of them then
+decompresses nothing else, and its messages lie side by side. Each zstd frame has a checksum of its
+own beside the chunk's CRC: a reader gets it checked for a tenth of the time that the CRC takes.
+Format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ from __future__ import annotations
 import struct
 import zlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -38,6 +41,7 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
 
+_LONGEST_WAIT_NS = 10 * 10**9  # of log time, once a chunk of other channels is full
 _COMPRESSION = "zstd"
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_BODY = _MESSAGE.size - 9  # without opcode and length
@@ -62,24 +66,46 @@ class Stream(Protocol):
         ...
 
 
+@dataclass(slots=True)
+class _OpenChunk:
+    """What one group of channels has that is not written yet."""
+
+    group: str
+    data: bytearray = field(default_factory=bytearray)
+    index: dict[int, array[int]] = field(default_factory=dict[int, "array[int]"])
+    began: int = 0  # how many messages the file had when its first one came
+    schemas: set[int] = field(default_factory=set[int])  # that a chunk of this group has
+
+
 class McapWriter:
     """Writes one MCAP file of zstd chunks with all indexes.
 
     The methods are those of ``mcap.writer.Writer``.
     """
 
-    def __init__(self, stream: Stream, chunk_size: int = CHUNK_SIZE) -> None:
+    def __init__(
+        self,
+        stream: Stream,
+        chunk_size: int = CHUNK_SIZE,
+        group_of: Callable[[str, str], str] | None = None,
+    ) -> None:
         """Write to a stream; :meth:`start` begins.
 
         Args:
             stream: Where to.
             chunk_size: A chunk is written when it has more bytes than this.
+            group_of: Topic and name of the type to the group of a channel: those of one group
+                share chunks. None for one group, named "".
         """
         self._stream = stream
         self._chunk_size = chunk_size
         self._zstd = zstandard.ZstdCompressor(write_checksum=True)
-        self._chunk = bytearray()
-        self._index: dict[int, array[int]] = {}
+        self._group_of = group_of
+        self._shared = _OpenChunk("")
+        self._open = {"": self._shared}
+        self._chunk_of: dict[int, _OpenChunk] = {}
+        self._begun: dict[str, _OpenChunk] = {}  # those with messages, in the order they began
+        self._messages = 0
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._chunks: list[ChunkIndex] = []
@@ -87,6 +113,16 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._times: tuple[int, int] | None = None
+
+    @property
+    def settled(self) -> int:
+        """How many messages, counted from the first, are all in chunks that are written."""
+        return next((chunk.began for chunk in self._begun.values()), self._messages)
+
+    @property
+    def messages(self) -> int:
+        """How many messages were added."""
+        return self._messages
 
     def start(self, profile: str, library: str) -> None:
         """Write the beginning of the file.
@@ -117,7 +153,8 @@ class McapWriter:
         """
         schema = Schema(len(self._schemas) + 1, data, encoding, name)
         self._schemas[schema.id] = schema
-        self._into_chunk(schema)
+        self._shared.schemas.add(schema.id)
+        self._into(self._shared, schema)
         return schema.id
 
     def register_channel(
@@ -144,16 +181,22 @@ class McapWriter:
         number = len(self._channels) + 1
         channel = Channel(number, topic, message_encoding, dict(metadata or {}), schema_id)
         self._channels[number] = channel
-        self._into_chunk(channel)
+        schema = self._schemas.get(schema_id)
+        group = self._group_of(topic, schema.name if schema else "") if self._group_of else ""
+        chunk = self._chunk_of[number] = self._open.setdefault(group, _OpenChunk(group))
+        if schema is not None and schema_id not in chunk.schemas:  # it comes before the channel
+            chunk.schemas.add(schema_id)
+            self._into(chunk, schema)
+        self._into(chunk, channel)
         return number
 
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Add a message to the chunk.
+        """Add a message to the chunk of its channel.
 
         Args:
-            channel_id: Its channel.
+            channel_id: Its channel, which is registered.
             log_time: When it was recorded [Unix ns].
             data: Its bytes.
             publish_time: When it was sampled [Unix ns].
@@ -163,19 +206,26 @@ class McapWriter:
             OSError: If the stream can't take the chunk that is full now.
             struct.error: If a number is out of range; the message is not in the chunk then.
         """
-        chunk = self._chunk
+        chunk = self._chunk_of[channel_id]
         head = _MESSAGE.pack(
             _OPCODE, _MESSAGE_BODY + len(data), channel_id, sequence, log_time, publish_time
         )
-        index = self._index.get(channel_id)
+        index = chunk.index.get(channel_id)
         if index is None:
-            index = self._index[channel_id] = array("Q")
+            if not chunk.index:
+                chunk.began = self._messages
+                self._begun[chunk.group] = chunk
+            index = chunk.index[channel_id] = array("Q")
+        records = chunk.data
         index.append(log_time)
-        index.append(len(chunk))
-        chunk += head
-        chunk += data
-        if len(chunk) > self._chunk_size:
-            self._finish_chunk()
+        index.append(len(records))
+        records += head
+        records += data
+        self._messages += 1
+        if len(records) > self._chunk_size:
+            self._finish_chunk(chunk)
+            if self._begun:
+                self._finish_behind(log_time)
 
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
@@ -221,21 +271,34 @@ class McapWriter:
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=name))
 
     def flush(self) -> None:
-        """Write the chunk, if it has messages, and flush the stream.
+        """Write the chunks that have messages, and flush the stream.
 
         Raises:
             OSError: If the stream can't take it.
         """
-        self._finish_chunk()
+        self.settle(self._messages)
         self._stream.flush()
 
-    def finish(self) -> None:
-        """Write the chunk and the summary; the stream stays open.
+    def settle(self, count: int) -> None:
+        """Write the chunks that have any of the file's first messages.
+
+        Args:
+            count: How many messages are to be in chunks that are written.
 
         Raises:
             OSError: If the stream can't take it.
         """
-        self._finish_chunk()
+        for chunk in list(self._begun.values()):
+            if chunk.began < count:
+                self._finish_chunk(chunk)
+
+    def finish(self) -> None:
+        """Write the chunks and the summary; the stream stays open.
+
+        Raises:
+            OSError: If the stream can't take it.
+        """
+        self.settle(self._messages)
         self._put(DataEnd(0))
         start = self._stream.tell()
         summary, offsets = RecordBuilder(), list[SummaryOffset]()
@@ -270,26 +333,31 @@ class McapWriter:
         self._stream.write(data)
         return len(data)
 
-    def _into_chunk(self, record: Schema | Channel) -> None:
-        self._chunk += _encoded(record)
-        if len(self._chunk) > self._chunk_size:
-            self._finish_chunk()
+    def _into(self, chunk: _OpenChunk, record: Schema | Channel) -> None:
+        chunk.data += _encoded(record)
+        if chunk.index and len(chunk.data) > self._chunk_size:  # else it waits for a message
+            self._finish_chunk(chunk)
 
-    def _finish_chunk(self) -> None:
-        if not self._index:  # definitions alone wait for the first message
-            return
-        indexes = {key: np.frombuffer(index, np.uint64)[::2] for key, index in self._index.items()}
+    def _finish_behind(self, log_time: int) -> None:
+        """Write the chunks that have waited for long: a file that is cut lacks no more of them."""
+        for other in list(self._begun.values()):
+            if log_time - next(iter(other.index.values()))[0] > _LONGEST_WAIT_NS:
+                self._finish_chunk(other)
+
+    def _finish_chunk(self, chunk: _OpenChunk) -> None:
+        """Write a chunk that has messages."""
+        indexes = {key: np.frombuffer(index, np.uint64)[::2] for key, index in chunk.index.items()}
         begin = int(min(times.min() for times in indexes.values()))
         end = int(max(times.max() for times in indexes.values()))
-        data = self._zstd.compress(self._chunk)
+        data = self._zstd.compress(chunk.data)
         body = _CHUNK.size - 9 + len(data)
         at = self._stream.tell()
-        size, crc = len(self._chunk), zlib.crc32(self._chunk)
+        size, crc = len(chunk.data), zlib.crc32(chunk.data)
         head = _CHUNK.pack(
             Opcode.CHUNK, body, begin, end, size, crc, 4, _COMPRESSION.encode(), len(data)
         )
         self._stream.write(head + data)
-        chunk = ChunkIndex(
+        written = ChunkIndex(
             message_start_time=begin,
             message_end_time=end,
             chunk_start_offset=at,
@@ -302,18 +370,19 @@ class McapWriter:
         )
         index_at = self._stream.tell()
         records = bytearray()
-        for key, index in self._index.items():
-            chunk.message_index_offsets[key] = index_at + len(records)
+        for key, index in chunk.index.items():
+            written.message_index_offsets[key] = index_at + len(records)
             length = len(index) * index.itemsize
             records += _INDEX.pack(Opcode.MESSAGE_INDEX, length + 6, key, length)
             records += index.tobytes()
             self._counts[key] = self._counts.get(key, 0) + len(index) // 2
-        chunk.message_index_length = len(records)
+        written.message_index_length = len(records)
         self._stream.write(bytes(records))
-        self._chunks.append(chunk)
+        self._chunks.append(written)
         low, high = self._times or (begin, end)
         self._times = min(low, begin), max(high, end)
-        self._chunk, self._index = bytearray(), {}
+        chunk.data, chunk.index = bytearray(), {}
+        del self._begun[chunk.group]
 
     def _statistics(self) -> Statistics:
         begin, end = self._times or (0, 0)

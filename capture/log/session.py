@@ -6,6 +6,7 @@ whatever could not be read is said in ``warnings``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -146,6 +147,16 @@ class Session:
     def session_id(self) -> str:
         """The session's id, or the file's name for a log that has none."""
         return self._file.metadata.get("undulog", {}).get("session_id") or self.path.stem
+
+    @property
+    def settle_s(self) -> float | None:
+        """The first part that is not fit for steady-state analysis [s], None if it doesn't say."""
+        stated = self._file.metadata.get("undulog", {}).get("settle_s", "")
+        try:
+            seconds = float(stated)
+        except ValueError:
+            return None
+        return seconds if 0.0 <= seconds < math.inf else None
 
     @cached_property
     def robot(self) -> Robot | None:

@@ -165,7 +165,7 @@ class _Check:
                 checked += crc
                 without_crc += not crc and block.start in container.chunks
             except LogError as error:
-                damage.append(str(error).removeprefix(f"{path}: "))
+                damage.append(str(error).removeprefix(f"{path}: ") + self._lost_with(block))
             step()
         return FileHealth(
             chunks=len(container.chunks),
@@ -176,6 +176,19 @@ class _Check:
             indexed=indexed,
             notes=tuple(notes),
         )
+
+    def _lost_with(self, block: Block) -> str:
+        """What a chunk that can't be read held, as its index has it."""
+        try:
+            held = {key: len(self._file.offsets(block, key)) for key in block.index_at}
+        except LogError:
+            return ""
+        channels = self._file.channels
+        listed = [
+            f"{count} of {channels[key].topic if key in channels else f'channel {key}'}"
+            for key, count in sorted(held.items())
+        ]
+        return f"; it held {sum(held.values())} messages: {', '.join(listed)}" if listed else ""
 
     def _against_summary(self, file: FileHealth) -> FileHealth:
         """The file's health with the summary's counts held against the messages read."""

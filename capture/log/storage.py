@@ -7,7 +7,8 @@ files' blocks as one more block, in memory; nothing on the disk is changed.
 from __future__ import annotations
 
 import mmap
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -105,9 +106,9 @@ class LogFile:
         """See :meth:`BlockSource.inflate_into`."""
         self._sources[block.part].inflate_into(block, room)
 
-    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """See :meth:`BlockSource.entries`."""
-        return self._sources[block.part].entries(block, channel_ids)
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """See :meth:`BlockSource.indexed`."""
+        return self._sources[block.part].indexed(block, channel_ids)
 
     # -- putting together ------------------------------------------------------------------
 
@@ -150,8 +151,11 @@ class LogFile:
         self._define(wal)
         self._leave_cut_chunk(wal)
         # The log may begin before the files' end, and they may have grown beyond its own since.
-        overlap = max(wal.accepted, sum(self.counts.values())) - wal.before
-        keys, looked = self._last_keys(overlap if wal.messages else 0)
+        # What it let go of while it was being read is a hole in it, of channels it can't tell.
+        grown = max(0, sum(self.counts.values()) - wal.accepted)
+        hole = wal.accepted - wal.before - len(wal.messages)
+        listed = Counter(message.channel_id for message in wal.messages)
+        keys, looked = self._last_keys({key: n + hole + grown for key, n in listed.items()})
         in_files = sum(self.counts.values())
         rest = beyond(wal.messages, keys)
         if rest:
@@ -197,21 +201,29 @@ class LogFile:
         if wal.before <= sum(self.counts.values()) - sum(map(len, (block.offsets or {}).values())):
             self._leave_out(block)
 
-    def _last_keys(self, least: int) -> tuple[set[MessageKey], bool]:
-        """The keys of the files' last messages, at least so many where there are.
+    def _last_keys(self, least: Mapping[int, int]) -> tuple[set[MessageKey], bool]:
+        """The keys of the files' last messages of some channels.
 
-        A chunk that can't be read is left out: the write-ahead log may have its messages.
+        A channel's messages are in the files in the order they came, while those of others may be
+        in a later chunk though they came before. A chunk that can't be read is left out: the
+        write-ahead log may have its messages.
+
+        Args:
+            least: Channel id to how many of its messages are wanted, if there are as many.
 
         Returns:
             The keys, and whether all of the files was read to count their messages.
         """
         keys: set[MessageKey] = set()
-        passed = 0
+        left = dict(least)
         trusted = {part for part, file in enumerate(self.files) if not file.cut}
         unread = {id(block) for block in self.blocks if block.part in trusted}
         for block in reversed(self.blocks.copy()):
-            if passed >= least:
+            if not left:
                 break
+            ids = block.offsets if block.offsets is not None else block.index_at
+            if ids and left.keys().isdisjoint(ids):
+                continue
             try:
                 heads = self._heads(block)
             except LogError as error:
@@ -219,11 +231,14 @@ class LogFile:
                 self.warnings.append(
                     f"{error}; of its messages only the write-ahead log's are read"
                 )
-            else:
-                columns = (heads[name].tolist() for name in ("channel", "sequence", "log"))
-                keys.update(zip(*columns, strict=True))
-                passed += len(heads)
-                unread.discard(id(block))
+                continue
+            columns = (heads[name].tolist() for name in ("channel", "sequence", "log"))
+            keys.update(zip(*columns, strict=True))
+            unread.discard(id(block))
+            ids, counts = np.unique(heads["channel"], return_counts=True)
+            passed = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+            left = {key: count - passed.get(key, 0) for key, count in left.items()}
+            left = {key: count for key, count in left.items() if count > 0}
         return keys, not unread
 
     def _heads(self, block: Block) -> NDArray[np.void]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import mmap
 import sys
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ _SHORT_NS = 2**31
 _LARGE = 4 << 20
 _STEPS = 16
 """Pages of a large column are asked for in so many steps: a fault for each costs twice as much."""
+_STEP_SIZE = 1 << 18
+"""Bytes of a column that are asked for at once, at least: each call costs as much as some pages."""
 _POPULATE_WRITE = 23
 """Linux's MADV_POPULATE_WRITE (5.14), which Python has no name for."""
 
@@ -93,7 +96,8 @@ class ColumnStore:
         memory = self._memory
         if memory is None:
             return
-        first, self._ready = self._ready, min(self._capacity, stop + self._capacity // _STEPS)
+        step = max(self._capacity // _STEPS, _STEP_SIZE // self._dtype.itemsize)
+        first, self._ready = self._ready, min(self._capacity, stop + step)
         size, runs = self._dtype.itemsize, self._width
         if self._by_row:
             size, runs = size * self._width, 1
@@ -131,6 +135,7 @@ class EchoColumn:
         self._leader: EchoColumn | None = None
         self._own: ColumnStore | None = None
         self._count = 0
+        self._last: tuple[int, NDArray[Any]] | None = None
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -140,7 +145,7 @@ class EchoColumn:
         """Add rows.
 
         Args:
-            rows: Shape (n,).
+            rows: Shape (n,); never written to afterwards.
         """
         start, stop = self._count, self._count + len(rows)
         if self._own is None and not start:
@@ -152,7 +157,7 @@ class EchoColumn:
         if self._leader is None:
             self._own = self._copied(stop) if self._own is None else self._own
             self._own.append(rows)
-        self._count = stop
+        self._count, self._last = stop, (start, rows)
 
     def has(self, rows: NDArray[Any], start: int) -> bool:
         """Whether some of its rows are these.
@@ -164,6 +169,8 @@ class EchoColumn:
         Returns:
             False where it has fewer rows, too.
         """
+        if self._last is not None and self._last[1] is rows and self._last[0] == start:
+            return True
         stop = start + len(rows)
         return self._count >= stop and np.array_equal(self.column()[start:stop], rows)
 
@@ -177,6 +184,38 @@ class EchoColumn:
         own = ColumnStore(self._dtype, 1, max(self._capacity, capacity))
         own.append(self.column())
         return own
+
+
+@dataclass(frozen=True)
+class Times:
+    """Times of some messages; nobody writes to the arrays.
+
+    Attributes:
+        log_ns: Log times [Unix ns], shape (n,).
+        stamp_ns: Stamps [ns], shape (n,); None where they have none.
+        behind_ns: Log times minus stamps [ns], shape (n,); None without stamps.
+        is_short: Whether those fit into 32 bits.
+    """
+
+    log_ns: IntArray
+    stamp_ns: IntArray | None = None
+    behind_ns: IntArray | None = None
+    is_short: bool = True
+
+    @classmethod
+    def of(cls, log_ns: IntArray, stamp_ns: IntArray) -> Self:
+        """Times of stamped messages.
+
+        Args:
+            log_ns: Log times [Unix ns], shape (n,).
+            stamp_ns: Stamps [ns], shape (n,).
+
+        Returns:
+            The times.
+        """
+        behind = log_ns - stamp_ns
+        short = not len(behind) or (behind.min() >= -_SHORT_NS and behind.max() < _SHORT_NS)
+        return cls(log_ns, stamp_ns, behind, bool(short))
 
 
 class TimeStore:
@@ -209,24 +248,21 @@ class TimeStore:
         """Where log times minus stamps are; empty without stamps."""
         return self._behind
 
-    def append(self, log_ns: IntArray, stamp_ns: IntArray | None) -> None:
+    def append(self, times: Times) -> None:
         """Add messages.
 
         Args:
-            log_ns: Log times [Unix ns], shape (n,).
-            stamp_ns: Stamps [ns], shape (n,); None where they have none.
+            times: Of the messages.
         """
-        if not self.is_stamped or stamp_ns is None:
-            self._stamps.append(log_ns)
+        if not self.is_stamped or times.stamp_ns is None or times.behind_ns is None:
+            self._stamps.append(times.log_ns)
             return
-        behind = log_ns - stamp_ns
-        far = len(behind) and (behind.min() < -_SHORT_NS or behind.max() >= _SHORT_NS)
-        if far and self._is_short:
-            wide = EchoColumn("<i8", len(self._behind) + len(behind))
+        if self._is_short and not times.is_short:
+            wide = EchoColumn("<i8", len(self._behind) + len(times.behind_ns))
             wide.append(self._behind.column())
             self._behind, self._is_short = wide, False
-        self._stamps.append(stamp_ns)
-        self._behind.append(behind)
+        self._stamps.append(times.stamp_ns)
+        self._behind.append(times.behind_ns)
 
     def __len__(self) -> int:
         """Number of messages."""

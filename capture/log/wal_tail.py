@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
-from .chunk import Block, Buffer, as_entries
+from .chunk import Block, Buffer
 from .wal import wal_folder
 from .wal_format import Definition
 from .wal_lock import is_live
@@ -142,9 +142,9 @@ class WalTail:
         """See :meth:`BlockSource.inflate_into`."""
         room[:] = self._data[block.start : block.stop]
 
-    def entries(self, block: Block, channel_ids: Sequence[int]) -> list[bytes]:
-        """See :meth:`BlockSource.entries`."""
-        return [as_entries(self.offsets(block, channel_id)) for channel_id in channel_ids]
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """See :meth:`BlockSource.indexed`."""
+        return [self.offsets(block, channel_id) for channel_id in channel_ids]
 
     def close(self) -> None:
         """Nothing to release."""

@@ -125,6 +125,21 @@ class SessionWriter(ChannelOpeners):
         """
         self._sink.define(Metadata(name, dict(facts)))
 
+    def explain(self, texts: Mapping[str, bytes], records: Mapping[str, Mapping[str, str]]) -> None:
+        """Store what a session was made from.
+
+        Args:
+            texts: File name to TOML text, e.g. ``plan.toml``.
+            records: Metadata records by name.
+
+        Raises:
+            LogWriteError: If the session can't be written.
+        """
+        for name, text in texts.items():
+            self.attach(name, "application/toml", text)
+        for name, facts in records.items():
+            self.note(name, facts)
+
     def note_at_end(self, name: str, facts: Mapping[str, str]) -> None:
         """Keep a metadata record until the session is closed.
 

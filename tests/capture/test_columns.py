@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import zstandard
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from capture import Session, SessionWriter
 from capture.errors import DataError
 from capture.log.frames import empty_frames
 from capture.log.own_times import Series, own_times
-from capture.log.stores import ColumnStore, EchoColumn, TimeStore
+from capture.log.stores import ColumnStore, EchoColumn, Times, TimeStore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 6)]
@@ -124,7 +126,7 @@ def test_stores_grow_and_keep_far_log_times():
     times = TimeStore(1, stamped=True)
     stamps = EPOCH_NS + np.arange(5)
     for behind in (10, 2**31, -(2**40)):
-        times.append(stamps + behind, stamps)
+        times.append(Times.of(stamps + behind, stamps))
     assert (times.log() - times.stamps()).tolist() == [10] * 5 + [2**31] * 5 + [-(2**40)] * 5
 
 
@@ -148,8 +150,12 @@ def test_echoes_keep_their_own_rows_whatever_the_others_get(seed):
 def test_a_damaged_frame_is_found_by_its_own_checksum(tmp_path):
     path = tmp_path / "s.mcap"
     write_session(path, 20)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    (imu,) = (key for key, channel in summary.channels.items() if channel.topic == "/imu")
+    (chunk,) = (each for each in summary.chunk_indexes if imu in each.message_index_offsets)
     data = bytearray(path.read_bytes())
-    at = data.index(b"\x28\xb5\x2f\xfd")
+    at = data.index(b"\x28\xb5\x2f\xfd", chunk.chunk_start_offset)
     assert zstandard.get_frame_parameters(bytes(data[at : at + 64])).has_checksum
     size = int.from_bytes(data[at - 8 : at], "little")
     data[at + size - 1] ^= 1  # the checksum itself: all else is whole
@@ -157,3 +163,38 @@ def test_a_damaged_frame_is_found_by_its_own_checksum(tmp_path):
     with Session(path) as session:
         assert len(session.table("/imu")) == 0
         assert any("can't be decompressed" in text for text in session.warnings)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sensors_of_shared_and_own_stamps_are_what_a_foreign_reader_finds(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    path = tmp_path / "s.mcap"
+    topics = [f"/ir/{k:02d}" for k in range(1, 5)]
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        limits = {"min_range": 0.0, "max_range": 4.0, "field_of_view": 0.1}
+        channels = [
+            writer.range(topic, frame=topic[1:], infrared=True, **limits) for topic in topics
+        ]
+        field = writer.magnetic_field("/compass", frame="compass")
+        for tick in range(400):
+            t_ns = EPOCH_NS + tick * STEP_NS
+            for k, channel in enumerate(channels):
+                chance = rng.random() if tick > 100 * k else 1.0
+                if chance > 0.02:  # one in fifty is missing, one has a stamp of its own
+                    own = t_ns + k if chance < 0.04 else t_ns
+                    channel.write(own, rng.random(), log_time_ns=t_ns + 5 * (chance < 0.06))
+            if tick % 2:
+                field.write(t_ns, rng.normal(size=3))
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [
+            (channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()
+        ]
+    with Session(path) as session:
+        _, tables = session.columns({}, {topic: ["range"] for topic in topics})
+    for topic in topics:
+        theirs = [message for name, message in found if name == topic]
+        stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in theirs]
+        order = np.argsort(stamps, kind="stable")
+        assert tables[topic].index.tolist() == np.array(stamps)[order].tolist()
+        assert tables[topic]["range"].tolist() == [theirs[k].range for k in order]

@@ -4,6 +4,7 @@ But for one thing: our zstd frames have a checksum, so the library is given a co
 the same.
 """
 
+import contextlib
 import io
 import struct
 from types import SimpleNamespace
@@ -13,7 +14,10 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from capture.log.mcap_writer import McapWriter
@@ -100,3 +104,42 @@ def test_a_number_out_of_range_leaves_the_chunk_as_it_was():
     writer.finish()
     stream.seek(0)
     assert [m.data for _, _, m in make_reader(stream).iter_messages()] == [b"x"]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    channels=st.lists(st.integers(0, 5), max_size=120),
+    settles=st.sets(st.integers(0, 119)),
+    chunk_size=st.integers(1, 600),
+)
+def test_groups_have_chunks_of_their_own_and_what_is_settled_is_in_the_file(
+    channels, settles, chunk_size
+):
+    """A foreign reader finds each channel whole, in order, and the first messages at any time."""
+    stream = io.BytesIO()
+    writer = McapWriter(stream, chunk_size, lambda topic, kind: topic if kind == "big" else "")
+    writer.start("", "")
+    kinds = [writer.register_schema(name, "ros2msg", b"") for name in ("big", "small")]
+    ids = [writer.register_channel(f"/t{k}", "cdr", kinds[k % 2]) for k in range(6)]
+    for k, channel in enumerate(channels):
+        writer.add_message(ids[channel], 7 + k, b"%d" % k * (channel + 1), k, k)
+        if k in settles:
+            writer.settle(k // 2)
+            assert writer.settled >= k // 2
+        assert 0 <= writer.settled <= writer.messages == k + 1
+        records = StreamReader(io.BytesIO(stream.getvalue())).records
+        there = {each.sequence for each in until_the_end(records) if isinstance(each, Message)}
+        assert set(range(writer.settled)) <= there
+    writer.finish()
+    reader = make_reader(io.BytesIO(stream.getvalue()))
+    found = [(c.id, m.sequence, m.data) for _, c, m in reader.iter_messages()]
+    assert found == [(ids[c], k, b"%d" % k * (c + 1)) for k, c in enumerate(channels)]
+    for chunk in reader.get_summary().chunk_indexes:
+        topics = [key for key in chunk.message_index_offsets if ids.index(key) % 2 == 0]
+        assert not topics or list(chunk.message_index_offsets) == topics[:1]
+
+
+def until_the_end(records):
+    """Records of a file that has no end yet."""
+    with contextlib.suppress(EndOfFile):
+        yield from records

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from capture import Session, load_robot
 from capture.errors import (
@@ -71,13 +72,35 @@ def test_a_cut_file_keeps_every_whole_message_before_the_cut(tmp_path: Path) -> 
 
 def test_a_flipped_bit_in_a_chunk_is_told_and_only_that_chunk_is_missing(tmp_path: Path) -> None:
     write_session(tmp_path / "s.mcap", 6000)
+    with (tmp_path / "s.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    (states,) = (key for key, each in summary.channels.items() if each.topic == "/joint_states")
+    chunks = [chunk for chunk in summary.chunk_indexes if states in chunk.message_index_offsets]
+    middle = chunks[len(chunks) // 2]
     damaged = bytearray((tmp_path / "s.mcap").read_bytes())
-    damaged[len(damaged) // 2] ^= 0x10
+    damaged[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0x10
     (tmp_path / "d.mcap").write_bytes(damaged)
     with Session.open(tmp_path / "d.mcap") as session:
         count = len(session.joints("/joint_states").t_ns[0])
         assert any("its messages are missing" in warning for warning in session.warnings)
     assert 3000 < count < 6000
+
+
+def test_chunks_that_claim_to_have_no_bytes_are_told_as_missing(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", 6000)
+    with (tmp_path / "s.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    damaged = bytearray((tmp_path / "s.mcap").read_bytes())
+    for chunk in summary.chunk_indexes:  # its compressed length is the last field before its bytes
+        compression = len(chunk.compression.encode())
+        at = chunk.chunk_start_offset + 9 + 8 + 8 + 8 + 4 + 4 + compression
+        claimed = int.from_bytes(damaged[at : at + 8], "little")
+        assert claimed == chunk.compressed_size
+        damaged[at : at + 8] = bytes(8)
+    (tmp_path / "d.mcap").write_bytes(damaged)
+    with Session.open(tmp_path / "d.mcap") as session:
+        assert not session.joints("/joint_states").t_ns  # no message tells of a joint
+        assert any("its messages are missing" in warning for warning in session.warnings)
 
 
 def mutations(whole: bytes) -> list[bytes]:
