@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from capture.errors import SimulationError
@@ -51,11 +51,13 @@ class Driver:
         gait: The commands; a run that is stopped has come to rest by then.
         facts: What the session's metadata says of it.
         attachments: File name to TOML text that explains it, e.g. ``plan.toml``.
+        records: Other metadata records that explain it, by name.
     """
 
     gait: Gait
     facts: Mapping[str, str]
     attachments: Mapping[str, bytes]
+    records: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
 
     def session_id(self, scenario: Scenario) -> str:
         """Hash of everything that decides what the run gives.
@@ -122,8 +124,8 @@ def record(
             force=force,
         ) as writer,
     ):
-        for name, data in driver.attachments.items() if driver is not None else ():
-            writer.attach(name, "application/toml", data)
+        if driver is not None:
+            writer.explain(driver.attachments, driver.records)
         log = SessionLog(writer, twin)
         try:
             for sample in twin.samples():

@@ -88,8 +88,9 @@ frequency and lag (``delay_s`` of delay blocks).
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from capture.errors import Fault, ScenarioError
 from capture.robot import Plane, Robot
@@ -116,11 +117,12 @@ def scenario_names() -> tuple[str, ...]:
     return _SHELF.names()
 
 
-def load_scenario(name_or_path: str | Path) -> Scenario:
+def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
     """Read a shipped scenario by name, or a scenario from a file.
 
     Args:
         name_or_path: A name of :func:`scenario_names`, or the path of a TOML file.
+        changes: Keys, with dots, to the values that they are to have instead.
 
     Returns:
         The scenario.
@@ -131,16 +133,25 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         RobotFileError: If the robot's own file has faults.
     """
     found = _SHELF.read(name_or_path)
-    return parse_scenario(found.text, found.source)
+    return parse_scenario(found.text, found.source, changes=changes)
 
 
-def parse_scenario(text: str, source: str | Path) -> Scenario:
+def parse_scenario(
+    text: str,
+    source: str | Path,
+    robot: Robot | None = None,
+    changes: Mapping[str, Any] | None = None,
+) -> Scenario:
     """Read a scenario from text.
 
     Args:
         text: The TOML text.
         source: Where it comes from: for messages, for the default name, and to find a robot's
             file beside it.
+        robot: The robot that it names, where it is at hand already, as in a session that carries
+            its description.
+        changes: Keys, with dots, e.g. ``servo.stall_torque``, to the values that they are to have
+            instead of the text's.
 
     Returns:
         The scenario.
@@ -155,10 +166,12 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
+    for key, value in (changes or {}).items():
+        _change(values, key, value, faults)
     top = Table(values, "", faults)
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
     robot_name = top.text("robot")
-    robot = _robot(top, robot_name, source.parent)
+    robot = robot or _robot(top, robot_name, source.parent)
     seed = top.integer("seed", at_least=0) if "seed" in top else Scenario.seed
     parts: dict[str, Any] = {
         "name": top.name("name") if "name" in top else stem,
@@ -187,6 +200,19 @@ def parse_scenario(text: str, source: str | Path) -> Scenario:
     if (found := faults.all()) or robot is None:
         raise ScenarioError(source, found)
     return Scenario(robot=parts["modules"].fitted(robot), **parts)
+
+
+def _change(values: dict[str, Any], key: str, value: object, faults: Faults) -> None:
+    """Set one value of nested tables; a fault where its place is no table."""
+    *path, last = key.split(".")
+    table: object = values
+    for name in path:
+        if isinstance(table, dict):
+            table = cast("dict[str, object]", table).setdefault(name, {})
+    if isinstance(table, dict):
+        cast("dict[str, object]", table)[last] = value
+    else:
+        faults.add(key, "a part of what is no table", "a key of a table, e.g. servo.stall_torque")
 
 
 def _times(top: Table) -> dict[str, float]:

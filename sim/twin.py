@@ -165,8 +165,7 @@ class Twin:
         Raises:
             SimulationError: If there is one.
         """
-        motion = np.abs(steps.stacked.body.velocity)
-        rotors = np.abs(steps.stacked.rotors.speed)
+        motion, rotors = np.abs(steps.links[:, 7:10]), np.abs(steps.motors[:, 1])
         if motion.max() <= MAX_SPEED and rotors.max() <= MAX_ROTOR_SPEED:  # false for NaN
             return
         speed = motion.max(axis=1)

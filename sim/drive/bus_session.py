@@ -61,6 +61,7 @@ class BusSession:
         armed: bool,
         facts: Mapping[str, str],
         attachments: Mapping[str, bytes],
+        records: Mapping[str, Mapping[str, str]],
         force: bool = False,
     ) -> None:
         """Open the session.
@@ -75,6 +76,7 @@ class BusSession:
             armed: Whether commands are sent.
             facts: For the metadata.
             attachments: File name to TOML text that explains what is driven.
+            records: Other metadata records that explain it, by name.
             force: Replace an existing file.
 
         Raises:
@@ -92,8 +94,7 @@ class BusSession:
             force=force,
             sink=None if path is not None else NowhereSink(),
         )
-        for name, data in attachments.items():
-            self.writer.attach(name, "application/toml", data)
+        self.writer.explain(attachments, records)
         topic = "/joint_commands" if armed else "/dry_run/joint_commands"
         self._commands = self.writer.joint_state(topic, robot.joint_names, unit="rad")
         self._gait = (

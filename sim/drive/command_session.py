@@ -33,14 +33,14 @@ _NS = 1_000_000_000
 
 
 class _Held:
-    """Values of several names, each by zero-order hold."""
+    """Values of several names, each by zero-order hold; NaN is a value unless ``known`` only."""
 
-    def __init__(self, signals: JointSignals) -> None:
+    def __init__(self, signals: JointSignals, *, known: bool = False) -> None:
         self.names = signals.names
         self._series: list[tuple[IntArray, FloatArray]] = []
         for t_ns, values in zip(signals.t_ns, signals.values, strict=True):
-            known = ~np.isnan(values)
-            self._series.append((t_ns[known], values[known]))
+            kept = ~np.isnan(values) if known else slice(None)
+            self._series.append((t_ns[kept], values[kept]))
 
     @property
     def given(self) -> bool:
@@ -108,7 +108,7 @@ class CommandReplay:
         Raises:
             DataError: If the robot lacks one of the joints, or there is no command.
         """
-        held = _Held(recorded.commands)
+        held = _Held(recorded.commands, known=True)
         strange = [name for name in held.names if name not in robot.joint_names]
         if strange:
             raise DataError(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from capture import Session
 from capture.errors import DataError, PlanError, UsageError
@@ -14,6 +15,7 @@ from capture.shipped import Shelf
 
 from ..control.build import build_gait
 from ..gait import Gait
+from ..physics.engine import Kernels
 from ..scenario import Scenario
 from ..scenario_file import load_scenario, parse_scenario, scenario_names
 from .command_session import CommandReplay, RecordedCommands
@@ -22,6 +24,9 @@ from .plan_file import is_plan, parse_plan
 
 _EXPLAINS = ("plan.toml", "gait.toml")
 """Attachments of recorded commands that say what they were made from: they go on to the run."""
+
+_RECORDS = ("undulog.plan",)
+"""Metadata records of recorded commands that say what they are for: likewise."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,10 @@ class Driven:
         attachments: File name to TOML text that explains it.
         own: The scenario whose gait and controller are driven, if that is what it is: a run's
             scenario then says it all.
+        settle_s: The first part of it that is not fit for steady-state analysis, None where it
+            does not say.
+        records: Metadata records that go along, by name.
+        kernels: What computed the force laws in the run that it is taken from.
     """
 
     kind: str
@@ -53,6 +62,15 @@ class Driven:
     facts: Mapping[str, str]
     attachments: Mapping[str, bytes]
     own: Scenario | None = None
+    settle_s: float | None = None
+    records: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
+    kernels: Kernels = Kernels.NUMPY
+
+    @property
+    def session_facts(self) -> Mapping[str, str]:
+        """What the metadata of a session without a scenario says of it."""
+        settled = {} if self.settle_s is None else {"settle_s": repr(self.settle_s)}
+        return {**self.facts, **settled}
 
     def scenario(self, world: Scenario | None, duration_s: float | None) -> Scenario:
         """The scenario of a run on the twin.
@@ -62,7 +80,8 @@ class Driven:
             duration_s: Length of the run; its own if None.
 
         Returns:
-            The world, with the length and, if it is a scenario's gait, that gait and controller.
+            The world, with the length, the settling time that it says, and, if it is a scenario's
+            gait, that gait and controller.
 
         Raises:
             UsageError: If no world is known, or its robot lacks a plane.
@@ -81,16 +100,22 @@ class Driven:
                 )
         if self.own is not None:
             where = dataclasses.replace(where, gait=self.own.gait, controller=self.own.controller)
+        if self.settle_s is not None:
+            where = dataclasses.replace(where, settle_s=self.settle_s)
         return where.changed(duration_s=self.duration_s if duration_s is None else duration_s)
 
 
-def find_driven(word: str, world: Scenario | None = None) -> Driven:
+def find_driven(
+    word: str, world: Scenario | None = None, changes: Mapping[str, Any] | None = None
+) -> Driven:
     """Find what is to be driven.
 
     Args:
         word: Name of a shipped scenario, or a file: a scenario or a plan (TOML), or a session of
             commands (MCAP).
         world: Where it will be run, if that is known: its robot takes recorded commands.
+        changes: Of recorded commands: what to change of the world that they were recorded in, see
+            :func:`sim.scenario_file.parse_scenario`.
 
     Returns:
         What it is.
@@ -104,7 +129,7 @@ def find_driven(word: str, world: Scenario | None = None) -> Driven:
     path = Path(word)
     is_folder = path.is_dir() and word not in scenario_names()  # of the parts of a session
     if path.suffix == ".mcap" or is_folder:
-        return _commands(path, world)
+        return _commands(path, world, changes)
     found = Shelf("gait or plan", "sim", "scenarios", PlanError).read(word)
     if is_plan(found.text):
         return _plan(found.text, found.source)
@@ -126,6 +151,7 @@ def _gait(scenario: Scenario) -> Driven:
         facts={"driven": "gait", "driven.by": scenario.name},
         attachments={"gait.toml": scenario.toml().encode()},
         own=scenario,
+        settle_s=scenario.settle_s,
     )
 
 
@@ -144,12 +170,13 @@ def _plan(text: str, source: Path) -> Driven:
     )
 
 
-def _commands(path: Path, world: Scenario | None) -> Driven:
+def _commands(path: Path, world: Scenario | None, changes: Mapping[str, Any] | None) -> Driven:
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
-        stored = session.attachments
-        robot = session.robot if world is None else world.robot
+        stored, told = session.attachments, session.metadata
+        settle_s, described = session.settle_s, session.robot
+        robot = described if world is None else world.robot
         facts["driven.session_id"] = session.session_id
     if robot is None:
         raise DataError(f"{path}: the session has no robot; name one by its world, e.g. twin:flat")
@@ -161,7 +188,9 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
     def recorded_world() -> Scenario | None:
         """The scenario that a session of the twin ran."""
         text = stored.get("scenario.toml")
-        return None if text is None else parse_scenario(text.decode(), f"{path}:scenario.toml")
+        if text is None:
+            return None
+        return parse_scenario(text.decode(), f"{path}:scenario.toml", described, changes)
 
     return Driven(
         kind="commands",
@@ -173,4 +202,12 @@ def _commands(path: Path, world: Scenario | None) -> Driven:
         make=lambda robot, _: CommandReplay(recorded, robot),
         facts=facts,
         attachments={name: stored[name] for name in _EXPLAINS if name in stored},
+        settle_s=settle_s,
+        records={name: told[name] for name in _RECORDS if name in told},
+        kernels=_kernels(told.get("undulog", {}).get("kernels")),
     )
+
+
+def _kernels(told: str | None) -> Kernels:
+    """What a session says of its kernels; the default where that is nothing we know."""
+    return Kernels(told) if told in set(Kernels) else Kernels.NUMPY

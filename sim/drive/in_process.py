@@ -42,6 +42,7 @@ def drive_twin(
         SimulationError: If the twin's state becomes impossible.
         OutputExistsError: If the file is there and ``force`` is not given.
         LogWriteError: If the file can't be written.
+        ImportError: If the kernels of the run that commands are from are not installed.
     """
     gait = FadingGait(driven.make(scenario.robot, scenario), scenario.robot)
     ended = StopRequest()
@@ -54,5 +55,13 @@ def drive_twin(
         if gait.at_rest:
             ended.signal = stop.signal if stop is not None else None
 
-    driver = Driver(gait, driven.facts, driven.attachments)
-    return record(scenario, path, driver=driver, force=force, stop=ended, on_sample=after)
+    driver = Driver(gait, driven.facts, driven.attachments, driven.records)
+    return record(
+        scenario,
+        path,
+        driver=driver,
+        force=force,
+        stop=ended,
+        on_sample=after,
+        kernels=driven.kernels,
+    )

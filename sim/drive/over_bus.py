@@ -160,8 +160,9 @@ def drive_bus(
             epoch_ns=epoch_ns,
             gait_names=gait.names,
             armed=plan.armed,
-            facts={**plan.driven.facts, f"source.{plan.address.name}": plan.address.text},
+            facts={**plan.driven.session_facts, f"source.{plan.address.name}": plan.address.text},
             attachments=plan.driven.attachments,
+            records=plan.driven.records,
             force=plan.force,
         )
         opened.callback(session.close)

@@ -143,6 +143,14 @@ class Oscillators(Protocol):
         """
         ...
 
+    def kick(self, turn: FloatArray) -> None:
+        """Turn each oscillator at once; radii stay.
+
+        Args:
+            turn: Added to the phases [rad], shape (n,).
+        """
+        ...
+
 
 class PhaseOscillators:
     """phi_i' = omega + extra_i + sum_j K_ij sin(phi_j - phi_i - psi_ij)."""
@@ -165,6 +173,10 @@ class PhaseOscillators:
             return extra(time_s, theta) + phase_rates(theta, coupling)
 
         self.theta = integrate(rate, self.theta, span_s, fastest + coupling.fastest)
+
+    def kick(self, turn: FloatArray) -> None:
+        """Turn each at once, see :class:`Oscillators`."""
+        self.theta = self.theta + turn
 
 
 class HopfOscillators:
@@ -198,3 +210,8 @@ class HopfOscillators:
         bound = fastest + coupling.fastest + 2.0 * attraction
         self._z = integrate(rate, before, span_s, bound)
         self.theta = self.theta + np.angle(self._z * np.conj(before))
+
+    def kick(self, turn: FloatArray) -> None:
+        """Turn each at once, see :class:`Oscillators`."""
+        self._z = self._z * np.exp(1j * turn)
+        self.theta = self.theta + turn

@@ -12,6 +12,9 @@ A the plane's own amplitude: of a response q_i - Y_i = g_i A sin(phi_i + delta_i
 eps (g_i sin(delta_i) - b_i), and a steady b_i = g_i sin(delta_i) removes what is constant of it.
 The angles are those last reported, so delta_i holds their age too; a joint that has reported
 nothing yet is not fed back.
+
+Locked phases tell nothing of what couples them. Kicks do: every so often each phase jumps by a
+random amount, and the way back shows the coupling.
 """
 
 from __future__ import annotations
@@ -38,6 +41,12 @@ Numbers: TypeAlias = "float | tuple[float, ...]"
 """One number for all, or one for each."""
 
 
+_KICK_SEED = 1
+
+_SAME_TIME_S = 1e-9
+"""Rounding of times: a kick comes no tick late for it."""
+
+
 class OscillatorKind(StrEnum):
     """What each oscillator is."""
 
@@ -59,6 +68,10 @@ class OscillatorChain(PlaneGait):
         attraction: alpha of Hopf oscillators [1/s].
         feedback: eps [1/s].
         feedback_bias: b, one number or n.
+        kick_every_s: Time from the start to the first kick and from one to the next, of which
+            at most one comes in a control period; 0: no kicks.
+        kick_size: Largest jump of a phase; each is drawn evenly up to it, the same in every run
+            [rad].
     """
 
     oscillator: OscillatorKind = OscillatorKind.PHASE
@@ -70,6 +83,8 @@ class OscillatorChain(PlaneGait):
     attraction: float = 5.0
     feedback: float = 0.0
     feedback_bias: Numbers = 0.0
+    kick_every_s: float = 0.0
+    kick_size: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +140,7 @@ class _OscillatorRhythm:
         )
         self._amplitude = Approach(np.zeros(n), chain.approach_rate)
         self._offset = Approach(np.zeros(n), chain.approach_rate)
+        self._random, self._kicks = np.random.default_rng(_KICK_SEED), 0
         # What is in force until the next tick.
         self._time_s, self._factor = 0.0, 1.0
         self._felt, self._steady = np.zeros(n), np.zeros(n)
@@ -132,6 +148,7 @@ class _OscillatorRhythm:
     def step(self, time_s: float, change: Change, readings: Readings) -> Swing:
         chain, elapsed = self._chain, time_s - self._time_s
         self._turn(elapsed)
+        self._kick(time_s)
         amplitude, offset = self._amplitude.advance(elapsed), self._offset.advance(elapsed)
         self._amplitude.aim(chain.amplitude * change.amplitude_factor)
         self._offset.aim(chain.offset + change.offset)
@@ -155,6 +172,15 @@ class _OscillatorRhythm:
         deviation = np.where(known, angle - offset, 0.0)
         self._felt = eps * 2.0 * deviation / self._chain.amplitude
         self._steady = np.where(known, eps * self._bias, 0.0)
+
+    def _kick(self, time_s: float) -> None:
+        """Make the kick whose time has come; at most one a control period."""
+        every, size = self._chain.kick_every_s, self._chain.kick_size
+        if every > 0.0:
+            due = (time_s + _SAME_TIME_S) / every  # times to kick so far
+            if due >= self._kicks + 1:
+                self._kicks = np.floor(due)
+                self._oscillators.kick(self._random.uniform(-size, size, len(self._joints)))
 
     def _turn(self, elapsed_s: float) -> None:
         """Advance the oscillators by what has been in force since the last tick."""

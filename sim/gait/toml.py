@@ -150,6 +150,8 @@ def _oscillator_chain(part: Table, max_frequency_hz: float, count: int | None) -
         attraction=attraction,
         feedback=part.number("feedback", default=default.feedback, at_least=0.0, at_most=STRONGEST),
         feedback_bias=_numbers(part, "feedback_bias", count, default.feedback_bias),
+        kick_every_s=part.number("kick_every_s", default=default.kick_every_s, at_least=0.0),
+        kick_size=part.number("kick_size", default=default.kick_size, at_least=0.0),
     )
     if chain.feedback > 0.0 and chain.amplitude == 0.0:
         part.fault("amplitude", "> 0 with feedback, which is measured against it")

@@ -192,11 +192,14 @@ class BulletEngine:
         Args:
             torque: Of the joints [N m], shape (m,).
         """
+        self._advance(torque.tolist())
+
+    def _advance(self, torque: list[float]) -> None:
         pybullet.setJointMotorControlArray(
             self._body,
             self._joints,
             pybullet.TORQUE_CONTROL,
-            forces=torque.tolist(),
+            forces=torque,
             physicsClientId=self._client,
         )
         pybullet.stepSimulation(self._client)

@@ -57,10 +57,11 @@ class CompiledBulletEngine(BulletEngine):
         self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in robot.joints])
         self._hinges = np.zeros((6, len(robot.joints)))
         self._generalised = np.zeros(6 + len(robot.joints))
+        self._drive = self._generalised[6:]  # of the joints
         self._coordinates = np.zeros(13 + 2 * len(robot.joints))
         self._buffer = self._coordinates.data  # the same memory
         self._pack = struct.Struct(f"{len(self._coordinates)}d").pack_into
-        self._state = self.read()
+        self.read()
 
     def read(self, into: BodyState | None = None) -> BodyState:
         """The present state.
@@ -72,14 +73,14 @@ class CompiledBulletEngine(BulletEngine):
             Positions and velocities of links and joints, in these arrays.
         """
         state = into or BodyState.empty(len(self._half), len(self._joints))
-        client = self._client
-        place, turn = pybullet.getBasePositionAndOrientation(self._body, client)
-        velocity, spin = pybullet.getBaseVelocity(self._body, client)
-        joints = pybullet.getJointStates(self._body, self._joints, client)
-        moving = *map(_angle, joints), *map(_rate, joints)
-        self._pack(self._buffer, 0, *place, *turn, *velocity, *spin, *moving)
+        body, client = self._body, self._client
+        self._place, turn = pybullet.getBasePositionAndOrientation(body, client)
+        velocity, spin = pybullet.getBaseVelocity(body, client)
+        joints = pybullet.getJointStates(body, self._joints, client)
+        head = *self._place, *turn, *velocity, *spin
+        self._pack(self._buffer, 0, *head, *map(_angle, joints), *map(_rate, joints))
         chain_kernels.spread(self._coordinates, self._half, self._vertical, *state, self._hinges)
-        self._state = state
+        self._position = state.position
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
@@ -89,7 +90,7 @@ class CompiledBulletEngine(BulletEngine):
             force: In the world [N], shape (3, n).
             point: Points of action in the world [m], shape (3, n).
         """
-        chain_kernels.gather(force, point, self._state.position, self._hinges, self._generalised)
+        chain_kernels.gather(force, point, self._position, self._hinges, self._generalised)
 
     def step(self, torque: FloatArray) -> None:
         """Advance the body by one step.
@@ -97,10 +98,10 @@ class CompiledBulletEngine(BulletEngine):
         Args:
             torque: Of the joints [N m], shape (m,).
         """
-        fx, fy, fz, mx, my, mz = self._generalised[:6].tolist()
-        at = self._state.position[:, 0].tolist()
-        world, client = pybullet.WORLD_FRAME, self._client
-        pybullet.applyExternalForce(self._body, -1, (fx, fy, fz), at, world, client)
-        pybullet.applyExternalTorque(self._body, -1, (mx, my, mz), world, client)
-        super().step(torque + self._generalised[6:])
-        self._generalised[:] = 0.0
+        self._drive += torque
+        load = self._generalised.tolist()
+        self._generalised.fill(0.0)
+        body, world, client = self._body, pybullet.WORLD_FRAME, self._client
+        pybullet.applyExternalForce(body, -1, load[:3], self._place, world, client)
+        pybullet.applyExternalTorque(body, -1, load[3:6], world, client)
+        self._advance(load[6:])

@@ -12,7 +12,7 @@ Arrays over n links carry the component first, shape (k, n), so that a row is on
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,13 +20,18 @@ import numpy as np
 from capture.arrays import FloatArray
 
 from ..world.ground import FrictionLaw, Ground
+from .engine import BodyState
 
 _TINY = 1e-300
 """Makes 0/0 a zero."""
 
 
 def normal_force(
-    penetration: FloatArray, rate: FloatArray, stiffness: float, damping: float
+    penetration: FloatArray,
+    rate: FloatArray,
+    stiffness: float | FloatArray,
+    damping: float | FloatArray,
+    out: FloatArray | None = None,
 ) -> FloatArray:
     """Normal force of the ground, Eq. 7 of Meister et al. 2011, clamped so that it never pulls.
 
@@ -37,31 +42,44 @@ def normal_force(
         rate: Rate of the depth, -v_z [m/s], shape (n,).
         stiffness: k [N/m].
         damping: d [N s/m].
+        out: Where the result goes; a new array by default.
 
     Returns:
         Force [N], never negative, shape (n,).
     """
     force = np.maximum(stiffness * penetration + damping * rate, 0.0)
-    return force * (penetration > 0.0)
+    return np.multiply(force, np.heaviside(penetration, 0.0), out=out)
 
 
-def _ellipse(slip: FloatArray, mu: FloatArray, slip_speed: float) -> FloatArray:
-    weighted = mu * slip
-    squares = weighted * weighted
+PerNewton: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Friction along (tangential, normal) for a load of 1 N, given the slip, both of shape (2, n)."""
+
+
+def _ellipse(mu: FloatArray, slip_speed: float) -> PerNewton:
+    against = -mu * mu
     floor = (mu * slip_speed) ** 2 + _TINY  # a coefficient may be 0
-    return -mu * weighted / np.sqrt(squares[0] + squares[1] + floor)
+
+    def friction(slip: FloatArray) -> FloatArray:
+        weighted = against * slip
+        power = weighted * slip
+        return weighted / np.sqrt(floor - (power[0] + power[1]))
+
+    return friction
 
 
-def _box(slip: FloatArray, mu: FloatArray, slip_speed: float) -> FloatArray:
-    return -mu * slip / np.sqrt(slip * slip + slip_speed**2)
+def _box(mu: FloatArray, slip_speed: float) -> PerNewton:
+    return lambda slip: -mu * slip / np.sqrt(slip * slip + slip_speed**2)
 
 
-def _transeth(slip: FloatArray, mu: FloatArray, slip_speed: float) -> FloatArray:
-    squares = slip * slip
-    return -mu * slip / np.sqrt(squares[0] + squares[1] + slip_speed**2)
+def _transeth(mu: FloatArray, slip_speed: float) -> PerNewton:
+    def friction(slip: FloatArray) -> FloatArray:
+        squares = slip * slip
+        return -mu * slip / np.sqrt(squares[0] + squares[1] + slip_speed**2)
+
+    return friction
 
 
-_LAWS: dict[FrictionLaw, Callable[[FloatArray, FloatArray, float], FloatArray]] = {
+_LAWS: dict[FrictionLaw, Callable[[FloatArray, float], PerNewton]] = {
     FrictionLaw.ELLIPSE: _ellipse,
     FrictionLaw.BOX: _box,
     FrictionLaw.TRANSETH: _transeth,
@@ -86,7 +104,7 @@ def friction_force(
     Returns:
         Force along (tangential, normal) [N], shape (2, n).
     """
-    return _LAWS[law](slip, mu, slip_speed) * normal
+    return _LAWS[law](mu, slip_speed)(slip) * normal
 
 
 def drag_force(slip: FloatArray, depth: FloatArray, drag: FloatArray) -> FloatArray:
@@ -106,41 +124,47 @@ def drag_force(slip: FloatArray, depth: FloatArray, drag: FloatArray) -> FloatAr
     return -drag * slip * (depth > 0.0)
 
 
-def tangents(quaternion: FloatArray) -> FloatArray:
+def tangents(
+    quaternion: Iterable[FloatArray],
+    out: tuple[FloatArray | None, FloatArray | None] = (None, None),
+) -> tuple[FloatArray, FloatArray]:
     """Unit vectors on the ground below the links' x axes.
 
     Args:
-        quaternion: Orientations x, y, z, w as rows, shape (4, n).
+        quaternion: Orientations x, y, z, w, each of shape (n,).
+        out: Where the result goes; new arrays by default.
 
     Returns:
-        World x and y of the tangential axes, shape (2, n); zero for a vertical link.
+        World x and y of the tangential axes, each of shape (n,); zero for a vertical link.
     """
     x, y, z, w = quaternion
-    tangent = np.empty((2, quaternion.shape[1]))
     # Half of the first two entries of the rotation's first column.
-    along_x = np.subtract(0.5, y * y + z * z, out=tangent[0])
-    along_y = np.add(x * y, z * w, out=tangent[1])
-    length = np.sqrt(along_x * along_x + along_y * along_y)
-    tangent /= np.maximum(length, _TINY)
-    return tangent
+    along_x, along_y = 0.5 - (y * y + z * z), x * y + z * w
+    length = np.maximum(np.hypot(along_x, along_y), _TINY)
+    return np.divide(along_x, length, out=out[0]), np.divide(along_y, length, out=out[1])
 
 
-def into_link_axes(tangent: FloatArray, vector: FloatArray) -> FloatArray:
-    """Horizontal components of world vectors along the links' tangential and normal axes.
+def into_link_axes(
+    tx: FloatArray,
+    ty: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    out: tuple[FloatArray | None, FloatArray | None] = (None, None),
+) -> tuple[FloatArray, FloatArray]:
+    """Horizontal world vectors along the links' tangential and normal axes.
 
     Args:
-        tangent: World x and y of the tangential axes, shape (..., 2, n).
-        vector: World x, y and perhaps z, shape (..., 2 or 3, n).
+        tx: World x of the tangential axes, shape (..., n).
+        ty: World y of the tangential axes, same shape.
+        x: World x of the vectors, same shape.
+        y: World y of the vectors, same shape.
+        out: Where the result goes; new arrays by default.
 
     Returns:
-        Components along (tangential, normal), shape (..., 2, n).
+        Components along (tangential, normal), each of the same shape.
     """
-    tx, ty = tangent[..., 0, :], tangent[..., 1, :]
-    x, y = vector[..., 0, :], vector[..., 1, :]
-    parts = np.empty_like(tangent)
-    np.add(tx * x, ty * y, out=parts[..., 0, :])
-    np.subtract(tx * y, ty * x, out=parts[..., 1, :])
-    return parts
+    along = np.add(tx * x, ty * y, out=out[0])
+    return along, np.subtract(tx * y, ty * x, out=out[1])
 
 
 class Contact(NamedTuple):
@@ -159,45 +183,62 @@ class Contact(NamedTuple):
     force: FloatArray
 
 
-ContactLaw: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], Contact]
+class GroundContact:
+    """The ground's law, bound to the arrays where one body's state and contact stand.
 
-
-def contact_law(ground: Ground | None, radius: FloatArray) -> ContactLaw:
-    """The ground's law, ready for one body.
-
-    Args:
-        ground: The ground, or None where there is none: no force at all.
-        radius: Radii of the links [m], shape (n,).
-
-    Returns:
-        A pure function of the links' centres, orientations (x, y, z, w), velocities and angular
-        velocities in the world, of shapes (3, n), (4, n), (3, n), (3, n), to a :class:`Contact`.
+    Short arrays cost by the call, not by the element. So components are views that are made once,
+    and constants are as wide as what they meet.
     """
-    surface = ground or Ground(stiffness=0.0, damping=0.0)
-    mu = np.array([[surface.mu_tangential], [surface.mu_normal]])
-    drag = np.array([[surface.drag_tangential], [surface.drag_normal]])
 
-    def resistance(slip: FloatArray, normal: FloatArray, depth: FloatArray) -> FloatArray:
-        if surface.law is FrictionLaw.VISCOUS:
-            return drag_force(slip, depth, drag)
-        return friction_force(slip, normal, mu, surface.slip_speed, surface.law)
+    def __init__(
+        self, ground: Ground | None, radius: FloatArray, body: BodyState, contact: Contact
+    ) -> None:
+        """Get ready.
 
-    def contact(
-        position: FloatArray, quaternion: FloatArray, velocity: FloatArray, spin: FloatArray
-    ) -> Contact:
+        Args:
+            ground: The ground, or None where there is none: no force at all.
+            radius: Radii of the links [m], shape (n,).
+            body: Where the body's state stands whenever :meth:`act` is called.
+            contact: What is filled in.
+        """
+        surface = ground or Ground(stiffness=0.0, damping=0.0)
+        ones = np.ones((2, len(radius)))
+        self._stiffness, self._damping = surface.stiffness * ones[0], surface.damping * ones[0]
+        mu = np.array([[surface.mu_tangential], [surface.mu_normal]]) * ones
+        self._drag = np.array([[surface.drag_tangential], [surface.drag_normal]]) * ones
+        self._friction = (
+            None
+            if surface.law is FrictionLaw.VISCOUS
+            else _LAWS[surface.law](mu, surface.slip_speed)
+        )
+        self._radius, self._height = radius, body.position[2]
+        self._quaternion, self._velocity = tuple(body.quaternion), tuple(body.velocity)
+        self._spin = body.spin[0], body.spin[1]
+        self._at_point, self._depth = tuple(contact.velocity), contact.depth
+        self._tangent = contact.tangent[0], contact.tangent[1]
+        self._force = tuple(contact.force)
+        self._slip, self._resistance = np.empty_like(ones), np.empty_like(ones)
+        self._slip_parts = self._slip[0], self._slip[1]
+        self._along, self._across = self._resistance
+
+    def act(self) -> None:
+        """Fill in the contact."""
         # The contact point lies r below the centre: v_c = v + omega x (0, 0, -r).
-        at_point = velocity.copy()
-        at_point[0] -= radius * spin[1]
-        at_point[1] += radius * spin[0]
-        depth = radius - position[2]
-        normal = normal_force(depth, -velocity[2], surface.stiffness, surface.damping)
-        tangent = tangents(quaternion)
-        slip = into_link_axes(tangent, at_point)
-        (tx, ty), (along, across) = tangent, resistance(slip, normal, depth)
-        force = np.empty_like(at_point)
-        np.subtract(tx * along, ty * across, out=force[0])
-        np.add(ty * along, tx * across, out=force[1])
-        force[2] = normal
-        return Contact(at_point, tangent, depth, force)
-
-    return contact
+        r, (vx, vy, vz), (wx, wy) = self._radius, self._velocity, self._spin
+        x, y, z = self._at_point
+        np.subtract(vx, r * wy, out=x)
+        np.add(vy, r * wx, out=y)
+        np.copyto(z, vz)
+        depth = np.subtract(r, self._height, out=self._depth)
+        force_x, force_y, normal = self._force
+        normal_force(depth, -vz, self._stiffness, self._damping, out=normal)
+        # Into the link's axes, where the ground resists, and back.
+        tx, ty = tangents(self._quaternion, self._tangent)
+        into_link_axes(tx, ty, x, y, self._slip_parts)
+        if self._friction is None:
+            self._resistance[...] = drag_force(self._slip, depth, self._drag)
+        else:
+            np.multiply(self._friction(self._slip), normal, out=self._resistance)
+        along, across = self._along, self._across
+        np.subtract(tx * along, ty * across, out=force_x)
+        np.add(ty * along, tx * across, out=force_y)

@@ -11,7 +11,7 @@ import numpy as np
 from capture.arrays import FloatArray
 
 from .contact import into_link_axes
-from .servo import Servos
+from .servo import COULOMB_SPEED, Servos
 from .steps import Steps
 from .vectors import cross
 
@@ -50,25 +50,25 @@ def joint_flows(steps: Steps, servos: Servos, dt: float) -> FloatArray:
     Returns:
         Energies [J], rows as :data:`JOINT_TERMS`, shape (9, m).
     """
-    body, _, rotors, drive, _ = steps.stacked
-    rate, speed = _middle(body.rate), _middle(rotors.speed)
-    acting = rotors.speed[:-1]  # friction acts with the speed at the start of the step
-    mechanical = rate * drive.torque[:-1]
-    voltage = drive.voltage[:-1]
+    rate_at = _by_field(steps.motion)[1]
+    _, speed_at, voltage_at, _, torque_at = _by_field(steps.motors)
+    rate, speed = _middle(rate_at), _middle(speed_at)
+    acting, voltage, torque = speed_at[:-1], voltage_at[:-1], torque_at[:-1]
     current = servos.current(voltage, speed)
-    electrical = voltage * current
-    powers = (
-        mechanical,
-        np.maximum(mechanical, 0.0),
-        np.abs(mechanical),
-        electrical,
-        np.maximum(electrical, 0.0),
-        servos.resistance * current * current,
-        servos.viscous * acting * speed,
-        servos.friction(acting) * speed,
-        servos.gear_damping * (acting - body.rate[:-1]) * (speed - rate),
-    )
-    return dt * np.array(powers).sum(axis=1)
+    power = np.empty((len(JOINT_TERMS), *rate.shape))
+    mechanical = np.multiply(rate, torque, out=power[0])
+    np.maximum(mechanical, 0.0, out=power[1])
+    np.abs(mechanical, out=power[2])
+    electrical = np.multiply(voltage, current, out=power[3])
+    np.maximum(electrical, 0.0, out=power[4])
+    # The losses, each without its coefficient; friction acts with the speed at the step's start.
+    np.multiply(current, current, out=power[5])
+    np.multiply(acting, speed, out=power[6])
+    np.multiply(np.tanh(acting / COULOMB_SPEED), speed, out=power[7])
+    np.multiply(acting - rate_at[:-1], speed - rate, out=power[8])
+    flows = dt * power.sum(axis=1)
+    flows[5:] *= servos.losses
+    return flows
 
 
 def ground_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
@@ -82,14 +82,15 @@ def ground_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
     Returns:
         Energies [J], as :data:`GROUND_TERMS`, shape (3,).
     """
-    contact = steps.stacked.contact
-    velocity = _middle(contact.velocity)
-    tangent, depth, force = (part[:-1] for part in contact[1:])
-    along, across = (into_link_axes(tangent, force) * into_link_axes(tangent, velocity)).sum(
-        axis=(0, 2)
-    )
-    damping = force[:, 2] - stiffness * np.maximum(depth, 0.0)
-    return -dt * np.array([along, across, (damping * velocity[:, 2]).sum()])
+    x, y, z, tx, ty, depth, force_x, force_y, force_z = _by_field(steps.touch)
+    vx, vy, vz = _middle(x), _middle(y), _middle(z)
+    tx, ty, depth = tx[:-1], ty[:-1], depth[:-1]
+    force_x, force_y, force_z = force_x[:-1], force_y[:-1], force_z[:-1]
+    along, across = into_link_axes(tx, ty, force_x, force_y)
+    slip_along, slip_across = into_link_axes(tx, ty, vx, vy)
+    damping = force_z - stiffness * np.maximum(depth, 0.0)
+    taken = (along, slip_along), (across, slip_across), (damping, vz)
+    return -dt * np.array([float(np.vdot(force, velocity)) for force, velocity in taken])
 
 
 def obstacle_flows(steps: Steps, stiffness: float, dt: float) -> FloatArray:
@@ -133,6 +134,11 @@ def push_flow(steps: Steps, dt: float) -> float:
     if steps.pushes is None:
         return 0.0
     return dt * float((steps.pushes[:-1] * _middle(steps.stacked.body.velocity)).sum())
+
+
+def _by_field(part: FloatArray) -> FloatArray:
+    """The fields of steps one after the other, (k, q, w) to (q, k, w): neighbours in memory."""
+    return np.ascontiguousarray(part.swapaxes(0, 1))
 
 
 def _middle(series: FloatArray) -> FloatArray:

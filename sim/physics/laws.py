@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +10,7 @@ from capture.arrays import FloatArray
 from capture.robot import Robot
 
 from ..world import Ground
-from .contact import contact_law
+from .contact import GroundContact
 from .engine import Kernels
 from .servo import Servos
 from .steps import Steps
@@ -61,8 +60,11 @@ class NumpyLaws:
             servos: Its servos.
             dt: Step [s].
         """
+        radius = np.array([link.radius for link in robot.links])
         self._rows = tuple(steps)
-        self._touch = contact_law(ground, np.array([link.radius for link in robot.links]))
+        self._ground = tuple(
+            GroundContact(ground, radius, row.body, row.contact) for row in self._rows
+        )
         self._servos = servos
         self._dt = dt
         self._reference = np.zeros(steps.joint_count)
@@ -73,8 +75,7 @@ class NumpyLaws:
         Args:
             k: Its row.
         """
-        row = self._rows[k]
-        _put(row.contact, self._touch(*row.body[:4]))
+        self._ground[k].act()
         self.command(k, self._reference)
 
     def follow(self, k: int) -> None:
@@ -84,8 +85,7 @@ class NumpyLaws:
             k: Its row, not the first.
         """
         before = self._rows[k - 1]
-        rotors = self._servos.advance(before.rotors, before.drive, self._dt)
-        _put(self._rows[k].rotors, rotors)
+        self._servos.advance(before.rotors, before.drive, self._dt, self._rows[k].rotors)
         self.start(k)
 
     def command(self, k: int, reference: FloatArray) -> None:
@@ -97,7 +97,7 @@ class NumpyLaws:
         """
         self._reference = reference
         row = self._rows[k]
-        _put(row.drive, self._servos.drive(reference, row.body.angle, row.body.rate, row.rotors))
+        self._servos.drive(reference, row.body.angle, row.body.rate, row.rotors, row.drive)
 
 
 def laws_for(
@@ -130,8 +130,3 @@ def laws_for(
     from .compiled_laws import CompiledLaws
 
     return CompiledLaws(steps, robot, ground, servos, dt)
-
-
-def _put(into: Iterable[FloatArray], values: Iterable[FloatArray]) -> None:
-    for place, value in zip(into, values, strict=True):
-        place[...] = value

@@ -61,6 +61,8 @@ class Servos:
             below, shape (10, m).
         supply, resistance, torque_constant, gain, inertia, viscous, coulomb, gear_stiffness,
             gear_damping, play: Its rows, each of shape (m,).
+        losses: Coefficients of the losses in winding, bearing, Coulomb friction and gear's damper:
+            resistance, viscous, coulomb and gear_damping again, shape (4, m).
     """
 
     def __init__(self, servos: Sequence[Servo]) -> None:
@@ -81,22 +83,34 @@ class Servos:
         self.supply, self.resistance, self.torque_constant, self.gain = self.table[:4]
         self.inertia, self.viscous, self.coulomb = self.table[4:7]
         self.gear_stiffness, self.gear_damping, self.play = self.table[7:]
+        self.losses = frozen(
+            np.array([self.resistance, self.viscous, self.coulomb, self.gear_damping])
+        )
         self._tight = not self.play.any()
+        self._slope = self.supply * self.gain  # of the voltage over the error, before it saturates
 
-    def current(self, voltage: FloatArray, speed: FloatArray) -> FloatArray:
+    def current(
+        self, voltage: FloatArray, speed: FloatArray, out: FloatArray | None = None
+    ) -> FloatArray:
         """Winding current i = (u V - Kt om)/R.
 
         Args:
-            voltage: u V [V], shape (m,).
-            speed: Rotor speed om [rad/s], shape (m,).
+            voltage: u V [V], shape (..., m).
+            speed: Rotor speed om [rad/s], shape (..., m).
+            out: Where the result goes; a new array by default.
 
         Returns:
-            Current [A], shape (m,).
+            Current [A], shape (..., m).
         """
-        return (voltage - self.torque_constant * speed) / self.resistance
+        return np.divide(voltage - self.torque_constant * speed, self.resistance, out=out)
 
     def drive(
-        self, reference: FloatArray, angle: FloatArray, rate: FloatArray, rotors: Rotors
+        self,
+        reference: FloatArray,
+        angle: FloatArray,
+        rate: FloatArray,
+        rotors: Rotors,
+        out: Drive | None = None,
     ) -> Drive:
         """What the servos do, given commands and state.
 
@@ -105,14 +119,18 @@ class Servos:
             angle: Joint angles q [rad], shape (m,).
             rate: Joint rates q' [rad/s], shape (m,).
             rotors: State of the rotors.
+            out: Where the result goes; new arrays by default.
 
         Returns:
-            Voltage, current, torque and the friction torques.
+            Voltage, current and torque.
         """
-        voltage = self.supply * _clip(self.gain * (reference - angle), 1.0)
+        into_voltage, into_current, into_torque = out or (None, None, None)
+        voltage = _clip(self._slope * (reference - angle), self.supply, out=into_voltage)
         twist, twist_rate = self.twist(angle, rotors.angle), rotors.speed - rate
-        torque = self.gear_stiffness * twist + self.gear_damping * twist_rate
-        return Drive(voltage, self.current(voltage, rotors.speed), torque)
+        torque = np.add(
+            self.gear_stiffness * twist, self.gear_damping * twist_rate, out=into_torque
+        )
+        return Drive(voltage, self.current(voltage, rotors.speed, out=into_current), torque)
 
     def twist(self, angle: FloatArray, rotor: FloatArray) -> FloatArray:
         """How far the gears' springs are wound up, D(th - q).
@@ -140,23 +158,25 @@ class Servos:
         """
         return self.coulomb * np.tanh(speed / COULOMB_SPEED)
 
-    def advance(self, rotors: Rotors, drive: Drive, dt: float) -> Rotors:
+    def advance(self, rotors: Rotors, drive: Drive, dt: float, out: Rotors | None = None) -> Rotors:
         """The rotors one step later, by the semi-implicit Euler rule that the body follows too.
 
         Args:
             rotors: State of the rotors.
             drive: What the servos do during the step.
             dt: Step [s].
+            out: Where the result goes; new arrays by default.
 
         Returns:
             Their next state.
         """
+        into_angle, into_speed = out or (None, None)
         torque = self.torque_constant * drive.current - self.viscous * rotors.speed
         torque -= self.friction(rotors.speed) + drive.torque
-        speed = rotors.speed + dt * torque / self.inertia
-        return Rotors(rotors.angle + dt * speed, speed)
+        speed = np.add(rotors.speed, dt * torque / self.inertia, out=into_speed)
+        return Rotors(np.add(rotors.angle, dt * speed, out=into_angle), speed)
 
 
-def _clip(values: FloatArray, bound: float | FloatArray) -> FloatArray:
+def _clip(values: FloatArray, bound: FloatArray, out: FloatArray | None = None) -> FloatArray:
     """``numpy.clip`` to +-bound; that function costs thrice as much on short arrays."""
-    return np.minimum(np.maximum(values, -bound), bound)
+    return np.minimum(np.maximum(values, -bound), bound, out=out)

@@ -81,16 +81,32 @@ class Steps(Sequence[Step]):
         return cls(np.zeros((count, width)), link_count, joint_count)
 
     @property
+    def links(self) -> FloatArray:
+        """The links' fields of :class:`sim.physics.engine.BodyState`, a view, shape (k, 13, n)."""
+        return self.table[:, : 13 * self.link_count].reshape(-1, 13, self.link_count)
+
+    @property
     def motion(self) -> FloatArray:
         """Joint angles and rates of all steps, a view, shape (k, 2, m)."""
         start, m = 13 * self.link_count, self.joint_count
         return self.table[:, start : start + 2 * m].reshape(-1, 2, m)
 
     @property
+    def touch(self) -> FloatArray:
+        """All of :class:`sim.physics.contact.Contact` of all steps, a view, shape (k, 9, n)."""
+        start, n = 13 * self.link_count + 2 * self.joint_count, self.link_count
+        return self.table[:, start : start + 9 * n].reshape(-1, 9, n)
+
+    @property
+    def motors(self) -> FloatArray:
+        """The rotors' and then the drives' fields of all steps, a view, shape (k, 5, m)."""
+        m = self.joint_count
+        return self.table[:, 22 * self.link_count + 2 * m :].reshape(-1, 5, m)
+
+    @property
     def drives(self) -> FloatArray:
         """Voltages, currents and torques of all steps, a view, shape (k, 3, m)."""
-        m = self.joint_count
-        return self.table[:, -3 * m :].reshape(-1, 3, m)
+        return self.motors[:, 2:]
 
     def taken(self, k: int) -> Step:
         """One step, in arrays of its own.
@@ -146,16 +162,18 @@ class Steps(Sequence[Step]):
 
 def _fields(table: FloatArray, n: int, m: int) -> Step:
     """The fields of rows, shape (..., width), as views."""
-    lead = table.shape[:-1]
-    end = 0
-
-    def take(rows: int, columns: int) -> FloatArray:
-        nonlocal end
-        start, end = end, end + rows * columns
-        part = table[..., start:end]
-        return part if rows == 1 else part.reshape(*lead, rows, columns)
-
-    body = BodyState(take(3, n), take(4, n), take(3, n), take(3, n), take(1, m), take(1, m))
-    contact = Contact(take(3, n), take(2, n), take(1, n), take(3, n))
-    rotors, drive = Rotors(take(1, m), take(1, m)), Drive(take(1, m), take(1, m), take(1, m))
-    return Step(body, contact, rotors, drive)
+    lead, width = table.shape[:-1], table.shape[-1]
+    acting, servos = 13 * n + 2 * m, width - 5 * m
+    links = table[..., : 13 * n].reshape(*lead, 13, n)
+    joints = table[..., 13 * n : acting].reshape(*lead, 2, m)
+    touch = table[..., acting:servos].reshape(*lead, 9, n)
+    motors = table[..., servos:].reshape(*lead, 5, m)
+    return Step(
+        BodyState(
+            *(links[..., :3, :], links[..., 3:7, :], links[..., 7:10, :], links[..., 10:, :]),
+            *(joints[..., 0, :], joints[..., 1, :]),
+        ),
+        Contact(touch[..., :3, :], touch[..., 3:5, :], touch[..., 5, :], touch[..., 6:, :]),
+        Rotors(motors[..., 0, :], motors[..., 1, :]),
+        Drive(motors[..., 2, :], motors[..., 3, :], motors[..., 4, :]),
+    )

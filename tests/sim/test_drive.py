@@ -5,9 +5,11 @@ import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 import undulog as front
 from capture import Session
@@ -18,7 +20,9 @@ from sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from sim.drive.command_session import CommandReplay, RecordedCommands
 from sim.drive.fading import FadingGait
 from sim.gait import GaitTick
+from sim.scenario_file import scenario_names
 
+T0_NS = 10**18
 COLUMNS = (
     ("/joint_commands", "position"),
     ("/joint_states", "position"),
@@ -76,6 +80,36 @@ def test_recorded_commands_drive_the_same_run_bit_by_bit(plain, tmp_path, capsys
         assert facts["driven"] == "commands"
         assert facts["driven.session_id"] == own.session_id
         assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
+
+
+def everything(path):
+    """All messages of a session but events, by topic: times and bytes."""
+    found = defaultdict(list)
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            found[channel.topic].append((message.log_time, message.publish_time, message.data))
+    del found["/rosout"]
+    return found
+
+
+# In what it tells of its gait, target following has values that nobody knows yet.
+@pytest.mark.parametrize(
+    "name",
+    [
+        "target-following",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in scenario_names()
+            if name != "target-following"
+        ),
+    ],
+)
+def test_what_a_shipped_scenario_commanded_drives_it_again_bit_by_bit(name, tmp_path):
+    path, again = tmp_path / "run.mcap", tmp_path / "again.mcap"
+    words = ["sim", "run", name, "-o", str(path), "--duration", "0.5"]
+    assert front.run(words) == 0
+    assert front.run(["drive", str(path), "--on", "twin", "-o", str(again)]) == 0
+    assert everything(again) == everything(path)
 
 
 def test_the_same_drive_gives_the_same_file(plain, tmp_path):
@@ -240,7 +274,7 @@ def written(path, rows, names=("joint01", "joint02"), **options):
     with SessionWriter(path, session_id="s", epoch_ns=0, **options) as writer:
         channel = writer.joint_state("/joint_commands", names, unit="rad")
         for t_ns, values in rows:
-            channel.write(10**18 + t_ns, values)
+            channel.write(T0_NS + t_ns, values)
     with Session.open(path) as session:
         return RecordedCommands.read(session)
 
@@ -282,6 +316,33 @@ def test_commands_without_a_gait_give_a_session_without_one(tmp_path, capsys):
             *[0.0] * 5,
             0.1,
         ]
+
+
+def test_what_planned_commands_are_for_goes_on_to_the_run(tmp_path):
+    names, plan = ("joint01", "joint02"), {"plan": "phase-kicks", "run": "3"}
+    source, path = tmp_path / "planned.mcap", tmp_path / "run.mcap"
+    facts = {"settle_s": "0.04"}
+    with SessionWriter(source, session_id="s", epoch_ns=T0_NS, metadata=facts) as writer:
+        writer.note("undulog.plan", plan)
+        channel = writer.joint_state("/joint_commands", names, unit="rad")
+        for k in range(11):
+            channel.write(T0_NS + k * 10_000_000, (0.01 * k, 0.0))
+    assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) == 0
+    with Session.open(path) as session:
+        assert session.metadata["undulog.plan"] == plan
+        assert session.settle_s == 0.04
+        said = [m.msg for _, m in session.messages("/rosout")]
+        assert "settled: 0.04 s have passed" in said
+
+
+@pytest.mark.parametrize("stated", ["soon", "-1", "inf", "nan"])
+def test_a_senseless_settling_time_is_none(tmp_path, stated):
+    path = tmp_path / "a.mcap"
+    facts = {"settle_s": stated}
+    with SessionWriter(path, session_id="s", epoch_ns=T0_NS, metadata=facts) as writer:
+        writer.joint_state("/joint_commands", ("joint01",), unit="rad").write(T0_NS, (0.0,))
+    with Session.open(path) as session:
+        assert session.settle_s is None
 
 
 def test_commands_of_another_robot_are_refused(tmp_path, make_robot):

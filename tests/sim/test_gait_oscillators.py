@@ -340,6 +340,36 @@ def test_feedback_of_an_answer_that_follows_slows_the_rhythm_in_second_order(mak
     assert drift == pytest.approx(-(eps**2) / (2 * OMEGA), rel=0.05)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_kicks_turn_the_phases_at_their_times_only(make_robot, kind):
+    # Uncoupled, nothing else moves a phase.
+    theta, _, _ = run(
+        make_robot(4, planar=True),
+        2.1,
+        oscillator=kind,
+        forward=0.0,
+        backward=0.0,
+        kick_every_s=0.7,
+        kick_size=1.2,
+    )
+    jumps = np.diff(theta, axis=0)
+    moved = np.flatnonzero(np.abs(jumps).max(axis=1) > 1e-9)
+    assert moved.tolist() == [69, 139, 209]
+    assert np.abs(jumps[moved]).max() <= 1.2
+    assert np.unique(jumps[moved].round(6)).size == 9
+    assert np.abs(np.delete(jumps, moved, axis=0)).max() < 1e-9
+
+
+def test_a_kicked_chain_comes_back(make_robot):
+    fields = {"forward": 5.0, "backward": 5.0, "kick_every_s": 6.0, "kick_size": 1.0}
+    theta, _, _ = run(make_robot(5, planar=True), 11.0, **fields)
+    pattern = np.diff(theta, axis=1) + PSI
+    assert np.abs(pattern[600]).max() > 0.3
+    assert np.abs(pattern[-1]).max() < 1e-3
+    again, _, _ = run(make_robot(5, planar=True), 11.0, **fields)
+    np.testing.assert_array_equal(theta, again)
+
+
 def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):
     robot = make_robot(5, planar=True)
     plain, _, _ = run(robot, 3.0)

@@ -58,6 +58,8 @@ chain = {
     "approach_rate": rate,
     "feedback": st.floats(0.0, 100.0),
     "feedback_bias": numbers(6),
+    "kick_every_s": st.floats(0.0, 10.0),
+    "kick_size": st.floats(0.0, 7.0),
 }
 ramp = st.floats(0.0, 10.0)
 gaits = st.one_of(
