@@ -19,38 +19,58 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .analyse import analyse_session
+    from .compare.compare import Choices, compare_sessions
+    from .compare.decisions import Margins
+    from .compare.result import Comparison
     from .experiment import analyse_experiment
+    from .notebook.files import load
+    from .notebook.picture import Picture
     from .result import Analysis, Estimate, Index, JointResult
     from .result_coupling import LocalCoupling
     from .result_experiment import Experiment, Reversal
+    from .result_sweep import LinearCoupling
     from .stretch import Options
     from .table import render
 
 __all__ = [
     "Analysis",
+    "Choices",
+    "Comparison",
     "Estimate",
     "Experiment",
     "Index",
     "JointResult",
+    "LinearCoupling",
     "LocalCoupling",
+    "Margins",
     "Options",
+    "Picture",
     "Reversal",
     "analyse_experiment",
     "analyse_session",
+    "compare_sessions",
+    "load",
     "render",
 ]
 
 _HOMES = {
     "Analysis": "result",
+    "Choices": "compare.compare",
+    "Comparison": "compare.result",
     "Estimate": "result",
     "Experiment": "result_experiment",
     "Index": "result",
     "JointResult": "result",
+    "LinearCoupling": "result_sweep",
     "LocalCoupling": "result_coupling",
+    "Margins": "compare.decisions",
     "Options": "stretch",
+    "Picture": "notebook.picture",
     "Reversal": "result_experiment",
     "analyse_experiment": "experiment",
     "analyse_session": "analyse",
+    "compare_sessions": "compare.compare",
+    "load": "notebook.files",
     "render": "table",
 }
 

@@ -13,27 +13,33 @@ from capture import Session
 from capture.environment import base_versions
 from capture.log.signals import Signal
 
+from .artefact_words import warn_flags, within
 from .body_motion import body_motion
 from .coupling import one_gait_coupling
+from .demodulation_session import response_over_time
+from .energy_cycles import energy_result
 from .fitting import GaitFit, fit_gait
+from .flags import find_artefacts
 from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
 from .indices import heterogeneity_indices
-from .joints import Span, joint_energies, joint_results
+from .joints import Energies, Span, joint_energies, joint_results
 from .ledger import check_ledger
+from .oscillators.session import session_couplings
 from .reading import Warn, by_plane, drag_ratio, read_columns, settle_time_s
 from .response import CONFIDENCE, around, t_factor
 from .result import (
     Analysis,
     Estimate,
     GaitFacts,
-    JointResult,
     Provenance,
     SessionFacts,
     Window,
 )
+from .result_artefact import flags_by_joint
 from .series import Series, clean
 from .spectrum import BINS_PER_SIDE
 from .stretch import Options, choose_stretch
+from .transport import transport
 from .windows import Stretch, whole_cycles
 
 _NS = 1e9
@@ -50,6 +56,21 @@ class Examined:
 
     analysis: Analysis
     gait: GaitFit | None
+
+
+@dataclass(frozen=True)
+class Measured(Examined):
+    """One session's numbers with what they were computed from; heavy, so not to be kept.
+
+    Attributes:
+        responses: Measured joint angles by name, on the analysed stretch.
+        energies: By joint name.
+        span: Whole cycles over which energies are taken.
+    """
+
+    responses: Mapping[str, Series]
+    energies: Mapping[str, Energies]
+    span: Span
 
 
 def analyse_session(session: Session, options: Options | None = None) -> Analysis:
@@ -85,6 +106,25 @@ def examine_session(session: Session, options: Options | None = None) -> Examine
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
+    measured = measure_session(session, options)
+    return Examined(measured.analysis, measured.gait)
+
+
+def measure_session(session: Session, options: Options | None = None) -> Measured:
+    """Compute what one session tells, and keep what it was computed from.
+
+    Args:
+        session: An open session.
+        options: What the user chose; the defaults choose by themselves.
+
+    Returns:
+        The result, the fitted gait, the responses and the energies.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
     options = options or Options()
     warnings: list[str] = []
 
@@ -92,27 +132,47 @@ def examine_session(session: Session, options: Options | None = None) -> Examine
         if sentence not in warnings:
             warnings.append(sentence)
 
-    columns = read_columns(session, options.command_topic, options.response_topic, warn)
+    columns = read_columns(
+        session,
+        options.command_topic,
+        options.response_topic,
+        warn,
+        reference_topic=options.reference_topic,
+    )
+    artefacts = find_artefacts(session, columns)
     stretch = choose_stretch(session, columns, options, warn)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     commands = _series(columns.names, columns.command, stretch, origin_ns)
     responses = _series(columns.names, columns.position, stretch, origin_ns)
     _warn_dropped(commands, responses, warn)
-    gait = fit_gait(commands, responses, stretch.duration_s, warn)
+    held = within(artefacts, session, stretch)
+    falsified = {one.joint for one in held if one.falsifies("position")}
+    sound = {name: one for name, one in responses.items() if name not in falsified}
+    gait = fit_gait(commands, sound, stretch.duration_s, warn)
     span = _span(stretch, origin_ns, gait)
-    energies = joint_energies(columns, span, warn)
-    check_ledger(session, energies.values(), span, warn)
+    energies = joint_energies(columns, held, span, warn)
+    closure = check_ledger(session, energies.values(), span, warn)
     joints = joint_results(
         session.robot,
         columns,
-        commands=commands,
         responses=responses,
         gait=gait,
         energies=energies,
+        flags=flags_by_joint(held),
         span=span,
     )
-    _warn_flags(joints, gait, warn)
-    body = body_motion(session, responses, gait, span, warn)
+    warn_flags(held, joints, gait, warn)
+    energy = energy_result(
+        session,
+        columns,
+        energies,
+        span,
+        transport=transport(session, sound, energies, span, warn),
+        closure=closure,
+        warn=warn,
+    )
+    over_time = response_over_time(session, columns, artefacts, warn)
+    body = body_motion(session, sound, gait, span, warn)
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     analysis = Analysis(
         session=SessionFacts(
@@ -130,8 +190,12 @@ def examine_session(session: Session, options: Options | None = None) -> Examine
         coupling=one_gait_coupling(0 if gait is None else len(gait.answered)),
         warnings=(*session.warnings, *warnings),
         provenance=_provenance(session, options),
+        artefacts=artefacts,
+        over_time=over_time,
+        energy=energy,
+        oscillators=session_couplings(session, options.start_s, options.stop_s),
     )
-    return Examined(analysis, gait)
+    return Measured(analysis, gait, sound, energies, span)
 
 
 def _series(
@@ -158,30 +222,6 @@ def _warn_dropped(
                 f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
                 f"time that was there already ({', '.join(one.name for one in lost)})"
             )
-
-
-def _warn_flags(joints: tuple[JointResult, ...], gait: GaitFit | None, warn: Warn) -> None:
-    meaning = {
-        "saturated": "at the joint limit",
-        "frozen": "frozen while commanded to move",
-        "stale": "repeats old samples",
-        "gaps": "has gaps",
-        "not_recorded": "has no response samples",
-    }
-    for flag, text in meaning.items():
-        names = [joint.name for joint in joints if flag in joint.flags]
-        if names:
-            warn(f"{', '.join(names)}: {text} (an artefact or a limit, not mechanics)")
-    lost = [
-        joint.name
-        for joint in joints
-        if gait is not None and joint.name in gait.answered and joint.lag_rad.value is None
-    ]
-    if lost:
-        warn(
-            f"{', '.join(lost)}: no response at the gait frequency that can be told from noise, or "
-            "a frozen one: gain and lag are null"
-        )
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:

@@ -18,6 +18,9 @@ from .result import Analysis, Estimate, Index, JointResult
 SIGNIFICANT = 0.05
 """Family-wise level of the sentence."""
 
+_NAMED = 6
+"""Flagged joints that the answer names at most."""
+
 
 class Verdict(StrEnum):
     """What kind of answer a session gives."""
@@ -58,13 +61,13 @@ def answer(analysis: Analysis) -> Answer:
         return Answer(
             Verdict.NOTHING,
             "No gait was found in this session, so there is no gain and no lag to compare.",
-            _why_not(analysis),
+            _why_not(analysis, "no gait"),
         )
     if not known:
         return Answer(
             Verdict.NOTHING,
             "No joint could be compared with its command.",
-            _why_not(analysis),
+            _why_not(analysis, "gain and lag are null"),
         )
     if len(known) == 1:
         joint = known[0]
@@ -85,33 +88,6 @@ def answer(analysis: Analysis) -> Answer:
         verdict,
         f"{lead}: {numbers}." if numbers else f"{lead}.",
         _extremes(analysis, known) + _caveat(analysis),
-    )
-
-
-def answer_to_all(answers: Sequence[Answer]) -> Answer:
-    """One headline over several sessions.
-
-    Args:
-        answers: One a session, at least two.
-
-    Returns:
-        How many of them say what.
-    """
-    count = {verdict: sum(a.verdict is verdict for a in answers) for verdict in Verdict}
-    phrases = {
-        Verdict.UNLIKE: "the segments do not move alike",
-        Verdict.ALIKE: "the segments move alike within the stated margins",
-        Verdict.OPEN: "no difference between the segments could be shown",
-        Verdict.SINGLE: "one joint alone was driven",
-        Verdict.NOTHING: "there is nothing to compare",
-    }
-    parts = [f"in {count[v]} of {len(answers)} sessions {phrases[v]}" for v in Verdict if count[v]]
-    whole = [phrases[v] for v in Verdict if count[v] == len(answers)]
-    sentence = f"In all {len(answers)} sessions {whole[0]}." if whole else "; ".join(parts) + "."
-    return Answer(
-        max(Verdict, key=lambda v: count[v]),
-        sentence[0].upper() + sentence[1:],
-        "Each session is answered for itself; nothing is pooled across them.",
     )
 
 
@@ -173,9 +149,16 @@ def _numbers(analysis: Analysis) -> str:
         if plane in gains:
             spread = formats.scaled(Estimate(gains[plane].value, gains[plane].ci95), 100.0)
             whose = "" if parts else f" of the {joints}"
-            parts.append(f"gain{whose} spreads by {formats.estimate(spread, ' %', most=2)}")
+            parts.append(_gain_spread(spread, whose))
         told.append(" and ".join(parts))
     return "; ".join(told)
+
+
+def _gain_spread(spread: Estimate, whose: str) -> str:
+    if spread.value == 0.0 and spread.ci95 is not None:  # noise explains all of it
+        most = formats.number(spread.ci95[1], formats.decimals_for([spread], most=2))
+        return f"gain{whose} spreads by no more than noise, {most} % at most"
+    return f"gain{whose} spreads by {formats.estimate(spread, ' %', most=2)}"
 
 
 def _contrast(index: Index, joints: str) -> str:
@@ -189,7 +172,8 @@ def _contrast(index: Index, joints: str) -> str:
 def _margins(analysis: Analysis) -> str:
     """The margins of the equivalence tests, from their labels."""
     tests = [i for name, i in analysis.heterogeneity.items() if "equivalence" in name]
-    return " and ".join(test.label.rpartition("H1: ")[2] for test in tests)
+    stated = [test.label.rpartition("H1: ")[2] for test in tests]
+    return " and ".join(dict.fromkeys(stated))  # both planes are held to the same
 
 
 def _size(index: Index) -> Estimate:
@@ -222,16 +206,17 @@ def _extremes(analysis: Analysis, known: Sequence[JointResult]) -> str:
 
 
 def _caveat(analysis: Analysis) -> str:
-    flagged = sum(bool(j.flags) for j in analysis.joints)
-    if not flagged:
+    named = [f"{formats.plain(j.name)} ({', '.join(j.flags)})" for j in analysis.joints if j.flags]
+    if not named:
         return ""
-    return f" {flagged} joint{' is' if flagged == 1 else 's are'} flagged; see the table of joints."
+    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+    return f" Flagged, see the table of joints: {', '.join(named[:_NAMED])}{more}."
 
 
-def _why_not(analysis: Analysis) -> str:
-    """The warning that denies a gait, or else speaks of it, or the first."""
+def _why_not(analysis: Analysis, lacking: str) -> str:
+    """The warning that says what is lacking, or else speaks of a gait, or the first."""
     if not analysis.warnings:
         return "The result gives no reason."
-    verdict = [warning for warning in analysis.warnings if warning.startswith("no gait")]
+    verdict = [one for one in analysis.warnings if lacking in one and "held still" not in one]
     about = [warning for warning in analysis.warnings if "gait" in warning.lower()]
     return formats.sentence((verdict or about or analysis.warnings)[0])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from capture import Session
-from capture.arrays import ComplexArray, FloatArray
+from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from capture.errors import DataError, LogError
 from capture.robot import Plane, Robot
 
@@ -21,9 +21,7 @@ from .series import Series
 ODOMETRY_TOPIC = "/odom"
 
 _NS = 1_000_000_000
-_SLACK_NS = 5 * _NS
-"""Tables are cut by log time; poses may be stamped this much earlier or later."""
-
+_CHILD = "child_frame_id"
 _POSE = (
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
     *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
@@ -49,7 +47,7 @@ def body_motion(
     """
     try:
         robot, fitted, plane = _fit_for_null(session, responses, gait)
-        poses = _poses(session, robot.links[0].name, span)
+        poses = head_poses(session, robot.links[0].name, span)
         seen = track(robot, *poses, [responses[name] for name in robot.joint_names])
         commands = _commands(robot, fitted)
         omega = fitted.fit.omega
@@ -97,33 +95,50 @@ def _fit_for_null(
     return robot, gait, Plane(next(iter(planes)))
 
 
-def _poses(session: Session, head: str, span: Span) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times [s], positions and quaternions of the head within the window."""
+def head_poses(
+    session: Session, head: str, span: Span
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The head's poses within a window.
+
+    Args:
+        session: An open session.
+        head: Name of the head link.
+        span: The window.
+
+    Returns:
+        Times from the window's origin [s], shape (n,), positions [m], shape (n, 3), and unit
+        quaternions x, y, z, w, shape (n, 4).
+
+    Raises:
+        DataError: If there are none, too few, of another link, or without an orientation.
+    """
     start_ns = span.origin_ns + round(span.start_s * _NS)
     stop_ns = span.origin_ns + round(span.stop_s * _NS)
-    table = session.table(
-        ODOMETRY_TOPIC, start_ns=start_ns - _SLACK_NS, stop_ns=stop_ns + _SLACK_NS
-    )
+    _, tables = session.columns({}, {ODOMETRY_TOPIC: [_CHILD, *_POSE]})
+    table = tables[ODOMETRY_TOPIC]
+    at_ns: IntArray = table.index.to_numpy(dtype=np.int64)
+    i, j = np.searchsorted(at_ns, (start_ns, stop_ns))
+    table, t_ns = table.iloc[i:j], at_ns[i:j]
     if table.empty or not set(_POSE) <= set(table.columns):
         raise DataError(f"{ODOMETRY_TOPIC} has no poses within the analysed window")
-    children = {str(name) for name in table["child_frame_id"].unique()} - {""}
+    children = {str(name) for name in table[_CHILD].unique()} - {""}
     if children - {head}:
         raise DataError(
             f"{ODOMETRY_TOPIC} gives the pose of {', '.join(sorted(children))}, not of the head "
             f"link {head}"
         )
-    t_ns = table.index.to_numpy(dtype=np.int64)
-    pose = table[list(_POSE)].to_numpy(dtype=np.float64)
-    inside = (t_ns >= start_ns) & (t_ns < stop_ns) & np.isfinite(pose).all(axis=1)
+    pose = np.stack([table[name].to_numpy(dtype=np.float64) for name in _POSE])
+    inside: BoolArray = np.all(np.isfinite(pose), axis=0)
     inside[1:] &= np.diff(t_ns) > 0
     if np.count_nonzero(inside) < 16:
         raise DataError(f"{ODOMETRY_TOPIC} has fewer than 16 poses within the analysed window")
-    chosen = pose[inside]
-    length = np.linalg.norm(chosen[:, 3:], axis=1, keepdims=True)
+    if not np.all(inside):
+        pose, t_ns = pose[:, inside], t_ns[inside]
+    length = np.sqrt(np.einsum("ij,ij->j", pose[3:], pose[3:]))
     if np.any(length < 0.5):
         raise DataError(f"{ODOMETRY_TOPIC} holds orientations that are not unit quaternions")
-    t_s = (t_ns[inside] - span.origin_ns).astype(np.float64) * 1e-9
-    return t_s, chosen[:, :3], chosen[:, 3:] / length
+    t_s = (t_ns - span.origin_ns).astype(np.float64) * 1e-9
+    return t_s, pose[:3].T, (pose[3:] / length).T
 
 
 def _commands(robot: Robot, gait: GaitFit) -> dict[int, tuple[ComplexArray, float]]:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json as json_text
-import shutil
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress
 from capture.errors import UsageError
-from capture.part_file import part_file
+
+from .command_line import check_output, chosen, opened, show
 
 if TYPE_CHECKING:
     from .result import Analysis
@@ -29,6 +27,8 @@ def analyse(
     stop: float | None = None,
     command_topic: str = "/joint_commands",
     response_topic: str = "/joint_states",
+    reference_topic: str | None = None,
+    null: Path | None = None,
     force: bool = False,
 ) -> None:
     """Compute gain and lag, energy and spread over the segments, each with its interval.
@@ -47,44 +47,39 @@ def analyse(
         stop: Its end [s].
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
+        reference_topic: JointState topic of a second sensor of the same positions, to be compared.
+        null: Model of identical modules (see `undulog sim null`) to hold the one session to.
         force: Replace the output file if it exists.
     """
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
-    if start is not None and stop is not None and stop <= start:
-        raise UsageError(f"--stop {stop:g} is not after --start {start:g}")
+    options = chosen(start, stop, command_topic, response_topic, reference_topic)
+    if null is not None and len(files) > 1:
+        raise UsageError("--null takes one session; with both directions recorded leave it out")
     if output is not None:
-        if output.suffix.lower() != ".json":
-            raise UsageError(f"{output}: the result file is JSON; end its name in .json")
-        refuse_existing(output, force=force)
-    from .stretch import Options
-
-    options = Options(start, stop, command_topic, response_topic)
-    result = _one(files[0], options) if len(files) == 1 else _several(files, options)
-    whole = result.to_dict()
+        why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
+        check_output(output, (".json",), why, force=force)
+    alone = len(files) == 1
+    result = _one(files[0], options, null) if alone else experiment_of(files, options, "analyse")
     if output is not None:
-        text = json_text.dumps(whole, indent=2, allow_nan=False) + "\n"
-        with part_file(output) as part:
-            part.write_text(text, encoding="utf-8")
+        result.save(output, force=True)  # refused before the work began, if it was there
     if json:
-        emit_json(whole)
+        emit_json(result.to_dict())
         return
-    from .experiment_table import render_experiment
-    from .result_experiment import Experiment
-    from .table import UNLIMITED, render
+    from .result import Analysis
+    from .table import render
 
-    # Into a file or a pipe nothing is wrapped: one sentence, one line.
-    terminal = sys.stdout.isatty()
-    width = shutil.get_terminal_size().columns if terminal else UNLIMITED
-    if isinstance(result, Experiment):
-        print(render_experiment(result, width=width, color=terminal), end="")
-    else:
-        print(render(result, width=width, color=terminal), end="")
-    if output is not None:
-        print(f"Result: {output}")
+    def text(width: int, color: bool) -> str:
+        if isinstance(result, Analysis):
+            return render(result, width=width, color=color)
+        from .experiment_table import render_experiment
+
+        return render_experiment(result, width=width, color=color)
+
+    show(text, output)
 
 
-def _one(file: Path, options: Options) -> Analysis:
+def _one(file: Path, options: Options, null: Path | None) -> Analysis:
     from capture import Session
 
     from .analyse import analyse_session
@@ -92,20 +87,25 @@ def _one(file: Path, options: Options) -> Analysis:
     with progress("analyse", total=1) as bar:
         bar.update(0, note=file.name)
         with Session.open(file) as session:
-            return analyse_session(session, options)
+            if null is None:
+                return analyse_session(session, options)
+            from .null_model_check import analyse_with_null
+
+            return analyse_with_null(session, null, options)
 
 
-def _several(files: Sequence[Path], options: Options) -> Experiment:
-    from capture import Session
+def experiment_of(files: Sequence[Path], options: Options, verb: str) -> Experiment:
+    """Analyse sessions as one experiment, opening one at a time, behind a progress bar.
 
+    Args:
+        files: Sessions (MCAP).
+        options: What the user chose.
+        verb: Of the progress bar.
+
+    Returns:
+        The experiment.
+    """
     from .experiment import analyse_experiment
 
-    with progress("analyse", total=len(files)) as bar:
-
-        def opened() -> Iterator[Session]:
-            for k, file in enumerate(files):
-                bar.update(k, note=file.name)
-                with Session.open(file) as session:
-                    yield session
-
-        return analyse_experiment(opened(), options)
+    with progress(verb, total=len(files)) as bar:
+        return analyse_experiment(opened(files, bar), options)

@@ -8,6 +8,7 @@ times motor current, signed and clipped. Gaps are not bridged: the weights of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,8 @@ import numpy as np
 from capture.arrays import FloatArray, IntArray
 from capture.log.signals import Signal
 
-from .series import GAP_FACTOR, Series, clean, coverage, sample_weights
+from .cycle_sums import Weighed, cycle_sums, weigh
+from .series import Series, clean
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,13 @@ class Energy:
         net_j: Integral of the power in each cycle [J], shape (c,).
         plus_j: Of its positive part [J], shape (c,).
         coverage: Fraction of the window that has samples.
+        covered: Fraction of each cycle that has samples, shape (c,).
     """
 
     net_j: FloatArray
     plus_j: FloatArray
     coverage: float
+    covered: FloatArray
 
     @property
     def abs_j(self) -> FloatArray:
@@ -38,28 +42,34 @@ class Energy:
         return 2 * self.plus_j - self.net_j
 
 
-def integrate(power: Series, start_s: float, stop_s: float, cycles: int = 1) -> Energy | None:
-    """Integrate a power over a window.
+def integrate(
+    powers: Sequence[Series], start_s: float, stop_s: float, cycles: int = 1
+) -> list[Energy | None]:
+    """Integrate powers over one window; those with the same times are weighed once.
 
     Args:
-        power: Power [W] on its own times.
+        powers: Powers [W], each on its own times.
         start_s: Start of the window [s].
         stop_s: Its end, not included [s].
         cycles: Parts of equal length that the window is cut into.
 
     Returns:
-        The energies, or None where the window has no samples.
+        The energies of each, or None where the window has no samples of it.
     """
-    part = power.between(start_s, stop_s)
-    if part.count < 2 or stop_s <= start_s:
-        return None
-    weights = sample_weights(part.t_s, start_s, stop_s)
-    place = np.floor((part.t_s - start_s) / (stop_s - start_s) * cycles).astype(np.int64)
-    cycle = np.clip(place, 0, cycles - 1)
-    net, plus = np.zeros((2, cycles))
-    np.add.at(net, cycle, weights * part.values)
-    np.add.at(plus, cycle, weights * np.maximum(part.values, 0.0))
-    return Energy(net, plus, coverage(part.t_s, start_s, stop_s))
+    found: list[Energy | None] = []
+    last: Weighed | None = None
+    for power in powers:
+        part = power.between(start_s, stop_s)
+        if part.count < 2 or stop_s <= start_s:
+            found.append(None)
+            continue
+        if last is None or not np.array_equal(last.t_s, part.t_s):
+            last = weigh(part.t_s, start_s, stop_s, cycles)
+        work = last.weights * part.values
+        net = cycle_sums(work, last.starts)
+        plus = cycle_sums(np.maximum(work, 0.0, out=work), last.starts)
+        found.append(Energy(net, plus, last.coverage, last.covered))
+    return found
 
 
 def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
@@ -88,7 +98,6 @@ def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
     t_s = (t_ns - t_ns[0]).astype(np.float64) * 1e-9
     values = known.at(t_s)
     values[(t_s < known.t_s[0]) | (t_s > known.t_s[-1])] = np.nan
-    step = np.diff(known.t_s)
-    for k in np.flatnonzero(step > GAP_FACTOR * known.period_s):
+    for k in known.gaps:
         values[(t_s > known.t_s[k]) & (t_s < known.t_s[k + 1])] = np.nan
     return values

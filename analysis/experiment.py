@@ -33,14 +33,19 @@ from .kick_answer import kick_answer
 from .kick_coupling import ROW_TOLERANCE, kick_coupling
 from .kick_experiment import find_kicks
 from .kick_runs import MOST_KICK, MOST_PATTERN, SAME
+from .oscillators.body import body_oscillators
 from .reading import Warn
 from .response import CONFIDENCE
 from .result import Analysis, Provenance
+from .result_coupling import LocalCoupling
 from .result_experiment import Experiment, Reversal, Run
 from .reversal import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
 from .reversal_modules import SIGNIFICANT, reversal_of
 from .reversal_shares import RESAMPLES
 from .stretch import Options
+from .sweep_answer import sweep_answer
+from .sweep_coupling import NONLINEAR, sweep_coupling
+from .sweep_runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
 
 _LOW_FLOOR = 0.01
 """A p-value that can't go below this leaves little room under the level."""
@@ -64,9 +69,11 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
     options = options or Options()
     examined: list[Examined] = []
     robots: list[Robot | None] = []
+    commanded: list[CommandTones | None] = []
     for session in sessions:
         examined.append(examine_session(session, options))
         robots.append(session.robot)
+        commanded.append(command_tones(session, options, examined[-1]))
     if not examined:
         raise UsageError("an experiment needs at least one session")
     warnings: list[str] = []
@@ -75,6 +82,9 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
         for one, robot in zip(examined, robots, strict=True)
     ]
     kicks = find_kicks(runs, [one.gait for one in examined])
+    sweep = find_sweep(commanded) if kicks is None else None
+    if sweep is not None:
+        return _of_sweep(sweep, commanded, examined, runs, options)
     parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
     rest = [k for k, part in enumerate(parts) if part in (None, "base")]
     own_roles, own_why = sort_runs([runs[k] for k in rest])
@@ -112,7 +122,44 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
         coupling=coupling,
         warnings=tuple(warnings),
         provenance=_provenance([one.analysis for one in examined], options),
+        oscillators=body_oscillators(coupling) if isinstance(coupling, LocalCoupling) else None,
     )
+
+
+def _of_sweep(
+    sweep: Sweep,
+    commanded: Sequence[CommandTones | None],
+    examined: Sequence[Examined],
+    runs: Sequence[GaitRun],
+    options: Options,
+) -> Experiment:
+    """The experiment of a lag sweep or a multisine: its gaits are no repeats of each other."""
+    analyses = [one.analysis for one in examined]
+    warnings = [
+        f"{run.label} is no run of the sweep; it is left out"
+        for k, run in enumerate(runs)
+        if k not in sweep.index
+    ]
+    paths = [Path(one.session.path) for one in analyses]
+    coupling = sweep_coupling(sweep, commanded, paths, options, warnings.append)
+    none = np.zeros((0, 0), dtype=np.complex128)
+    return Experiment(
+        answer=sweep_answer(coupling),
+        sessions=tuple(analyses),
+        runs=tuple(
+            _run(one, run, *(("sweep", None) if k in sweep.index else (None, "is no run of it")))
+            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
+        ),
+        heterogeneity=experiment_indices(none, none, None),
+        reversal=None,
+        coupling=coupling,
+        warnings=tuple(warnings),
+        provenance=_provenance(analyses, options),
+    )
+
+
+def _runs(count: int) -> str:
+    return f"{count} independent run{'' if count == 1 else 's'}"
 
 
 def _both_ways(
@@ -129,7 +176,7 @@ def _both_ways(
         return False
     if min(counts.values()) < MIN_RUNS:
         warn(
-            f"boundary or module: not separable from {counts[Role.FORWARD]} independent runs with "
+            f"boundary or module: not separable from {_runs(counts[Role.FORWARD])} with "
             f"the wave from head to tail and {counts[Role.REVERSE]} from tail to head; record at "
             "least 6 of each"
         )
@@ -194,6 +241,8 @@ def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
             "most_kick": MOST_KICK,
             "most_pattern": MOST_PATTERN,
             "row_tolerance": ROW_TOLERANCE,
+            "most_condition": MOST_CONDITION,
+            "nonlinear": NONLINEAR,
             "margin_gain": EQUIVALENT_GAIN,
             "margin_lag_rad": EQUIVALENT_LAG_RAD,
         },

@@ -25,7 +25,7 @@ def experiment_answer(reversal: Reversal | None, roles: Mapping[int, Role]) -> s
     if not roles:
         return "no gait with a travelling wave in these sessions: nothing to compare"
     if len(set(roles.values())) == 1:
-        return "one direction only: not separable; record the reverse"
+        return "boundary or module is open: one direction only; record the reverse"
     if reversal is None:
         return "both directions, but not separable from these sessions"
     return _different(reversal) if reversal.p < SIGNIFICANT else _bounded(reversal)

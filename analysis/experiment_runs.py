@@ -181,6 +181,22 @@ def mirror_fault(robot: Robot | None, driven: Sequence[str]) -> str | None:
     return None
 
 
+def command_change(command: ComplexArray, model: ComplexArray) -> ComplexArray:
+    """Each joint's command over that of another run, less the phase that all have in common.
+
+    Args:
+        command: Complex amplitudes [rad], shape (m,).
+        model: Those of the other run, shape (m,).
+
+    Returns:
+        1 where it is the same, shape (m,).
+    """
+    change: ComplexArray = command / model
+    change *= np.exp(-1j * np.angle(change.sum()))
+    change *= np.exp(-1j * np.median(np.angle(change)))  # as if the odd joint weren't there
+    return change
+
+
 def _unfit(run: GaitRun) -> str | None:
     if not run.names:
         return "has no gait"
@@ -202,9 +218,7 @@ def _difference(run: GaitRun, model: GaitRun) -> str | None:
     if abs(run.frequency_hz - model.frequency_hz) > SAME_FREQUENCY * model.frequency_hz:
         return f"has {run.frequency_hz:.4g} Hz, {model.label} {model.frequency_hz:.4g} Hz"
     command = run.command if run.wave == model.wave else run.command[::-1]
-    change: ComplexArray = command / model.command
-    change *= np.exp(-1j * np.angle(change.sum()))
-    change *= np.exp(-1j * np.median(np.angle(change)))  # as if the odd joint weren't there
+    change = command_change(command, model.command)
     deviation = np.abs(change - 1)
     worst = int(np.argmax(deviation))
     if deviation[worst] <= SAME_COMMAND:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import formats
+from .command_line import UNLIMITED
 from .experiment_answer import percent, told_p
 from .kick_answer import kick_detail
+from .oscillators.text import body_detail
 from .result import Estimate
 from .result_coupling import LocalCoupling
 from .result_experiment import Experiment, Reversal
+from .result_sweep import LinearCoupling
 from .reversal_modules import SIGNIFICANT
-from .table import UNLIMITED, sheet
+from .sweep_answer import sweep_detail, sweep_method
+from .table import put, sheet
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+
+_MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
+"""How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
 
 
 def render_experiment(
@@ -27,7 +34,7 @@ def render_experiment(
 
     Args:
         experiment: The result.
-        width: Columns of the terminal: sentences wrap there, but for the first line and the tables.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
         color: Whether to use bold and dim type.
 
     Returns:
@@ -35,37 +42,50 @@ def render_experiment(
     """
     text, prose, wide = sheet(width, color=color)
     count = len(experiment.sessions)
-    wide.print(
+    prose.print(
         f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.",
         style="bold",
         markup=False,
     )
     reversal = experiment.reversal
     if reversal is not None:
-        for line in _detail(reversal):
+        for line in reversal_detail(reversal):
             prose.print(line, markup=False)
         prose.print()
-        wide.print(_joint_table(reversal))
+        put(prose, wide, _joint_table(reversal), [("its mirror",)])
     if isinstance(experiment.coupling, LocalCoupling):
         for line in kick_detail(experiment.coupling):
             prose.print(line, markup=False)
+    if experiment.oscillators is not None:
+        for line in body_detail(experiment.oscillators):
+            prose.print(line, markup=False)
+    if isinstance(experiment.coupling, LinearCoupling):
+        for line in sweep_detail(experiment.coupling):
+            prose.print(line, markup=False)
     prose.print()
-    wide.print(_run_table(experiment))
+    put(prose, wide, _run_table(experiment), [("wave",), ("Hz",)])
     prose.print()
     for warning in experiment.warnings:
         prose.print(f"Warning: {warning}", markup=False)
-    for warning, names in _by_warning(experiment):
+    for warning, names in by_warning(experiment):
         prose.print(f"Warning: {warning} ({names})", markup=False)
     coupling = experiment.coupling
     if not coupling.identifiable:
         record = f" To identify it, record {coupling.record}." if coupling.record else ""
         prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
-    method = _kick_method(coupling) if isinstance(coupling, LocalCoupling) else _method(reversal)
-    prose.print(method, style="dim", markup=False)
+    prose.print(f"Method: {method(experiment)}", style="dim", markup=False)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
 
 
-def _detail(reversal: Reversal) -> Iterable[str]:
+def reversal_detail(reversal: Reversal) -> Iterable[str]:
+    """What stands below the answer.
+
+    Args:
+        reversal: The test.
+
+    Yields:
+        Sentences.
+    """
     for weak in reversal.weak:
         yield (
             f"{weak.name} against its mirror {weak.mirror}, over both directions: "
@@ -82,17 +102,8 @@ def _detail(reversal: Reversal) -> Iterable[str]:
     yield f"The test is {reversal.blind}."
 
 
-def _relative(log_gain: Estimate) -> Estimate:
-    """Gain over gain, less one, in percent."""
-    value, ci95 = log_gain.value, log_gain.ci95
-    return Estimate(
-        None if value is None else 100 * math.expm1(value),
-        None if ci95 is None else (100 * math.expm1(ci95[0]), 100 * math.expm1(ci95[1])),
-    )
-
-
 def _gain(log_gain: Estimate) -> str:
-    return formats.estimate(_relative(log_gain), " %", most=2)
+    return formats.estimate(formats.relative(log_gain), " %", most=2)
 
 
 def _lag(lag_rad: Estimate) -> str:
@@ -108,7 +119,7 @@ def _joint_table(reversal: Reversal) -> Table:
         table.add_column(name, no_wrap=True)
     for name in ("gain % (95 %)", "lag° (95 %)", "p"):
         table.add_column(name, justify="right", no_wrap=True)
-    gains = [_relative(one.log_gain_difference) for one in reversal.joints]
+    gains = [formats.relative(one.log_gain_difference) for one in reversal.joints]
     lags = [formats.degrees(one.lag_difference_rad) for one in reversal.joints]
     digits = [formats.decimals_for(column, most=3) for column in (gains, lags)]
     for one, *pair in zip(reversal.joints, gains, lags, strict=True):
@@ -139,12 +150,22 @@ def _run_table(experiment: Experiment) -> Table:
     return table
 
 
-def _by_warning(experiment: Experiment) -> list[tuple[str, str]]:
-    """The sessions' own warnings, each once; what the experiment itself answers is left out."""
+def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
+    """The sessions' own warnings, each once; what the experiment itself answers is left out.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Warning, and the names of the files that have it, or ``all sessions``.
+    """
+    expected = ["boundary or module:"]
+    if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
+        expected += _MANY_TONES
     said: dict[str, list[str]] = {}
     for session in experiment.sessions:
         for warning in session.warnings:
-            if not warning.startswith("boundary or module:"):
+            if not warning.startswith(tuple(expected)):
                 said.setdefault(warning, []).append(Path(session.session.path).name)
     everyone = len(experiment.sessions)
     return [
@@ -153,25 +174,42 @@ def _by_warning(experiment: Experiment) -> list[tuple[str, str]]:
     ]
 
 
+def method(experiment: Experiment) -> str:
+    """How the numbers of an experiment were made.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        One sentence, beginning in lower case.
+    """
+    coupling = experiment.coupling
+    if isinstance(coupling, LocalCoupling):
+        return _kick_method(coupling)
+    if isinstance(coupling, LinearCoupling):
+        return sweep_method(coupling)
+    return _reversal_method(experiment.reversal)
+
+
 def _kick_method(coupling: LocalCoupling) -> str:
     return (
-        f"Method: local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
+        f"local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
         "kick: central differences of each joint's phase and log amplitude, intervals one by one "
         "at 95 % from the responses' noise (Student's t), those of indices at least 95 %; all four "
         "matrices with --json."
     )
 
 
-def _method(reversal: Reversal | None) -> str:
+def _reversal_method(reversal: Reversal | None) -> str:
     if reversal is None:
-        return "Method: each session by itself as undulog analyse gives it; nothing is pooled."
+        return "each session by itself as undulog analyse gives it; nothing is pooled."
     tried = (
         f"all {reversal.labellings}"
         if reversal.labellings_tried == reversal.labellings
         else f"{reversal.labellings_tried} random ones of {reversal.labellings}"
     )
     return (
-        f"Method: reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
+        f"reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
         "with the wave from head to tail minus its mirror joint with the wave from tail to head; "
         f"largest studentised difference T = {formats.number(reversal.statistic, 2)}, its null by "
         f"dealing out the runs' labels anew ({tried}; p can't go below "

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray
-
 from .gait import (
     MIN_CYCLES,
     MIN_EXPLAINED,
+    MIN_SAMPLES,
     NYQUIST_SHARE,
     Rhythm,
     allowed_model,
@@ -85,23 +84,27 @@ def fit_gait(
         return None
     if not commands:
         return _responses_only(responses, rhythm)
-    usable = [one for one in commands.values() if _usable(one, rhythm.omega)]
-    first = fit_at(usable, rhythm.omega, allowed_model(usable, rhythm.omega))
+    usable = {name: one for name, one in commands.items() if _usable(one, rhythm.omega)}
+    moving = [one for name, one in usable.items() if name in rhythm.names]
+    first = rhythm.fit
+    if len(moving) < len(rhythm.names):
+        first = fit_at(moving, rhythm.omega, allowed_model(moving, rhythm.omega))
     follows, astray = driven(first)
-    names = [one.name for one in usable]
-    amplitudes = dict(zip(names, np.abs(first.fundamental).tolist(), strict=True))
+    amplitudes = dict.fromkeys(usable, 0.0)
+    amplitudes |= zip((one.name for one in moving), np.abs(first.fundamental).tolist(), strict=True)
+    chosen = [one for one, follow in zip(moving, follows, strict=True) if follow]
+    strays = {one.name for one, stray in zip(moving, astray, strict=True) if stray}
+    followers = {one.name for one in chosen}
     _warn_undriven(
-        names=names,
-        held=~follows & ~astray,
-        astray=astray,
-        unusable=[name for name in commands if name not in names],
+        held=[name for name in usable if name not in strays | followers],
+        astray=[name for name in usable if name in strays],
+        unusable=[name for name in commands if name not in usable],
         warn=warn,
     )
-    chosen = [one for one, follow in zip(usable, follows, strict=True) if follow]
     moved = tuple(one.name for one in chosen)
     answered = tuple(n for n in moved if n in responses and _usable(responses[n], rhythm.omega))
-    silent = [name for name in moved if name not in answered]
-    if silent and responses:
+    silent = [name for name in moved if name in responses and name not in answered]
+    if silent:
         warn(f"too few response samples for {', '.join(silent)}: gain and lag are null")
     channels = chosen + [responses[name] for name in answered]
     fit = fit_shared(channels, rhythm.omega, allowed_model(channels, rhythm.omega))
@@ -146,7 +149,7 @@ def _responses_only(responses: Mapping[str, Series], rhythm: Rhythm) -> GaitFit:
 
 def _usable(one: Series, omega: float) -> bool:
     """Enough samples, often enough, for long enough."""
-    if one.count < 16:
+    if one.count <= MIN_SAMPLES:
         return False
     cycles = omega * float(one.t_s[-1] - one.t_s[0] + one.period_s) / (2 * np.pi)
     return one.period_s * omega / (2 * np.pi) < NYQUIST_SHARE and cycles >= MIN_CYCLES - 0.01
@@ -156,16 +159,11 @@ def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> No
     return Noise(noise.level[index], noise.dof[index], noise.covariance[index])
 
 
-def _warn_undriven(
-    *, names: list[str], held: BoolArray, astray: BoolArray, unusable: list[str], warn: Warn
-) -> None:
+def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], warn: Warn) -> None:
     """Say once why joints have no gain and lag."""
     reasons = (
-        ([n for n, chosen in zip(names, held, strict=True) if chosen], "held still by the command"),
-        (
-            [n for n, chosen in zip(names, astray, strict=True) if chosen],
-            "commanded something else than the common rhythm",
-        ),
+        (held, "held still by the command"),
+        (astray, "commanded something else than the common rhythm"),
         (unusable, "commanded too seldom or too briefly"),
     )
     for joints, why in reasons:

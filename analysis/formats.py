@@ -148,6 +148,22 @@ def scaled(quantity: Estimate, factor: float) -> Estimate:
     )
 
 
+def relative(log_gain: Estimate) -> Estimate:
+    """A ratio of gains, less one, in percent.
+
+    Args:
+        log_gain: Logarithm of the ratio.
+
+    Returns:
+        In percent.
+    """
+    value, ci95 = log_gain.value, log_gain.ci95
+    return Estimate(
+        None if value is None else 100 * math.expm1(value),
+        None if ci95 is None else (100 * math.expm1(ci95[0]), 100 * math.expm1(ci95[1])),
+    )
+
+
 def p_value(p: float | None) -> str:
     """A p-value: three decimals, never a bare zero.
 
@@ -210,17 +226,32 @@ def short(text: str, most: int = 40) -> str:
     return known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
 
 
-def sentence(text: str) -> str:
-    """Text with a capital at its beginning and one stop at its end.
+def filename(path: str) -> str:
+    """Last part of a path of any system.
 
     Args:
-        text: From a log or a result.
+        path: As the user named it.
 
     Returns:
         Plain text.
     """
-    known = plain(text).strip()
-    return known[:1].upper() + known[1:].rstrip(".") + "."
+    return plain(path.replace("\\", "/").rstrip("/").rpartition("/")[2] or path)
+
+
+def sentence(text: str) -> str:
+    """Text with a capital at its beginning and one stop at its end.
+
+    Args:
+        text: From a log or a result; a name at its beginning keeps its own letters.
+
+    Returns:
+        Plain text.
+    """
+    known = plain(text).strip().rstrip(".")
+    first = known.partition(" ")[0]
+    if not any(c in "._/\\" or c.isdigit() for c in first):
+        known = known[:1].upper() + known[1:]
+    return known + "."
 
 
 def _forbidden(code: int) -> bool:

@@ -22,6 +22,9 @@ from .series import Series
 
 MIN_CYCLES = 3.0
 MIN_EXPLAINED = 0.8
+MIN_SAMPLES = 16
+"""A channel needs more than these."""
+
 HARMONICS = 3
 NYQUIST_SHARE = 0.45
 """Highest harmonic as a share of the sampling rate; half would be the limit."""
@@ -40,14 +43,22 @@ class Rhythm:
     """A rhythm common to several channels.
 
     Attributes:
-        omega: Angular frequency [rad/s].
-        explained: Share of all channels' variance that it explains, 0 to 1.
-        model: Basis that the sampling rate allows.
+        names: Channels that move, in their order.
+        fit: Of these, with the basis that the sampling rate allows.
     """
 
-    omega: float
-    explained: float
-    model: HarmonicModel
+    names: tuple[str, ...]
+    fit: HarmonicFit
+
+    @property
+    def omega(self) -> float:
+        """Angular frequency [rad/s]."""
+        return self.fit.omega
+
+    @property
+    def explained(self) -> float:
+        """Share of all these channels' variance that it explains, 0 to 1."""
+        return 1.0 - float(self.fit.rss.sum() / self.fit.total.sum())
 
 
 def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
@@ -61,7 +72,7 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
         The best rhythm with at least ``MIN_CYCLES`` cycles, however little it explains; None
         where nothing moves or the samples are too few.
     """
-    moving = [one for one in series if one.count > 16 and np.ptp(one.values) > 0]
+    moving = [one for one in series if one.count > MIN_SAMPLES and np.ptp(one.values) > 0]
     if not moving or duration_s <= 0:
         return None
     scouts = sorted(moving, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
@@ -148,7 +159,7 @@ def _refine(scouts: Sequence[Series], series: Sequence[Series], omega: float) ->
         fit = fit_at(series, found, model)
     except DataError:
         return None
-    return Rhythm(found, 1.0 - float(fit.rss.sum() / fit.total.sum()), model)
+    return Rhythm(tuple(one.name for one in series), fit)
 
 
 def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | None:

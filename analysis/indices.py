@@ -40,6 +40,9 @@ def heterogeneity_indices(
         warn("no joint's gain and lag are known: the heterogeneity indices are null")
         return unknown
     known = {joint.name for joint in joints if joint.lag_rad.value is not None}
+    old = {joint.name for joint in joints if joint.name in known and "stale" in joint.flags}
+    if old != known:  # where all samples are late by a hold, that makes no difference
+        known -= old
     planes = by_plane(robot, gait.driven)
     result: dict[str, Index] = {}
     for plane, names in planes.items():

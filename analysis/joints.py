@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,14 +12,15 @@ from capture.robot import Robot
 
 from .energy import Energy, integrate, power_of
 from .fitting import GaitFit
-from .flags import joint_flags
 from .reading import Columns, Warn, planes_of
 from .response import gain_estimate, lag_estimate
 from .result import Estimate, JointResult
+from .result_artefact import Artefact
 from .series import Series, coverage
+from .threads import in_threads
 
-_THIN = 0.99
-"""Power covered less than this part of the window is worth a warning."""
+GAP_SHARE = 0.01
+"""More of the window without samples is worth a flag, or of power a warning."""
 
 
 @dataclass(frozen=True)
@@ -47,30 +48,50 @@ class Energies:
     electrical: Energy | None
 
 
-def joint_energies(columns: Columns, span: Span, warn: Warn) -> dict[str, Energies]:
+def joint_energies(
+    columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
+) -> dict[str, Energies]:
     """Energies of all joints.
 
     Args:
         columns: The session's columns.
+        artefacts: Of the analysed stretch; what a sensor falsifies has no energy.
         span: The window.
-        warn: Told of joints whose power has gaps.
+        warn: Told of joints whose power has gaps or is falsified.
 
     Returns:
         By joint name.
     """
-    result: dict[str, Energies] = {}
-    thin: list[str] = []
-    for name in columns.names:
-        mechanical = electrical = None
-        if name in columns.effort and name in columns.velocity:
-            power = power_of(columns.effort[name], columns.velocity[name], span.origin_ns)
-            mechanical = integrate(power, span.start_s, span.stop_s, max(span.cycles, 1))
-        if name in columns.current and name in columns.voltage:
-            power = power_of(columns.current[name], columns.voltage[name], span.origin_ns)
-            electrical = integrate(power, span.start_s, span.stop_s, max(span.cycles, 1))
-        result[name] = Energies(mechanical, electrical)
-        if any(one is not None and one.coverage < _THIN for one in (mechanical, electrical)):
-            thin.append(name)
+    wrong = list(artefacts)
+    false = {one.joint for one in wrong if one.falsifies("velocity", "effort")}
+    false_el = {one.joint for one in wrong if one.falsifies("current", "voltage")}
+    for joints, kind in ((false, "mechanical"), (false_el, "electrical")):
+        if joints:
+            named = ", ".join(name for name in columns.names if name in joints)
+            warn(f"{named}: {kind} energies are null, since a sensor falsifies them")
+
+    def of_joint(name: str) -> Energies:
+        powers: dict[str, Series] = {}
+        for kind, (first, second), wrong in (
+            ("mechanical", (columns.effort, columns.velocity), false),
+            ("electrical", (columns.current, columns.voltage), false_el),
+        ):
+            if name in first and name in second and name not in wrong:
+                powers[kind] = power_of(first[name], second[name], span.origin_ns)
+        cycles = max(span.cycles, 1)
+        each = integrate([*powers.values()], span.start_s, span.stop_s, cycles)
+        found = dict(zip(powers, each, strict=True))
+        return Energies(found.get("mechanical"), found.get("electrical"))
+
+    samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
+    result = dict(zip(columns.names, in_threads(of_joint, columns.names, samples), strict=True))
+    thin = [
+        name
+        for name, one in result.items()
+        if any(
+            e is not None and e.coverage < 1 - GAP_SHARE for e in (one.mechanical, one.electrical)
+        )
+    ]
     if thin:
         warn(
             f"the power of {', '.join(thin)} has gaps, which are not bridged: energies count only "
@@ -83,10 +104,10 @@ def joint_results(
     robot: Robot | None,
     columns: Columns,
     *,
-    commands: Mapping[str, Series],
     responses: Mapping[str, Series],
     gait: GaitFit | None,
     energies: Mapping[str, Energies],
+    flags: Mapping[str, Sequence[str]],
     span: Span,
 ) -> tuple[JointResult, ...]:
     """The joints' lines, head to tail.
@@ -94,34 +115,25 @@ def joint_results(
     Args:
         robot: The robot, or None.
         columns: The session's columns.
-        commands: By joint name, on the analysed stretch.
         responses: By joint name, on the analysed stretch.
         gait: The fitted gait, or None.
         energies: By joint name.
+        flags: Artefacts of each joint on the analysed stretch, by name.
         span: The window of energies and coverage.
 
     Returns:
         One result a joint.
     """
     planes = planes_of(robot)
-    limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
     results: list[JointResult] = []
     for name in columns.names:
         response = responses.get(name)
         part = None if response is None else response.between(span.start_s, span.stop_s)
         fraction = 0.0 if part is None else coverage(part.t_s, span.start_s, span.stop_s)
-        driven = gait is not None and name in gait.driven
-        flags: tuple[str, ...] = ("not_recorded",)
-        if response is not None and response.count:
-            flags = joint_flags(
-                response,
-                commands.get(name),
-                limits.get(name),
-                driven_hz=gait.fit.frequency_hz if gait is not None and driven else None,
-                fraction_covered=fraction,
-            )
-        # A frozen encoder says nothing about its joint.
-        gain, lag = _estimates(None if "frozen" in flags else gait, name)
+        own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
+        if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
+            own.append("gaps")
+        gain, lag = _estimates(gait, name)
         power = energies[name]
         mechanical, electrical = power.mechanical, power.electrical
         results.append(
@@ -138,7 +150,7 @@ def joint_results(
                 energy_el_clipped_j=_total(None if electrical is None else electrical.plus_j),
                 coverage=fraction,
                 samples=0 if part is None else part.count,
-                flags=flags,
+                flags=tuple(own),
             )
         )
     return tuple(results)

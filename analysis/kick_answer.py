@@ -46,6 +46,19 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
     Yields:
         Sentences.
     """
+    yield from kick_checks(coupling)
+    yield from held_out_detail(coupling)
+
+
+def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
+    """What was checked, and what the kicks say of a linear chain.
+
+    Args:
+        coupling: Of a kick experiment.
+
+    Yields:
+        Sentences.
+    """
     said = "pass" if coupling.checks_pass else "FAIL"
     yield (
         f"Time shift: rows of P sum to 1 within {_worst(coupling.phase_rows)}, rows of R to 0 "
@@ -62,6 +75,17 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
             f"small: X = H^-1 (condition number {coupling.condition_number:.3g}) has asymmetry "
             f"{_percent(lti.asymmetry)}; off-diagonal energy {bands}."
         )
+
+
+def held_out_detail(coupling: LocalCoupling) -> Iterable[str]:
+    """How well runs that were not used are predicted.
+
+    Args:
+        coupling: Of a kick experiment.
+
+    Yields:
+        Sentences.
+    """
     for one in coupling.held_out:
         yield (
             f"Held out, {one.session}: deviations up to {one.size:.3f}, error "

@@ -64,6 +64,19 @@ def lti_reading(
     X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
     noise = scale * (noise_draws(P, seed) - 1j * noise_draws(R, seed + 1))
     error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
+    return LtiReading(H, condition, *reciprocity(X, error))
+
+
+def reciprocity(X: ComplexArray, error: ComplexArray) -> tuple[Estimate, tuple[Estimate, ...]]:
+    """Asymmetry and reach of a matrix off its diagonal.
+
+    Args:
+        X: An impedance, or what stands for one, shape (m, m).
+        error: Errors that it may have, shape (DRAWS, m, m).
+
+    Returns:
+        ||X - X'|| / ||X||, and the share of the energy within each of ``BANDS``.
+    """
     place = np.arange(len(X))
     distance = np.abs(place[:, None] - place[None, :])
     outside: FloatArray = (distance > 0).astype(np.float64)
@@ -74,11 +87,18 @@ def lti_reading(
         norm_ratio(off * (distance <= b), off_error * (distance <= b), off, off_error)
         for b in BANDS
     )
-    return LtiReading(H, condition, asymmetry, tuple(_squared(one) for one in bands))
+    return asymmetry, tuple(squared(one) for one in bands)
 
 
-def _squared(share: Estimate) -> Estimate:
-    """Energy from a ratio of norms, a share of the whole."""
+def squared(share: Estimate) -> Estimate:
+    """Energy from a ratio of norms.
+
+    Args:
+        share: Of a norm in the whole's.
+
+    Returns:
+        Share of the energy, at most 1.
+    """
     if share.value is None:
         return share
     ci95 = share.ci95

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,6 +18,21 @@ COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"
 CURRENT_TOPIC = "/joint_current"
 VOLTAGE_TOPIC = "/joint_voltage"
+
+QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage", "reference")
+"""What is read of each joint."""
+
+_OF_ITS_OWN = {
+    "velocity": ("/joint_velocity", "position"),
+    "effort": ("/joint_effort", "position"),
+}
+
+_CONTRACT = {"/joint_sample_offset", "/joint_command_offset", "/joint_temperature", "/gait"} | {
+    *("/energy_ledger", CURRENT_TOPIC, VOLTAGE_TOPIC, "/joint_velocity", "/joint_effort")
+}
+"""JointStates that are neither commands nor positions."""
+
+_JOINT_STATE = "sensor_msgs/msg/JointState"
 
 Warn = Callable[[str], None]
 
@@ -34,6 +49,8 @@ class Columns:
         effort: [N m].
         current: Motor current [A].
         voltage: Motor voltage [V].
+        reference: Positions by a second sensor [rad].
+        topics: Quantity, as the attributes above are called, to the topic that it was read from.
     """
 
     names: tuple[str, ...]
@@ -43,9 +60,30 @@ class Columns:
     effort: Mapping[str, Signal]
     current: Mapping[str, Signal]
     voltage: Mapping[str, Signal]
+    reference: Mapping[str, Signal]
+    topics: Mapping[str, str]
+
+    def of(self, quantity: str) -> Mapping[str, Signal]:
+        """One quantity by its name.
+
+        Args:
+            quantity: One of ``QUANTITIES``.
+
+        Returns:
+            Signals by joint name.
+        """
+        signals: Mapping[str, Signal] = getattr(self, quantity)
+        return signals
 
 
-def read_columns(session: Session, command_topic: str, response_topic: str, warn: Warn) -> Columns:
+def read_columns(
+    session: Session,
+    command_topic: str,
+    response_topic: str,
+    warn: Warn,
+    *,
+    reference_topic: str | None = None,
+) -> Columns:
     """Read what is there, and say what is not.
 
     Args:
@@ -53,12 +91,15 @@ def read_columns(session: Session, command_topic: str, response_topic: str, warn
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
         warn: Takes one sentence for each thing missing.
+        reference_topic: JointState topic of a second sensor of the positions, or None.
 
     Returns:
         The columns.
 
     Raises:
-        MissingChannelError: If neither topic is there; the message lists those that are.
+        MissingChannelError: If neither topic is there, or one that was chosen is not; the message
+            lists those that are.
+            those that are.
         DataError: If a topic is not of JointStates.
     """
     wanted = {
@@ -69,21 +110,37 @@ def read_columns(session: Session, command_topic: str, response_topic: str, warn
         "current": (CURRENT_TOPIC, "position"),
         "voltage": (VOLTAGE_TOPIC, "position"),
     }
-    if not {command_topic, response_topic} & set(session.channels):
-        joint_topics = [
-            topic
-            for topic, channel in session.channels.items()
-            if channel.type_name == "sensor_msgs/msg/JointState"
-        ]
-        raise MissingChannelError(
-            session.path, f"{command_topic} or {response_topic}", sorted(joint_topics)
-        )
+    if reference_topic is not None:
+        wanted["reference"] = (reference_topic, "position")
+    joint_topics = sorted(
+        topic for topic, one in session.channels.items() if one.type_name == _JOINT_STATE
+    )
+    asked = [(command_topic, response_topic)]
+    asked += [] if reference_topic is None else [(reference_topic,)]
+    named = [(command_topic, COMMAND_TOPIC), (response_topic, RESPONSE_TOPIC)]
+    asked += [(topic,) for topic, usual in named if topic != usual]  # chosen, so it must be there
+    for topics in asked:
+        if not set(topics) & set(session.channels):
+            there = joint_topics or sorted(session.channels)
+            raise MissingChannelError(session.path, _wanted(topics, session.warnings), there)
     wanted = {key: one for key, one in wanted.items() if one[0] in session.channels}
     found = _read(session, wanted)
-    if "command" not in found:
-        warn(f"no commands on {command_topic}: gain and lag are null")
-    if "position" not in found:
-        warn(f"no positions on {response_topic}: gain and lag are null")
+    if response_topic == RESPONSE_TOPIC:
+        # A bus that gives them in frames of their own has them on topics of their own.
+        own = {key: one for key, one in _OF_ITS_OWN.items() if one[0] in session.channels}
+        own = {key: one for key, one in own.items() if key not in found}
+        found |= _read(session, own) if own else {}
+        wanted |= own
+    others = [one for one in joint_topics if one not in _CONTRACT]
+    for key, kind, topic in (
+        ("command", "commands", command_topic),
+        ("position", "positions", response_topic),
+    ):
+        if key not in found:
+            option = "--command-topic" if key == "command" else "--response-topic"
+            spare = [one for one in others if one not in (command_topic, response_topic)]
+            named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
+            warn(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}")
     if "velocity" not in found or "effort" not in found:
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
         warn(f"{response_topic} carries no {lacking}: mechanical energies are null")
@@ -98,10 +155,11 @@ def read_columns(session: Session, command_topic: str, response_topic: str, warn
         for key, signals in found.items()
     }
     absent: dict[str, Signal] = {}
-    return Columns(names=tuple(seen), **{key: by_name.get(key, absent) for key in _QUANTITIES})
-
-
-_QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage")
+    return Columns(
+        names=tuple(seen),
+        **{key: by_name.get(key, absent) for key in QUANTITIES},
+        topics={key: wanted[key][0] for key in found},
+    )
 
 
 def settle_time_s(session: Session) -> float:
@@ -113,11 +171,7 @@ def settle_time_s(session: Session) -> float:
     Returns:
         From the session's start.
     """
-    stated = session.metadata.get("undulog", {}).get("settle_s")
-    try:
-        return max(0.0, float(stated)) if stated is not None else 0.0
-    except ValueError:
-        return 0.0
+    return session.settle_s or 0.0
 
 
 def drag_ratio(session: Session) -> float:
@@ -167,6 +221,12 @@ def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
     for name in names:
         result.setdefault(planes.get(name, "chain"), []).append(name)
     return result
+
+
+def _wanted(topics: Sequence[str], warnings: Sequence[str]) -> str:
+    """What is missing; where the file itself is not whole, that is why."""
+    told = " or ".join(topics)
+    return f"{told} ({'; '.join(warnings)})" if warnings else told
 
 
 def _read(session: Session, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:

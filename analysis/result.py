@@ -9,7 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from .notebook.shown import Shown
+from .result_artefact import Artefact
+
+if TYPE_CHECKING:
+    from .oscillators.result import ChainCoupling
+    from .result_energy import EnergyResult
+    from .result_over_time import ResponseOverTime
 
 Interval = tuple[float, float]
 
@@ -101,7 +109,8 @@ class JointResult:
         energy_el_clipped_j: Its positive part only (no regeneration).
         coverage: Fraction of the windows that has samples, 0 to 1.
         samples: Response samples used.
-        flags: Artefacts seen, e.g. ``saturated``.
+        flags: Artefacts seen in the analysed stretch, e.g. ``saturated``;
+            :attr:`Analysis.artefacts` says when.
     """
 
     name: str
@@ -171,8 +180,8 @@ class Index:
     label: str
 
 
-@dataclass(frozen=True)
-class Coupling:
+@dataclass(frozen=True, repr=False)
+class Coupling(Shown):
     """Whether the coupling can be told from this session.
 
     Attributes:
@@ -207,8 +216,8 @@ class Provenance:
     options: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Analysis:
+@dataclass(frozen=True, repr=False)
+class Analysis(Shown):
     """All numbers of one session.
 
     Attributes:
@@ -220,6 +229,11 @@ class Analysis:
         coupling: Identifiable or not.
         warnings: One sentence each: what is missing or doubtful and why.
         provenance: How it was made.
+        artefacts: What is wrong with samples or at a limit, anywhere in the session, and when.
+        over_time: Gain and lag cycle by cycle, by the logged phase; None with a warning.
+        energy: Energies cycle by cycle, cost of transport, closure.
+        oscillators: Couplings of the oscillators that drove it, one a plane; none where no
+            oscillator's phase was logged.
     """
 
     session: SessionFacts
@@ -230,6 +244,10 @@ class Analysis:
     coupling: Coupling
     warnings: tuple[str, ...]
     provenance: Provenance
+    artefacts: tuple[Artefact, ...] = ()
+    oscillators: tuple[ChainCoupling, ...] = ()
+    over_time: ResponseOverTime | None = None
+    energy: EnergyResult | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -255,15 +273,40 @@ class Analysis:
                 name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
             },
             "coupling": dataclasses.asdict(self.coupling),
+            "over_time": None if self.over_time is None else dataclasses.asdict(self.over_time),
+            "energy": None if self.energy is None else _energy_dict(self.energy),
+            "oscillators": [dataclasses.asdict(one) for one in self.oscillators],
+            "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),
             "provenance": dataclasses.asdict(self.provenance),
         }
 
 
+def interval_key(key: str) -> str:
+    """Name of an estimate's interval in the JSON object of a session.
+
+    Args:
+        key: Name of the estimate, e.g. ``lag_rad``.
+
+    Returns:
+        For example ``lag_ci95``.
+    """
+    with_unit = {"lag_rad", "frequency_hz", "phase_rad", "amplitude_m", "distance_m"}
+    return f"{key.rsplit('_', 1)[0] if key in with_unit else key}_ci95"
+
+
 def _flat(key: str, estimate: Estimate) -> dict[str, Any]:
-    stem = key.rsplit("_", 1)[0] if key in {"lag_rad", "frequency_hz", "phase_rad"} else key
-    stem = "amplitude" if key == "amplitude_m" else stem
-    return {key: estimate.value, f"{stem}_ci95": estimate.ci95}
+    return {key: estimate.value, interval_key(key): estimate.ci95}
+
+
+def _energy_dict(energy: EnergyResult) -> dict[str, Any]:
+    cost = energy.transport
+    named = ("net", "plus", "abs", "el", "el_clipped")
+    flat = {"distance_m": cost.distance_m, **{name: getattr(cost, name) for name in named}}
+    transport: dict[str, Any] = {"mass_kg": cost.mass_kg, "why": cost.why}
+    for key, estimate in flat.items():
+        transport |= _flat(key, estimate)
+    return dataclasses.asdict(energy) | {"transport": transport}
 
 
 def _point_dict(point: BodyPoint) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class HeldOut:
     noise: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class LocalCoupling(Coupling):
     """The answers of all joints to small kicks of each joint's command around one gait.
 

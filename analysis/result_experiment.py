@@ -10,6 +10,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from .notebook.shown import Shown
+from .oscillators.result import BodyOscillators
 from .result import Analysis, Coupling, Estimate, Index, Provenance
 
 BLIND = (
@@ -80,8 +82,8 @@ class WeakModule:
     p: float
 
 
-@dataclass(frozen=True)
-class Reversal:
+@dataclass(frozen=True, repr=False)
+class Reversal(Shown):
     """Test of H1, that the modules are identical, by running the wave both ways.
 
     Attributes:
@@ -128,8 +130,8 @@ class Reversal:
     blind: str = BLIND
 
 
-@dataclass(frozen=True)
-class Experiment:
+@dataclass(frozen=True, repr=False)
+class Experiment(Shown):
     """All numbers of several sessions.
 
     Attributes:
@@ -139,9 +141,12 @@ class Experiment:
         heterogeneity: Index name to index, from all runs together.
         reversal: None where it can't be tested; a warning says why.
         coupling: Identifiable or not; from kicks around one gait a
-            :class:`analysis.result_coupling.LocalCoupling`.
+            :class:`analysis.result_coupling.LocalCoupling`, from a sweep without contact a
+            :class:`analysis.result_sweep.LinearCoupling`.
         warnings: One sentence each.
         provenance: How it was made.
+        oscillators: From kicks around one gait: how oscillators that feel their servos would
+            synchronise through the body; None without such kicks.
     """
 
     answer: str
@@ -152,6 +157,7 @@ class Experiment:
     coupling: Coupling
     warnings: tuple[str, ...]
     provenance: Provenance
+    oscillators: BodyOscillators | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -171,6 +177,9 @@ class Experiment:
             },
             "reversal": None if self.reversal is None else dataclasses.asdict(self.reversal),
             "coupling": dataclasses.asdict(self.coupling),
+            "oscillators": None
+            if self.oscillators is None
+            else dataclasses.asdict(self.oscillators),
             "warnings": list(self.warnings),
             "provenance": dataclasses.asdict(self.provenance),
         }

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from capture.arrays import FloatArray, IntArray, frozen
+from capture.log.signals import Signal
 
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""
@@ -38,10 +40,15 @@ class Series:
         """Number of samples."""
         return self.t_s.size
 
-    @property
+    @cached_property
     def period_s(self) -> float:
         """Median sampling interval [s]; NaN with fewer than two samples."""
         return float(np.median(np.diff(self.t_s))) if self.count > 1 else float("nan")
+
+    @cached_property
+    def gaps(self) -> IntArray:
+        """Indices of the samples that a gap follows, shape (g,)."""
+        return gaps_after(np.diff(self.t_s))
 
     def at(self, t_s: FloatArray) -> FloatArray:
         """Values at other times, interpolated linearly; the ends are held.
@@ -52,6 +59,8 @@ class Series:
         Returns:
             Values, shape (k,).
         """
+        if t_s is self.t_s:
+            return self.values
         return np.interp(t_s, self.t_s, self.values).astype(np.float64)
 
     def between(self, start_s: float, stop_s: float) -> Series:
@@ -89,23 +98,76 @@ def clean(name: str, t_ns: IntArray, values: FloatArray, origin_ns: int) -> Seri
         origin_ns: Unix time that becomes 0 s.
 
     Returns:
-        The series, without samples that are not finite and without second samples of one time.
+        The series, without samples that are not finite and without second samples of one time;
+        where there are none, its values are those that were given, not a copy.
     """
     finite = np.isfinite(values)
-    kept_t, kept = t_ns[finite], values[finite]
-    if kept_t.size > 1 and np.any(np.diff(kept_t) < 0):
-        order = np.argsort(kept_t, kind="stable")
-        kept_t, kept = kept_t[order], kept[order]
-    first = np.ones(kept_t.size, dtype=np.bool_)
-    first[1:] = np.diff(kept_t) > 0
-    t_s = (kept_t[first] - np.int64(origin_ns)).astype(np.float64) * 1e-9
+    lost = values.size - int(np.count_nonzero(finite))
+    if lost:
+        t_ns, values = t_ns[finite], values[finite]
+    step = np.diff(t_ns)
+    least = int(step.min()) if step.size else 1
+    if least < 0:
+        order = np.argsort(t_ns, kind="stable")
+        t_ns, values = t_ns[order], values[order]
+        step = np.diff(t_ns)
+    double = 0
+    if least <= 0:
+        first = np.concatenate(([True], step > 0))
+        double = first.size - int(np.count_nonzero(first))
+        t_ns, values = t_ns[first], values[first]
+    t_s = (t_ns - np.int64(origin_ns)).astype(np.float64)
+    t_s *= 1e-9
     return Series(
         name=name,
         t_s=frozen(t_s),
-        values=frozen(kept[first].astype(np.float64)),
-        dropped_nan=int(values.size - np.count_nonzero(finite)),
-        dropped_duplicates=int(first.size - np.count_nonzero(first)),
+        values=frozen(values.view() if values.dtype == np.float64 else values.astype(np.float64)),
+        dropped_nan=lost,
+        dropped_duplicates=double,
     )
+
+
+def clean_together(signals: Mapping[str, Signal], origin_ns: int) -> dict[str, Series]:
+    """Take several signals into that form; what shares its times goes on sharing them.
+
+    Args:
+        signals: By any key.
+        origin_ns: Unix time that becomes 0 s.
+
+    Returns:
+        The series by key.
+    """
+    found: dict[str, Series] = {}
+    times: dict[int, Series] = {}
+    for key, one in signals.items():
+        known = times.get(id(one.t_ns))
+        if known is not None and np.isfinite(one.values).all():
+            found[key] = Series(one.name, known.t_s, frozen(one.values.view()))
+            continue
+        found[key] = made = clean(one.name, one.t_ns, one.values, origin_ns)
+        if np.may_share_memory(made.values, one.values):  # nothing was left out or moved
+            times[id(one.t_ns)] = made
+    return found
+
+
+def gaps_after(step_s: FloatArray) -> IntArray:
+    """Which intervals between samples are gaps.
+
+    Args:
+        step_s: The intervals, all above 0 [s], shape (n,).
+
+    Returns:
+        Their indices.
+    """
+    if step_s.size == 0 or _all_usual(step_s, float(step_s.max())):
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(step_s > GAP_FACTOR * np.median(step_s))
+
+
+def _all_usual(step_s: FloatArray, longest_s: float) -> bool:
+    """Whether even the longest interval is no gap; most channels are done without a median."""
+    # More than half of the intervals are this long, so their median is.
+    return 2 * int(np.count_nonzero(GAP_FACTOR * step_s >= longest_s)) > step_s.size
 
 
 def sample_weights(t_s: FloatArray, start_s: float, stop_s: float) -> FloatArray:
@@ -129,9 +191,11 @@ def sample_weights(t_s: FloatArray, start_s: float, stop_s: float) -> FloatArray
     if t_s.size == 1:
         return np.zeros(1)
     around_the_end = (t_s[0] - start_s) + (stop_s - t_s[-1])
-    step = np.concatenate(([around_the_end], np.diff(t_s), [around_the_end]))
-    usual = float(np.median(step[1:-1]))
-    half = np.where(step > GAP_FACTOR * usual, usual, step) / 2
+    half = np.concatenate(([around_the_end], np.diff(t_s), [around_the_end])) / 2
+    inner = half[1:-1]
+    if not _all_usual(inner, float(max(half[0], inner.max()))):
+        usual = np.median(inner)
+        half[half > GAP_FACTOR * usual] = usual
     return half[:-1] + half[1:]
 
 

@@ -15,9 +15,10 @@ from scipy.special import fdtrc
 
 from capture.arrays import ComplexArray
 
+from .cycle_sums import cycle_sums, starts_of
 from .harmonic import HarmonicFit
 from .series import Series
-from .spectrum import demodulated
+from .spectrum import residuals
 
 DRIFT_PER_CYCLE = 1e-4
 """Drift of ln H per cycle below which a motion counts as settled."""
@@ -91,11 +92,11 @@ def _each_cycle(one: Series, fit: HarmonicFit, channel: int) -> ComplexArray:
         return nothing
     turn_s = 2 * np.pi / fit.omega
     cycles = int((one.t_s[-1] - one.t_s[0] + one.period_s) / turn_s + 0.01)
-    sums, filled = np.zeros(cycles + 1, dtype=np.complex128), np.zeros(cycles + 1)
-    for part in demodulated([one], fit, [channel]):
-        cycle = np.minimum((part.t_s - one.t_s[0]) / turn_s, cycles).astype(np.int64)
-        np.add.at(sums, cycle, part.residual[0])
-        np.add.at(filled, cycle, 1.0)
-    if cycles < 1 or filled[:cycles].min() < 2:
+    starts = starts_of(one.t_s, one.t_s[0] + turn_s * np.arange(cycles + 1))
+    filled = np.diff(starts)
+    if cycles < 1 or filled.min() < 2:
         return nothing
-    return 2 * sums[:cycles] / filled[:cycles] / amplitude
+    parts = [part.turned[:, 0] for part in residuals([one], fit, [channel])]
+    turned = np.concatenate(parts, axis=1)
+    real, imaginary = cycle_sums(turned, starts)
+    return 2 * (real + 1j * imaginary) / filled / amplitude

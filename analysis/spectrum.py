@@ -12,14 +12,22 @@ Student's t with 2 L of them gives the interval.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from capture.arrays import ComplexArray, FloatArray, IntArray
 
-from .harmonic import RELATIVE_FLOOR, HarmonicFit, basis, chunks, time_scale
+from .harmonic import HarmonicFit
+from .harmonic_moments import (
+    RELATIVE_FLOOR,
+    HarmonicModel,
+    basis,
+    chunks,
+    time_scale,
+)
 from .series import Series, shared_times
+from .threads import in_threads
 
 BINS_PER_SIDE = 6
 """At most six bins on either side: 24 degrees of freedom, whose t factor is 5 % above normal."""
@@ -89,8 +97,13 @@ def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
         Level, degrees of freedom and covariance.
     """
     level, dof = np.zeros((2, len(series)))
-    for members in shared_times(series):
-        power, kept = _bins([series[k] for k in members], fit, members)
+
+    def bins(members: list[int]) -> tuple[FloatArray, FloatArray]:
+        return _bins([series[k] for k in members], fit, members)
+
+    groups = shared_times(series)
+    found = in_threads(bins, groups, sum(one.count for one in series))
+    for members, (power, kept) in zip(groups, found, strict=True):
         usable = kept > KEPT_POWER * fit.count[members[0]]
         if not np.any(usable):
             usable = kept == kept.max()
@@ -127,24 +140,24 @@ def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Demodulated:
-    """One chunk of a group of k channels, turned back by the gait's own rotation.
+class Residual:
+    """What a fit leaves of one chunk of a group of k channels.
 
     Attributes:
-        t_s: Times [s], shape (n,).
-        rows: Basis rows times exp(-j omega t), shape (p, n).
-        residual: What the fit leaves, times exp(-j omega t), shape (k, n).
+        part: Where in the record the chunk lies.
+        rows: Basis rows of the model with one harmonic more, shape (p + 2, n).
+        turned: Residual times cos(omega t) and times -sin(omega t), shape (2, k, n).
     """
 
-    t_s: FloatArray
-    rows: ComplexArray
-    residual: ComplexArray
+    part: slice
+    rows: FloatArray
+    turned: FloatArray
 
 
-def demodulated(
+def residuals(
     group: Sequence[Series], fit: HarmonicFit, members: Sequence[int]
-) -> Iterator[Demodulated]:
-    """What a fit leaves of channels with shared times, demodulated at omega.
+) -> Iterator[Residual]:
+    """What a fit leaves of channels with shared times, turned back by the gait's own rotation.
 
     Args:
         group: The channels.
@@ -158,11 +171,12 @@ def demodulated(
     scale = time_scale(t_s)
     theta = _parameters(fit, members, scale)
     first = fit.model.trend + 1
+    wider = replace(fit.model, harmonics=fit.model.harmonics + 1)
     for part in chunks(t_s.size):
-        rows = basis(t_s[part], fit.omega, fit.model, scale)
-        back = rows[first] + 1j * rows[first + 1]  # cos - j sin
-        residual = np.stack([one.values[part] for one in group]) - theta @ rows
-        yield Demodulated(t_s[part], rows * back, residual * back)
+        rows = basis(t_s[part], fit.omega, wider, scale)
+        residual = np.stack([one.values[part] for one in group])
+        residual -= theta @ rows[: fit.model.size]
+        yield Residual(part, rows, rows[first : first + 2, None] * residual)
 
 
 def _bins(
@@ -177,14 +191,37 @@ def _bins(
     # Demodulated, the bins turn a few times over the whole record: long records are summed in
     # blocks of less than a hundredth of a radian first.
     block = max(1, t_s.size // _BLOCKS)
-    for part in demodulated(group, fit, members):
-        edges = np.arange(0, part.t_s.size, block)
-        filled = np.diff(np.append(edges, part.t_s.size))
-        waves = _waves(np.add.reduceat(part.t_s, edges) / filled, 2 * np.pi / span, side)
-        transform += np.add.reduceat(part.residual, edges, axis=1) @ waves.T
-        overlap += np.add.reduceat(part.rows, edges, axis=1) @ waves.T
+    for one in residuals(group, fit, members):
+        count = one.part.stop - one.part.start
+        edges: IntArray = np.arange(0, count, block, dtype=np.int64)
+        filled = np.diff(np.concatenate((edges, [count])))
+        waves = _waves(np.add.reduceat(t_s[one.part], edges) / filled, 2 * np.pi / span, side)
+        real, imaginary = np.add.reduceat(one.turned, edges, axis=2)
+        transform += (real + 1j * imaginary) @ waves.T
+        overlap += _turned_rows(one.rows, edges, fit.model) @ waves.T
     removed = np.einsum("pl,pq,ql->l", overlap.conj(), fit.inverse_gram[members[0]], overlap).real
     return np.abs(transform) ** 2, t_s.size - removed
+
+
+def _turned_rows(rows: FloatArray, edges: IntArray, model: HarmonicModel) -> ComplexArray:
+    """Sums over blocks of the basis rows times exp(-j omega t), shape (p, blocks).
+
+    Of a harmonic they are those of its neighbours: cos(h x) exp(-j x) is half the sum of
+    exp(j (h - 1) x) and exp(-j (h + 1) x), and -sin(h x) exp(-j x) is j / 2 of their difference.
+    """
+    first, h = model.trend + 1, model.harmonics
+    sums = np.add.reduceat(rows, edges, axis=1)
+    parts = sums[first:].reshape(h + 1, 2, -1)
+    back: ComplexArray = parts[:, 0] + 1j * parts[:, 1]  # exp(-j m x), m = 1 .. h + 1
+    below = np.concatenate((sums[:1], back[: h - 1].conj()))
+    turned = np.empty((model.size, edges.size), dtype=np.complex128)
+    turned[0] = back[0]
+    for d in range(1, first):
+        real, imaginary = np.add.reduceat(rows[d] * rows[first : first + 2], edges, axis=1)
+        turned[d] = real + 1j * imaginary
+    turned[first::2] = (below + back[1:]) / 2
+    turned[first + 1 :: 2] = (below - back[1:]) * 0.5j
+    return turned
 
 
 def _waves(t_s: FloatArray, spacing: float, side: int) -> ComplexArray:

@@ -30,12 +30,14 @@ class Options:
         stop_s: Its end, not included [s]; None: chosen.
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
+        reference_topic: JointState topic of a second sensor of the same positions, or None.
     """
 
     start_s: float | None = None
     stop_s: float | None = None
     command_topic: str = COMMAND_TOPIC
     response_topic: str = RESPONSE_TOPIC
+    reference_topic: str | None = None
 
     def arguments(self) -> list[str]:
         """What to give on the command line for these options, defaults left out."""

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import formats
 from .answer import answer
+from .command_line import UNLIMITED
+from .null_model_result import ModelledAnalysis, told_null
+from .oscillators.text import chain_detail
 from .result import Analysis, BodyResult, Estimate, Index, JointResult
+from .table_lines import more_lines
+
+_SPARE: list[tuple[str, ...]] = [
+    (name,) for name in ("plane", "cover", "E_net J", "E_el J", "command°", "E_abs J")
+]
+"""Columns of the table of joints that a narrow terminal goes without."""
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
-
-UNLIMITED = 10_000
-"""A width at which nothing wraps."""
 
 
 def sheet(width: int, *, color: bool) -> tuple[StringIO, Console, Console]:
@@ -42,12 +49,48 @@ def sheet(width: int, *, color: bool) -> tuple[StringIO, Console, Console]:
     return text, console(max(width, 40)), console(UNLIMITED)
 
 
+def put(prose: Console, wide: Console, table: Table, spare: Sequence[tuple[str, ...]]) -> None:
+    """Print a table, without what it can spare where the terminal is too narrow for all of it.
+
+    Args:
+        prose: As wide as the terminal.
+        wide: Prints it, unwrapped.
+        table: The table.
+        spare: Headings of columns that may go, those that go together, the first ones first.
+    """
+    from rich.measure import Measurement
+
+    left: list[str] = []
+    for names in spare:
+        if Measurement.get(wide, wide.options, table).maximum <= prose.width:
+            break
+        left += [name for name in names if any(one.header == name for one in table.columns)]
+        table = _without(table, names)
+    wide.print(table)
+    if left:
+        told = f"Without {', '.join(left)}: the terminal is too narrow; --json has all."
+        prose.print(told, style="dim", markup=False)
+
+
+def _without(table: Table, names: tuple[str, ...]) -> Table:
+    """A table without the columns of those headings."""
+    from rich.table import Table
+
+    fewer = Table(box=None, pad_edge=False, header_style="bold")
+    kept = [column for column in table.columns if column.header not in names]
+    for column in kept:
+        fewer.add_column(column.header, justify=column.justify, no_wrap=column.no_wrap)
+    for row, *cells in zip(table.rows, *(column.cells for column in kept), strict=True):
+        fewer.add_row(*cells, style=row.style)
+    return fewer
+
+
 def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -> str:
     """Set a result as text.
 
     Args:
         analysis: The result.
-        width: Columns of the terminal: sentences wrap there, but for the first line and the tables.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
         color: Whether to use bold and dim type.
 
     Returns:
@@ -55,21 +98,32 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     """
     text, prose, wide = sheet(width, color=color)
     name, told = Path(analysis.session.path).name, answer(analysis)
-    wide.print(f"{name}: {told.sentence}", style="bold", markup=False)
+    prose.print(f"{name}: {told.sentence}", style="bold", markup=False)
     prose.print(told.detail, markup=False)
-    tables = [_joint_table(analysis)]
+    tables: list[tuple[Table, list[tuple[str, ...]]]] = [(_joint_table(analysis), _SPARE)]
     if analysis.body is not None:
-        tables.append(_body_table(analysis.body))
+        table = _body_table(analysis.body)
+        tables.append(
+            (table, [("phase°",), tuple(f"{name} null mm" for name in analysis.body.null)])
+        )
     if any(one.value is not None for one in analysis.heterogeneity.values()):
-        tables.append(_index_table(analysis.heterogeneity))
-    for table in tables:
+        tables.append((_index_table(analysis.heterogeneity), [("what",), ("unit",)]))
+    for table, spare in tables:
         prose.print()
-        wide.print(table)
+        put(prose, wide, table, spare)
     prose.print()
+    for line in more_lines(analysis):
+        prose.print(line, markup=False)
     coupling = analysis.coupling
     if not coupling.identifiable:
         record = f" To identify it, record {coupling.record}." if coupling.record else ""
         prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
+    for chain in analysis.oscillators:
+        for line in chain_detail(chain):
+            prose.print(line, markup=False)
+    if isinstance(analysis, ModelledAnalysis):
+        for line in told_null(analysis.null_model):
+            prose.print(line, markup=False)
     for warning in analysis.warnings:
         prose.print(f"Warning: {warning}", markup=False)
     prose.print(_method(analysis), style="dim", markup=False)

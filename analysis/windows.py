@@ -98,9 +98,12 @@ def steady_runs(
         return []
     kept = [k for k, name in enumerate(names) if name.rpartition(".")[2] in _STEADY]
     kept = [k for k in kept if names[k].rpartition(".")[2] not in ignore]
-    steady = values[:, kept]
-    allowed = _SAME * np.maximum(np.abs(steady[1:]), np.abs(steady[:-1])) + 1e-12
-    changed: BoolArray = np.any(np.abs(np.diff(steady, axis=0)) > allowed, axis=1)
+    changed: BoolArray = np.zeros(t_ns.size - 1, dtype=np.bool_)
+    for steady in values.T[kept]:
+        step = np.abs(np.diff(steady))
+        if np.any(step):
+            size = np.abs(steady)
+            changed |= step > _SAME * np.maximum(size[1:], size[:-1]) + 1e-12
     edges = [0, *(np.flatnonzero(changed) + 1).tolist(), t_ns.size]
     interval = int(np.median(np.diff(t_ns))) if t_ns.size > 1 else 1
     stops = np.append(t_ns, t_ns[-1] + interval)

@@ -11,7 +11,7 @@ from capture.console import emit_json
 from capture.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from .designs import PlannedRun
     from .gait_base import BaseGait
@@ -105,6 +105,22 @@ def _plan(
         files = write_plan(
             plan, base, design(base), session, folder, settle_s=settle_s, measure_s=measure_s
         )
+    announce(plan, folder, files, (settle_s, measure_s), as_json=as_json)
+
+
+def announce(
+    plan: str, folder: Path, files: Sequence[Path], times_s: tuple[float, float], *, as_json: bool
+) -> None:
+    """Say what was written, and what to do with it.
+
+    Args:
+        plan: Name of the design.
+        folder: Where the files are.
+        files: One a run.
+        times_s: Of a run's settling, and of what is measured after it [s].
+        as_json: Print one JSON object.
+    """
+    settle_s, measure_s = times_s
     if as_json:
         emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
         return

@@ -16,18 +16,45 @@ HELD_OUT = (0.05, 0.1, 0.15)
 
 
 @dataclass(frozen=True)
+class Tone:
+    """A sine at a frequency of its own, in all driven joints.
+
+    Attributes:
+        omega: Angular frequency [rad/s].
+        amplitude: Complex amplitudes of the driven joints' commands [rad], shape (m,).
+    """
+
+    omega: float
+    amplitude: ComplexArray
+
+
+@dataclass(frozen=True)
 class PlannedRun:
     """One run's commands.
 
     Attributes:
         label: For its file name.
-        amplitude: Complex amplitudes of the driven joints' commands [rad], shape (m,).
+        amplitude: Complex amplitudes of the driven joints' commands at the gait's frequency [rad],
+            shape (m,).
         facts: What it is, for its metadata record.
+        more: Tones beside it.
     """
 
     label: str
     amplitude: ComplexArray
     facts: dict[str, str] = field(default_factory=dict[str, str])
+    more: tuple[Tone, ...] = ()
+
+    def tones(self, omega: float) -> tuple[Tone, ...]:
+        """All that is commanded.
+
+        Args:
+            omega: The gait's angular frequency [rad/s].
+
+        Returns:
+            The tone at the gait's frequency, then the others.
+        """
+        return (Tone(omega, self.amplitude), *self.more)
 
 
 def phase_kicks(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ def write_plan(
     *,
     settle_s: float,
     measure_s: float,
+    facts: Mapping[str, str] | None = None,
 ) -> tuple[Path, ...]:
     """Write each run's commands to a session of its own.
 
@@ -41,6 +42,7 @@ def write_plan(
         folder: Where to; made if it isn't there.
         settle_s: Time before what is to be measured [s].
         measure_s: Length of what is to be measured [s].
+        facts: More for the metadata record of every run.
 
     Returns:
         The files.
@@ -70,8 +72,9 @@ def write_plan(
             robot=like.robot,
             metadata={"settle_s": f"{settle_s:g}"},
         ) as writer:
-            facts = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
-            writer.note("undulog.plan", facts | run.facts)
+            told = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
+            told |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
+            writer.note("undulog.plan", told | dict(facts or {}) | run.facts)
             if "scenario.toml" in like.attachments:
                 writer.attach(
                     "scenario.toml", "application/toml", like.attachments["scenario.toml"]
@@ -97,8 +100,9 @@ def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) ->
     x = np.clip(t_s / ramp_s, 0.0, 1.0) if ramp_s > 0 else np.ones_like(t_s)
     grown = x * x * (3 - 2 * x)
     values = np.tile(base.offset, (t_s.size, 1))
-    wave = np.real(np.exp(1j * base.omega * t_s)[:, None] * run.amplitude[None, :])
-    values[:, list(base.driven)] += grown[:, None] * wave
+    for tone in run.tones(base.omega):
+        wave = np.real(np.exp(1j * tone.omega * t_s)[:, None] * tone.amplitude[None, :])
+        values[:, list(base.driven)] += grown[:, None] * wave
     return values
 
 
@@ -107,7 +111,8 @@ def _check_limits(base: BaseGait, runs: Sequence[PlannedRun], like: Session) -> 
         return
     joints = {joint.name: joint for joint in like.robot.joints}
     for run in runs:
-        for k, amplitude in zip(base.driven, np.abs(run.amplitude), strict=True):
+        largest = np.sum([np.abs(tone.amplitude) for tone in run.tones(base.omega)], axis=0)
+        for k, amplitude in zip(base.driven, largest, strict=True):
             joint = joints.get(base.names[k])
             if joint is None:
                 continue

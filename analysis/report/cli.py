@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress
 from capture.errors import UsageError
 from capture.part_file import part_file
 
+from ..command_line import PAGES, check_output, chosen
+
 if TYPE_CHECKING:
     from ..result import Analysis
+    from ..stretch import Options
 
 
 def report(
@@ -28,68 +31,80 @@ def report(
 ) -> None:
     """Write the offline report: one HTML page that needs no network and no script.
 
+    Several sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
+    tell boundary from module, kicks of single joints tell the coupling.
+
     Example: `undulog report run.mcap -o run.html`
 
     Args:
-        files: Sessions (MCAP); several share one page.
+        files: Sessions (MCAP); several are runs of one experiment.
         output: The page, a name that ends in .html.
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
         force: Replace the page if it exists.
-        json: Print one JSON object: the page and the answer to each session.
+        json: Print one JSON object: the page, the answer, and the answer to each session.
     """
     if not files:
         raise UsageError(
             "report needs at least one session, e.g. undulog report run.mcap -o x.html"
         )
-    if output.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"{output}: the report is an HTML page; end its name in .html")
-    if start is not None and stop is not None and stop <= start:
-        raise UsageError(f"--stop {stop:g} is not after --start {start:g}")
-    refuse_existing(output, force=force)
-    from capture import Session
-
-    from ..analyse import analyse_session
-    from ..answer import answer
-    from ..stretch import Options
-    from . import render
-
-    options = Options(start, stop, command_topic, response_topic)
-    analyses: list[Analysis] = []
-    sessions: list[Session] = []
-
-    with ExitStack() as stack, progress("report", total=len(files) + 1) as bar:
-        for k, file in enumerate(files):
-            bar.update(k, note=file.name)
-            session = stack.enter_context(Session.open(file))
-            analyses.append(analyse_session(session, options))
-            sessions.append(session)
-        bar.update(len(files), note="page")
-        page = render(analyses, sessions)
+    options = chosen(start, stop, command_topic, response_topic)
+    why = "the report is an HTML page; end its name in .html"
+    check_output(output, PAGES, why, force=force)
+    page, told, warnings = _one(files[0], options) if len(files) == 1 else _several(files, options)
     with part_file(output) as part:
         part.write_text(page, encoding="utf-8")
-    answers = [answer(analysis) for analysis in analyses]
+    size = output.stat().st_size
     if json:
-        emit_json(
-            {
-                "page": str(output),
-                "bytes": output.stat().st_size,
-                "answers": [
-                    {
-                        "session": a.session.id,
-                        "path": a.session.path,
-                        "verdict": told.verdict,
-                        "sentence": told.sentence,
-                    }
-                    for a, told in zip(analyses, answers, strict=True)
-                ],
-            }
-        )
+        emit_json({"page": str(output), "bytes": size, **told})
         return
-    for file, told in zip(files, answers, strict=True):
-        print(told.sentence if len(answers) == 1 else f"{file.name}: {told.sentence}")
-    warnings = sum(len(analysis.warnings) for analysis in analyses)
+    print(told["answer"])
     said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
-    print(f"{output}: {output.stat().st_size / 1e3:.0f} kB{said}")
+    print(f"{output}: {size / 1e3:.0f} kB{said}")
+
+
+def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
+    """The page on one session, its answer, and how many warnings are in it."""
+    from capture import Session
+
+    from ..analyse import measure_session
+    from ..cycles import cycle_maps
+    from . import render
+
+    with progress("report", total=2) as bar:
+        bar.update(0, note=file.name)
+        with Session.open(file) as session:
+            measured = measure_session(session, options)
+            analysis = measured.analysis
+            bar.update(1, note="page")
+            page = render(analysis, session, cycle_maps(measured))
+    told = _told(analysis)
+    return page, {"answer": told["sentence"], "answers": [told]}, len(analysis.warnings)
+
+
+def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:
+    """The page on an experiment, its answer and each session's, and how many warnings are in it."""
+    from ..cli import experiment_of
+    from . import render
+
+    experiment = experiment_of(files, options, "report")
+    page = render(experiment)
+    told = {
+        "answer": f"{len(files)} sessions: {experiment.answer}.",
+        "answers": [_told(one) for one in experiment.sessions],
+    }
+    return page, told, len(experiment.warnings)
+
+
+def _told(analysis: Analysis) -> dict[str, Any]:
+    from ..answer import answer
+
+    told = answer(analysis)
+    return {
+        "session": analysis.session.id,
+        "path": analysis.session.path,
+        "verdict": told.verdict,
+        "sentence": told.sentence,
+    }

@@ -13,7 +13,8 @@ from typing import Any
 
 from matplotlib import lines
 
-from .svg import Figure, Handle
+from ..formats import short
+from .svg import Axes, Figure, Handle
 
 WIDTH_IN = 8.0
 """Width of every figure [inch]; the page scales it."""
@@ -66,3 +67,17 @@ def legend(figure: Figure, handles: Sequence[Handle]) -> None:
         handletextpad=0.5,
         handlelength=1.8,
     )
+
+
+def joint_ticks(axes: Axes, names: Sequence[str]) -> None:
+    """Joint names along the axis where they fit, else every second, third ... of them.
+
+    Args:
+        axes: Joints stand at 1, 2, ... from head to tail.
+        names: Of all joints.
+    """
+    shown = [short(name, 14) for name in names]
+    room = 95  # characters of 8 points that stand beside one another over the width
+    step = max(1, -(-sum(len(name) + 2 for name in shown) // room))
+    axes.set_xlim(0.4, len(names) + 0.6)
+    axes.set_xticks(range(1, len(names) + 1, step), shown[::step])

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from analysis.answer import Verdict, answer, answer_to_all
+from analysis.answer import Verdict, answer
 from analysis.result import Index
 
 
@@ -25,7 +25,7 @@ def test_the_paper_s_claim(snake):
     )
     assert "13 of 25 joints respond to a gait of 0.5000 Hz [0.4998, 0.5002]" in told.detail
     assert "lag runs from 7.5° (joint01) to 13.7° (joint13)" in told.detail
-    assert "1 joint is flagged" in told.detail
+    assert "Flagged, see the table of joints: joint13 (saturated)." in told.detail
 
 
 def test_late_ends_turn_the_sentence_round(snake):
@@ -38,6 +38,12 @@ def test_an_interval_over_zero_claims_nothing(snake):
     told = answer(with_indices(snake, boundary_contrast_lag=contrast(-0.01, -0.03, 0.01)))
     assert told.verdict is Verdict.OPEN
     assert told.sentence.startswith("No difference between the segments could be shown")
+
+
+def test_a_spread_that_noise_explains_is_said_to_be_none(snake):
+    spread = Index(0.0, (0.0, 0.064), 0.5, "1", "coefficient of variation of gain")
+    told = answer(with_indices(snake, gain_cv=spread))
+    assert "gain of the yaw joints spreads by no more than noise, 6.4 % at most" in told.sentence
 
 
 def test_a_small_p_of_the_common_response_is_enough(snake):
@@ -80,13 +86,6 @@ def test_one_joint_is_told_alone(single):
     told = answer(single)
     assert told.verdict is Verdict.SINGLE
     assert "its gain is 0.928 [0.924, 0.932], its lag 13.66° [13.45, 13.87]" in told.sentence
-
-
-def test_several_sessions(snake, still, single):
-    told = answer_to_all([answer(snake), answer(still), answer(single)])
-    assert "n 1 of 3 sessions the segments do not move alike" in told.sentence
-    same = answer_to_all([answer(snake), answer(snake)])
-    assert same.sentence == "In all 2 sessions the segments do not move alike."
 
 
 @pytest.mark.parametrize("name", ["snake", "still", "single", "hostile"])

@@ -1,10 +1,9 @@
-"""Energies on the samples' own times against closed forms; artefacts that are cheap to see."""
+"""Energies on the samples' own times against closed forms."""
 
 import numpy as np
 import pytest
 
 from analysis.energy import integrate, power_of
-from analysis.flags import joint_flags
 from analysis.series import Series, clean, coverage, sample_weights
 from capture.log.signals import Signal
 
@@ -14,7 +13,7 @@ SECOND = 10**9
 def test_periodic_power_over_whole_cycles_is_integrated_to_rounding():
     t = np.arange(400) / 100
     power = 0.2 + np.sin(2 * np.pi * t) + 0.5 * np.cos(6 * np.pi * t - 1)
-    energy = integrate(Series("q", t, power), 0.0, 4.0, 4)
+    (energy,) = integrate([Series("q", t, power)], 0.0, 4.0, 4)
     np.testing.assert_allclose(energy.net_j, 0.2, atol=0.02)
     assert energy.net_j.sum() == pytest.approx(0.8, abs=1e-12)
     assert energy.coverage == pytest.approx(1.0)
@@ -22,7 +21,7 @@ def test_periodic_power_over_whole_cycles_is_integrated_to_rounding():
 
 def test_positive_and_absolute_parts():
     t = np.arange(4000) / 1000
-    energy = integrate(Series("q", t, np.sin(2 * np.pi * t)), 0.0, 4.0, 2)
+    (energy,) = integrate([Series("q", t, np.sin(2 * np.pi * t))], 0.0, 4.0, 2)
     np.testing.assert_allclose(energy.plus_j, 2 / np.pi, rtol=1e-5)
     np.testing.assert_allclose(energy.abs_j, 4 / np.pi, rtol=1e-5)
 
@@ -30,19 +29,19 @@ def test_positive_and_absolute_parts():
 def test_uneven_sampling_is_weighted_by_time():
     rng = np.random.default_rng(1)
     t = np.arange(3000) / 1000 + rng.uniform(0, 0.9e-3, 3000)
-    energy = integrate(Series("q", t, t**2), 0.0, 3.0)
+    (energy,) = integrate([Series("q", t, t**2)], 0.0, 3.0)
     assert energy.net_j[0] == pytest.approx(9.0, rel=1e-3)
 
 
 def test_gaps_are_not_bridged():
     t = np.arange(1000) / 100
     t = t[(t < 3) | (t >= 5)]
-    energy = integrate(Series("q", t, np.ones(t.size)), 0.0, 10.0)
+    (energy,) = integrate([Series("q", t, np.ones(t.size))], 0.0, 10.0)
     assert energy.net_j[0] == pytest.approx(8.0, abs=0.02)
     assert energy.coverage == pytest.approx(0.8, abs=0.002)
     # Also not at the window's ends.
     assert coverage(t[t >= 5], 0.0, 10.0) == pytest.approx(0.5, abs=0.002)
-    assert integrate(Series("q", t[:1], np.ones(1)), 0.0, 10.0) is None
+    assert integrate([Series("q", t[:1], np.ones(1))], 0.0, 10.0) == [None]
 
 
 def test_weights_are_the_trapezoidal_rule_inside():
@@ -71,40 +70,12 @@ def test_clean_sorts_drops_and_counts():
     assert (series.dropped_nan, series.dropped_duplicates) == (1, 1)
 
 
-T = np.arange(800) / 100
-SINE = 0.5 * np.sin(2 * np.pi * 0.5 * T)
-
-
-def flags(values, command=None, *, limits=(-0.52, 0.52), covered=1.0, driven=0.5):
-    seen = None if command is None else Series("q", T, command)
-    return joint_flags(
-        Series("q", T, values), seen, limits, driven_hz=driven, fraction_covered=covered
-    )
-
-
-def test_a_sound_joint_has_no_flags():
-    rng = np.random.default_rng(1)
-    assert flags(SINE) == ()
-    assert flags(SINE + rng.normal(0, 0.003, T.size)) == ()
-    # A coarse encoder repeats values at the turning points; that is no artefact.
-    assert flags(np.round(SINE / 0.005) * 0.005) == ()
-    assert flags(np.zeros(800), driven=None) == ()
-
-
-def test_saturation_of_position_or_command():
-    assert flags(np.clip(1.2 * SINE, -0.52, 0.52)) == ("saturated",)
-    assert flags(SINE, np.clip(1.2 * SINE, -0.52, 0.52)) == ("saturated",)
-    assert flags(np.clip(1.2 * SINE, -0.52, 0.52), limits=None) == ()
-
-
-def test_frozen_and_stale_samples():
-    stuck = SINE.copy()
-    stuck[300:360] = stuck[300]
-    assert flags(stuck) == ("frozen",)
-    assert flags(np.full(800, 0.1)) == ("frozen",)
-    held = SINE[np.arange(800) // 2 * 2]
-    assert flags(held) == ("stale",)
-
-
-def test_gaps_are_flagged():
-    assert flags(SINE, covered=0.9) == ("gaps",)
+def test_each_cycle_has_its_own_energy_and_coverage():
+    t = np.arange(800) / 100 - 3.0
+    power = 0.2 + np.sin(2 * np.pi * t) ** 2
+    kept = (t < 0.2) | (t >= 0.7)
+    (energy,) = integrate([Series("q", t[kept], power[kept])], -3.0, 5.0, 8)
+    whole = np.delete(np.arange(8), 3)
+    np.testing.assert_allclose(energy.net_j[whole], 0.7, atol=1e-9)
+    np.testing.assert_allclose(energy.covered[whole], 1.0, atol=1e-9)
+    assert energy.covered[3] == pytest.approx(0.5, abs=0.011)

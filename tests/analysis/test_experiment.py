@@ -135,7 +135,7 @@ def test_a_weak_module_is_named(weak):
 
 def test_one_direction_is_not_separable(alike):
     result = experiment(alike[::2])
-    assert result.answer == "one direction only: not separable; record the reverse"
+    assert result.answer == "boundary or module is open: one direction only; record the reverse"
     assert result.reversal is None
     assert result.heterogeneity["module_share"].value is None
     assert result.heterogeneity["common_response"].p < 1e-6
@@ -221,6 +221,7 @@ def test_the_json_object(weak, capsys, tmp_path):
         "heterogeneity",
         "reversal",
         "coupling",
+        "oscillators",
         "warnings",
         "provenance",
     ]
@@ -229,6 +230,7 @@ def test_the_json_object(weak, capsys, tmp_path):
     assert printed["reversal"]["weak"][0]["name"] == "joint07"
     assert len(printed["reversal"]["joints"]) == M
     assert printed["coupling"]["identifiable"] is False
+    assert printed["oscillators"] is None
     assert shlex.split(printed["provenance"]["command"]) == ["undulog", *words]
     assert set(printed["provenance"]["inputs"]) == {str(path) for path in weak}
     for index in printed["heterogeneity"].values():
@@ -243,5 +245,7 @@ def test_the_first_line_is_the_answer(weak, alike, capsys):
     assert lines[-1].startswith("Method: reversal, 6 + 6 runs")
     assert "all 924" in lines[-1]
     text = render_experiment(experiment(alike[::2]), width=80)
-    assert text.startswith("6 sessions: one direction only: not separable; record the reverse.\n")
+    assert text.startswith(
+        "6 sessions: boundary or module is open: one direction only; record the reverse.\n"
+    )
     assert max(len(line) for line in text.splitlines()[1:]) <= 80

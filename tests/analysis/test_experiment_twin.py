@@ -1,6 +1,8 @@
 """Experiments on recorded twins, a short chain on the ground: six runs each way, and kicks."""
 
 import json
+import runpy
+from pathlib import Path
 
 import pytest
 
@@ -12,68 +14,39 @@ from sim.record import record
 
 pytestmark = pytest.mark.slow
 
-ROBOT = """name = "chain7"
-description = "Seven joints, yaw at both ends: four yaw joints in two mirror pairs."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = 7
-planes = ["horizontal", "vertical"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[defaults.joint]
-lower = -0.52
-upper = 0.52
-max_velocity = 10.0
-[defaults.servo]
-supply_v = 6.0
-stall_torque = 0.25
-torque_constant = 1.0
-proportional_gain = 8.0
-rotor_inertia = 1.5e-3
-viscous_friction = 0.005
-coulomb_friction = 0.03
-gear_stiffness = 40.0
-gear_damping = 0.05
-"""
+shared = runpy.run_path(str(Path(__file__).with_name("twin_chains.py")))
 
-SCENARIO = """description = "A wave in identical modules."
-robot = "chain7.toml"
-duration_s = 8.0
-settle_s = 4.0
-[gait]
-ramp_s = 1.0
-[gait.horizontal]
-amplitude = 0.4
-frequency_hz = 1.0
-lag = 1.0471975511965976
-wave = "{wave}"
-[noise]
-position = 0.005
-"""
+ROBOT = shared["chain"](7, stall_torque=0.25)
+"""Four yaw joints in two mirror pairs."""
 
-WEAK = """[servo_of.joint03]
-stall_torque = 0.2
-"""
+WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}
+
+
+def wave(way="head-to-tail", noise=0.005, **tables):
+    return shared["wave"](
+        duration_s=8.0,
+        settle_s=4.0,
+        gait={"ramp_s": 1.0},
+        horizontal={"wave": way},
+        noise={"position": noise},
+        **tables,
+    )
 
 
 @pytest.fixture(scope="module")
 def answered(tmp_path_factory):
     """The experiment of six runs each way, with identical modules or with a weak one."""
 
-    def make(more):
+    def make(**more):
         folder = tmp_path_factory.mktemp("twin")
-        (folder / "chain7.toml").write_text(ROBOT)
+        (folder / "chain.toml").write_text(ROBOT)
         paths = []
-        for way, wave in enumerate(("head-to-tail", "tail-to-head")):
-            (folder / "wave.toml").write_text(SCENARIO.format(wave=wave) + more)
+        for k, way in enumerate(("head-to-tail", "tail-to-head")):
+            (folder / "wave.toml").write_text(wave(way, **more))
             scenario = load_scenario(folder / "wave.toml")
-            for k in range(6):
-                paths.append(folder / f"{wave}-{k}.mcap")
-                record(scenario.changed(seed=20 * way + k + 1), paths[-1])
+            for run in range(6):
+                paths.append(folder / f"{way}-{run}.mcap")
+                record(scenario.changed(seed=20 * k + run + 1), paths[-1])
 
         def opened():
             for path in paths:
@@ -86,7 +59,7 @@ def answered(tmp_path_factory):
 
 
 def test_identical_modules_are_not_called_different(answered):
-    result = answered("")
+    result = answered()
     reversal = result.reversal
     assert (reversal.forward_runs, reversal.reverse_runs) == (6, 6)
     assert reversal.p > 0.05
@@ -98,7 +71,7 @@ def test_identical_modules_are_not_called_different(answered):
 
 
 def test_the_weak_servo_is_named(answered):
-    result = answered(WEAK)
+    result = answered(**WEAK)
     assert result.reversal.p == pytest.approx(2 / 924)
     assert result.answer.startswith("the modules differ: joint03 is weak (p = 0.002)")
     weak = result.reversal.weak[0]
@@ -109,9 +82,9 @@ def test_the_weak_servo_is_named(answered):
 
 def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
     """From a recorded gait to its coupling, by the verbs: plan, drive, analyse."""
-    (tmp_path / "chain7.toml").write_text(ROBOT)
+    (tmp_path / "chain.toml").write_text(ROBOT)
     scenario = tmp_path / "wave.toml"
-    scenario.write_text(SCENARIO.format(wave="head-to-tail").replace("0.005", "0.0005"))
+    scenario.write_text(wave(noise=0.0005))
     like, folder = tmp_path / "like.mcap", tmp_path / "kicks"
     assert undulog.run(["sim", "run", str(scenario), "-o", str(like)]) == 0
     words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]

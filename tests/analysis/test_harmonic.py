@@ -169,6 +169,26 @@ def test_fit_at_a_known_frequency_is_least_squares():
     np.testing.assert_allclose(fit.predict(0, t), np.stack(columns, axis=1) @ theirs, atol=1e-9)
 
 
+def test_the_last_step_takes_the_amplitudes_along():
+    """Times far from zero, with a gap, so that amplitudes turn and change with omega."""
+    rng = np.random.default_rng(8)
+    t = 100 + np.sort(rng.uniform(0, 20, 3000))
+    t = t[(t < 103) | (t > 109)]
+    series = [
+        Series(f"q{k}", t, np.cos(5 * t - k) + 0.3 * np.cos(10 * t) + rng.normal(0, 0.1, t.size))
+        for k in range(3)
+    ]
+    model = HarmonicModel(harmonics=2, trend=1)
+    best = fit_shared(series, 5.0, model)
+    for off in (-3e-9, 3e-9):  # within the linear reach of the best
+        near = fit_shared(series, best.omega + off, model)
+        exact = fit_at(series, near.omega, model)
+        assert near.omega == pytest.approx(best.omega, abs=1e-10)
+        np.testing.assert_allclose(near.amplitudes, exact.amplitudes, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(near.trend, exact.trend, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(near.rss, exact.rss, rtol=1e-11)
+
+
 def test_unix_nanoseconds_keep_their_resolution():
     epoch = 1_735_689_600_123_456_789
     t_ns = epoch + np.arange(1000) * 10_000_003
@@ -184,7 +204,7 @@ def test_chunks_do_not_change_the_answer(monkeypatch):
     series = [Series("q", t, np.cos(3 * t) + rng.normal(0, 0.1, 3000)) for _ in range(2)]
     whole = fit_shared(series, 3.01)
     level = residual_noise(series, whole).level
-    monkeypatch.setattr("analysis.harmonic.CHUNK", 700)
+    monkeypatch.setattr("analysis.harmonic_moments.CHUNK", 700)
     cut = fit_shared(series, 3.01)
     assert cut.omega == pytest.approx(whole.omega, abs=1e-12)
     np.testing.assert_allclose(residual_noise(series, cut).level, level, rtol=1e-9)

@@ -117,6 +117,34 @@ def test_a_linear_chain_is_told_as_linear(result):
     assert low <= (np.linalg.norm(near) / np.linalg.norm(off)) ** 2 <= high
 
 
+def parts(value):
+    return value.real, value.imag
+
+
+def test_what_oscillators_would_do_on_this_body(result):
+    body = result.oscillators
+    truth = np.linalg.eigvals(np.eye(M) - TRUTH.real)
+    truth = truth[np.abs(truth) > 1e-9]
+    assert len(body.modes) == M - 1
+    # These rates lie close together: what holds of each is the level that noise allows.
+    grid = np.array(body.pseudospectrum.real), np.array(body.pseudospectrum.imag)
+    level = np.array(body.pseudospectrum.level)
+    for rate in truth:
+        k, q = (int(np.argmin(np.abs(x - at))) for x, at in zip(grid, parts(rate), strict=True))
+        off = abs(grid[0][k] - rate.real) + abs(grid[1][q] - rate.imag)
+        assert level[k, q] <= body.pseudospectrum.noise + off
+    assert body.slowest.value == min(mode.real.value for mode in body.modes)
+    relative = np.array(body.entrainment.value) - (np.linalg.inv(TRUTH.real) - np.eye(M))
+    half = np.array(body.entrainment.ci95_half) + 1e-3
+    assert np.mean(np.abs(relative) <= half) >= 0.84  # 25 of 95 %: 3 standard deviations below
+    assert body.entrainment.condition_number == pytest.approx(np.linalg.cond(TRUTH.real), rel=0.05)
+    assert level.shape == (len(body.pseudospectrum.real), len(body.pseudospectrum.imag))
+    assert "explicit coupling" in body.answer
+    text = render_experiment(result)
+    assert f"Oscillators that feel their servos: {body.answer}." in text.splitlines()
+    assert json.dumps(result.to_dict()["oscillators"], allow_nan=False)
+
+
 def test_held_out_runs_are_predicted(result):
     coupling = result.coupling
     assert [one.session for one in coupling.held_out] == ["run21.mcap", "run22.mcap"]

@@ -102,7 +102,8 @@ def test_one_message_per_servo_is_read_right(bag, wave):
 def test_energies_of_sinusoidal_torque_and_velocity(bag, epoch_ns):
     """Closed form: with tau = T sin(wt + p), q' = V cos(wt), net = T V sin(p) / 2 a second."""
     one = bag()
-    omega, torque, speed, phase = 2 * np.pi * 0.8, 0.7, 1.1, np.array([0.3, -0.4])
+    omega, torque, phase = 2 * np.pi * 0.8, 0.7, np.array([0.3, -0.4])
+    speed = 0.4 * omega
     for tick in range(1000):
         t = tick / 100
         q = 0.4 * np.sin(omega * t) * np.ones(2)
@@ -258,7 +259,16 @@ def test_dead_and_frozen_joints_are_left_out_and_named(bag, wave):
     assert all(joint.gain.value is None for joint in result.joints if joint.name in lost)
     assert [joint.flags for joint in result.joints if joint.flags] == [("frozen",), ("frozen",)]
     assert any(
-        text.startswith("joint03, joint05, joint07: no response") for text in result.warnings
+        text.startswith("joint03, joint07: position on /joint_states: values stay exactly the same")
+        for text in result.warnings
+    )
+    assert any(text.startswith("joint05: no response") for text in result.warnings)
+    assert [(one.joint, one.flag, one.about) for one in result.artefacts] == [
+        ("joint03", "frozen", "sensor"),
+        ("joint07", "frozen", "sensor"),
+    ]
+    assert result.artefacts[1].spans_s == (
+        (pytest.approx(3.0, abs=1e-6), pytest.approx(3.99, abs=1e-6)),
     )
     sound = np.delete(truth.gain, [2, 4, 6])
     spread = result.heterogeneity["gain_cv"]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 
+import pytest
+
 from analysis.answer import answer
 from analysis.table import render
 
@@ -28,8 +30,24 @@ def test_every_joint_that_was_driven_has_its_numbers(snake):
             assert abs(float(shown) - exact) <= 0.5000001 * 10**-decimals
 
 
-def test_tables_fit_a_laptop_terminal_and_prose_wraps(snake):
-    assert max(len(line) for line in render(snake, width=100).splitlines()[1:]) <= 120
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_nothing_is_wider_than_the_terminal(snake, width):
+    lines = render(snake, width=width).splitlines()
+    assert max(map(len, lines)) <= width
+    assert " ".join(lines).startswith(f"weak.mcap: {answer(snake).sentence}")
+    left_out = [line for line in lines if line.startswith("Without ")]
+    assert bool(left_out) == (width < 120)
+    heading = next(line for line in lines if line.startswith("joint "))
+    told = left_out[0].partition(":")[0].removeprefix("Without ") if left_out else ""
+    assert not [name for name in told.split(", ") if name and name in heading]
+
+
+def test_a_pipe_gets_every_column_and_one_line_a_sentence(snake):
+    lines = render(snake).splitlines()
+    heading = next(line for line in lines if line.startswith("joint "))
+    for name in ("plane", "command°", "gain", "lag°", "cover"):
+        assert name in heading
+    assert not [line for line in lines if line.startswith("Without ")]
 
 
 def test_nulls_are_dashes_and_every_joint_stays_when_none_was_driven(still):

@@ -40,11 +40,19 @@ def test_json_names_page_and_answer_and_the_page_is_the_same(page, recorded, tmp
     assert again.read_bytes() == page.read_bytes()
 
 
-def test_several_sessions_share_a_page(recorded, tmp_path, capsys):
+def test_several_sessions_are_one_experiment(both_ways_files, tmp_path, capsys):
     page = tmp_path / "both.html"
-    assert undulog.run(["report", str(recorded), str(recorded), "-o", str(page)]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 3
-    assert "In all 2 sessions the segments do not move alike." in page.read_text(encoding="utf-8")
+    files = [str(path) for path in both_ways_files]
+    assert undulog.run(["report", *files, "-o", str(page)]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("12 sessions: the modules differ: j2 is weak (p = 0.002)")
+    assert second.startswith(f"{page}: ")
+    told = page.read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
+    assert "The modules differ: j2 is weak (p = 0.002)" in told
+    assert undulog.run(["report", *files, "-o", str(page), "--force", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["answer"] == first
+    assert [one["path"] for one in said["answers"]] == files
 
 
 def test_an_existing_page_stays_without_force(recorded, tmp_path, capsys):
@@ -109,6 +117,9 @@ def test_the_paper_s_claim_from_the_twin_to_the_browser(browser, tmp_path, capsy
     assert titles == [
         "Gain, lag and energy of every joint, head to tail",
         "Command and response of joint01, joint13, joint25",
+        "Gain of every joint in every cycle",
+        "Lag [°] of every joint in every cycle",
+        "Mean mechanical power [mW] of every joint in every cycle",
         "Motion of head, middle, tail over one gait cycle",
     ]
     assert page.stat().st_size < 3_000_000

@@ -56,10 +56,10 @@ def test_a_page_that_grows_too_large_goes_without_signals_and_says_so(snake, rec
         full = render(snake, session)
         monkeypatch.setattr("analysis.report.page.LARGEST_BYTES", len(full.encode()) - 1)
         lean = render(snake, session)
-        assert "Command and response are not drawn" in lean
-        assert "Command and response are not drawn" not in full
+        assert "the cycles one by one, are not drawn" in lean
+        assert "the cycles one by one, are not drawn" not in full
         monkeypatch.setattr("analysis.report.page.LARGEST_BYTES", 1000)
-        with pytest.raises(UsageError, match=r"1 sessions make a page of 0\.2 MB"):
+        with pytest.raises(UsageError, match=r"page on one session would be 0\.2 MB"):
             render(snake, session)
 
 

@@ -1,0 +1,124 @@
+"""Whether sessions can be compared, joint by joint: by the same commands, on the same joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.errors import DataError
+
+from .. import formats
+from ..experiment_runs import SAME_COMMAND, SAME_FREQUENCY, GaitRun, command_change
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What the sessions of both sides have in common.
+
+    Attributes:
+        names: Joints that can be compared, head to tail.
+        left_out: Joints that can't, and why.
+        gaits_differ: How the gaits differ, or None.
+    """
+
+    names: tuple[str, ...]
+    left_out: dict[str, str]
+    gaits_differ: str | None
+
+
+def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False) -> Alignment:
+    """Find what can be compared.
+
+    Args:
+        a: Runs of one side, at least one.
+        b: Runs of the other, at least one.
+        any_gait: Compare the responses although the gaits differ.
+
+    Returns:
+        The joints in common.
+
+    Raises:
+        DataError: If a session has no gait, no joint is in all of them, or the gaits differ and
+            that is not allowed.
+    """
+    runs = [*a, *b]
+    for run in runs:
+        if not run.names:
+            raise DataError(f"{run.label} has no gait, so there is no gait phase to align it by")
+    _refuse_copies(a, "A")
+    _refuse_copies(b, "B")
+    joints = list(dict.fromkeys(name for run in runs for name in run.names))
+    answered = [
+        {name for name, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
+        for run in runs
+    ]
+    names = tuple(name for name in joints if all(name in known for known in answered))
+    if not names:
+        raise DataError(
+            f"no joint has gain and lag in all sessions: {a[0].label} drives "
+            f"{_some(a[0].names)}, {b[0].label} {_some(b[0].names)}"
+        )
+    left_out: dict[str, str] = {}
+    for name in joints:
+        if name not in names:
+            lacking = [
+                r.label for r, known in zip(runs, answered, strict=True) if name not in known
+            ]
+            left_out[name] = f"no gain and lag in {', '.join(lacking)}"
+    faults = [fault for run in runs[1:] if (fault := gait_fault(run, runs[0], names)) is not None]
+    if faults and not any_gait:
+        raise DataError(
+            f"the gaits differ, so joints would answer differently anyway: {faults[0]}; record the "
+            "same gait, or compare nevertheless with --any-gait"
+        )
+    return Alignment(names, left_out, faults[0] if faults else None)
+
+
+def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None:
+    """What makes a run's gait another one than the model's.
+
+    Args:
+        run: A run.
+        model: The run that it is held against.
+        names: Joints to look at, driven in both.
+
+    Returns:
+        The reason, or None within 0.5 % of the frequency and 1 % of every command's amplitude.
+    """
+    if abs(run.frequency_hz - model.frequency_hz) > SAME_FREQUENCY * model.frequency_hz:
+        return (
+            f"{run.label} has {run.frequency_hz:.4g} Hz, {model.label} {model.frequency_hz:.4g} Hz"
+        )
+    own, other = (
+        np.array([one.command[one.names.index(name)] for name in names]) for one in (run, model)
+    )
+    change = command_change(own, other)
+    deviation = np.abs(change - 1)
+    worst = int(np.argmax(deviation))
+    if deviation[worst] <= SAME_COMMAND:
+        return None
+    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
+    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
+    return (
+        f"at {names[worst]} the command of {run.label} is {percent} % in amplitude and {degrees} "
+        f"degrees in phase off that of {model.label}"
+    )
+
+
+def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
+    """Two copies of one run would look like two runs without any scatter."""
+    seen: dict[bytes, str] = {}
+    for run in runs:
+        numbers = run.ratio.tobytes()
+        if numbers in seen:
+            raise DataError(
+                f"{run.label} gives the very numbers of {seen[numbers]} on side {side}: a copy is "
+                "not a run of its own"
+            )
+        seen[numbers] = run.label
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

@@ -1,0 +1,135 @@
+"""The answer of a comparison in one sentence."""
+
+from __future__ import annotations
+
+import math
+
+from .. import formats
+from ..result import Estimate
+from .decisions import SIGNIFICANT, Decided
+from .result import BODY, Difference
+
+WORDS = {
+    "gain": "gain",
+    "lag": "lag",
+    "energy_abs": "E_abs per cycle",
+    "speed": "speed",
+    "cost_of_transport": "cost of transport",
+}
+"""What people call the quantities."""
+
+
+def answer_of(decided: Decided, partial: bool) -> tuple[str, str]:
+    """Verdict and answer.
+
+    Args:
+        decided: The decisions.
+        partial: Whether something could not be compared.
+
+    Returns:
+        ``different``, ``same``, ``small`` or ``open``, and one sentence without its full stop.
+    """
+    beyond_doubt = [one for one in decided.differences if one.p_holm < SIGNIFICANT]
+    tests = {one.quantity: one for one in decided.equivalence}
+    same = all(tests[quantity].p < SIGNIFICANT for quantity in ("gain", "lag"))
+    margins = (
+        f"{_short(100 * tests['gain'].margin)} % and {_short(math.degrees(tests['lag'].margin))}°"
+    )
+    whole = " (partial comparison)" if partial else ""
+    joints = len({one.place for one in decided.differences if one.place != BODY})
+    alike = f"gain and lag of {_all(joints)} are equivalent within {margins}"
+    if not beyond_doubt:
+        if same:
+            return "same", f"no difference found; {alike}{whole}"
+        return "open", f"no difference found, but {_not_shown(decided)}{whole}"
+    if same:
+        return "small", f"{alike}; beyond doubt, if small: {_largest(decided)}{whole}"
+    return "different", f"B differs from A: {_largest(decided)}{whole}"
+
+
+def told(one: Difference) -> str:
+    """A difference with its interval.
+
+    Args:
+        one: The difference.
+
+    Returns:
+        For example ``gain −8.1 % [−8.6, −7.6]``.
+    """
+    return f"{WORDS[one.quantity]} {signed(*in_people_units(one))}"
+
+
+def in_people_units(one: Difference) -> tuple[Estimate, str]:
+    """A difference in the unit people read.
+
+    Args:
+        one: The difference.
+
+    Returns:
+        Percent for gains, degrees for lags, and for the others percent of side A.
+    """
+    if one.quantity == "lag":
+        return formats.degrees(one.difference), "°"
+    if one.quantity == "gain":
+        return formats.scaled(one.difference, 100.0), " %"
+    if one.a > 0:
+        return formats.scaled(one.difference, 100.0 / one.a), " %"
+    return one.difference, f" {one.unit}"
+
+
+def signed(quantity: Estimate, unit: str) -> str:
+    """A difference that always has a sign.
+
+    Args:
+        quantity: In ``unit``.
+        unit: With its own space.
+
+    Returns:
+        For example ``+1.9° [1.7, 2.1]``.
+    """
+    text = formats.estimate(quantity, unit, most=2)
+    return text if text.startswith(formats.MINUS) else f"+{text}"
+
+
+def _largest(decided: Decided) -> str:
+    """The joint that differs most, with all that is beyond doubt of it; else energy or body."""
+    beyond_doubt = [one for one in decided.differences if one.p_holm < SIGNIFICANT]
+    if decided.named:
+        name = decided.named[0].name
+        own = [one for one in beyond_doubt if one.place == name and one.quantity != "energy_abs"]
+        parts = ", ".join(told(one) for one in sorted(own, key=lambda one: one.quantity))
+        others = len(decided.named) - 1
+        more = f"; {others} other joint{'s' if others > 1 else ''} by less" if others else ""
+        smallest = min(one.p_holm for one in own)
+        return f"{name} most, {parts} (p {_p(smallest)}){more}"
+    first = beyond_doubt[0]
+    others = len(beyond_doubt) - 1
+    more = f"; and {others} more" if others else ""
+    where = "the body's" if first.place == BODY else f"{first.place}:"
+    return f"{where} {told(first)} (p {_p(first.p_holm)}){more}"
+
+
+def _p(p: float) -> str:
+    text = formats.p_value(p)
+    return text if text.startswith("<") else f"= {text}"
+
+
+def _not_shown(decided: Decided) -> str:
+    """How large a difference might be hidden, from the intervals that hold together."""
+    worst: dict[str, float] = {"gain": 0.0, "lag": 0.0}
+    for one in decided.differences:
+        ends = one.difference.ci95
+        if one.quantity in worst and ends is not None:
+            worst[one.quantity] = max(worst[one.quantity], abs(ends[0]), abs(ends[1]))
+    return (
+        f"up to {_short(100 * worst['gain'])} % in gain and {_short(math.degrees(worst['lag']))}° "
+        "in lag could hide in the noise; record more"
+    )
+
+
+def _all(joints: int) -> str:
+    return "the joint" if joints == 1 else f"all {joints} joints"
+
+
+def _short(value: float) -> str:
+    return f"{value:.2g}"

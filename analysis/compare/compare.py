@@ -1,0 +1,238 @@
+"""Two sessions in, or two groups of them: what differs, and what is the same."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from capture import Session
+from capture.environment import base_versions
+from capture.errors import UsageError
+
+from ..reading import Warn
+from ..response import CONFIDENCE, around, t_factor
+from ..result import Estimate, Provenance
+from ..stretch import Options
+from .alignment import Alignment, align
+from .answer import answer_of
+from .changes import changes
+from .decisions import Margins, decide, differ, estimates_of, family
+from .differences import Quantities, independent
+from .result import Comparison, Waveform
+from .side import Seen, see, turned
+from .waveform import phases_rad
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the user may choose in a comparison.
+
+    Attributes:
+        paired: Run i of B belongs to run i of A, e.g. recorded one after the other.
+        any_gait: Compare although the gaits differ.
+        margins: Differences that count as the same.
+        session: What is analysed of each session.
+    """
+
+    paired: bool = False
+    any_gait: bool = False
+    margins: Margins = field(default_factory=Margins)
+    session: Options = field(default_factory=Options)
+
+
+def compare_sessions(
+    a: Session | Iterable[Session], b: Session | Iterable[Session], choices: Choices | None = None
+) -> Comparison:
+    """Compare two sessions, or two groups of runs: B minus A.
+
+    Args:
+        a: An open session, or several, each used once and in turn.
+        b: The other side.
+        choices: What the user chose.
+
+    Returns:
+        The comparison.
+
+    Raises:
+        MissingChannelError: If a session has neither commands nor responses.
+        DataError: If sessions have no gait, no joint in common or another gait.
+        UsageError: If a side has no session, a group has one run, or runs don't pair up.
+    """
+    choices = choices or Choices()
+    warnings: dict[str, list[str]] = {}
+
+    def seen(session: Session) -> Seen:
+        def warn(sentence: str) -> None:
+            warnings.setdefault(sentence, []).append(session.path.name)
+
+        return see(session, choices.session, warn)
+
+    sides = [
+        [seen(one) for one in ([side] if isinstance(side, Session) else side)] for side in (a, b)
+    ]
+    every = sum(map(len, sides))
+    said = [
+        f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
+        for sentence, names in warnings.items()
+    ]
+    return compare_seen(sides[0], sides[1], choices, said)
+
+
+def compare_seen(
+    a: Sequence[Seen], b: Sequence[Seen], choices: Choices, warnings: Sequence[str] = ()
+) -> Comparison:
+    """Compare what was taken from the sessions.
+
+    Args:
+        a: Side A.
+        b: Side B.
+        choices: What the user chose.
+        warnings: What was said so far.
+
+    Returns:
+        The comparison.
+
+    Raises:
+        DataError: If sessions have no gait, no joint in common or another gait.
+        UsageError: If a side has no session, a group has one run, or runs don't pair up.
+    """
+    if not a or not b:
+        raise UsageError("a comparison needs at least one session a side")
+    said = list(warnings)
+    design = _design(a, b, choices)
+    aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
+    keys = family(a, b, aligned.names)
+    # Lags near pi must not part company: all are taken within pi of the first session's.
+    about = np.array([a[0].estimates[key][0] for key in keys])
+    stacks = [estimates_of(side, keys, about) for side in (a, b)]
+    if design == "sessions":
+        first, second = (Quantities(*stack[:, 0]) for stack in stacks)
+        found = independent(first, second)
+    else:
+        first, second, found = differ(stacks[0][0], stacks[1][0], paired_runs=design == "pairs")
+    decided = decide(keys, first, second, found, choices.margins)
+    partial = _partial(aligned)
+    _warn(a, b, design, said.append)
+    verdict, sentence = answer_of(decided, partial is not None)
+    return Comparison(
+        answer=sentence,
+        verdict=verdict,
+        design=design,
+        a=tuple(one.analysis.session for one in a),
+        b=tuple(one.analysis.session for one in b),
+        partial=partial,
+        changed=changes([one.facts for one in a], [one.facts for one in b]),
+        named=decided.named,
+        differences=decided.differences,
+        equivalence=decided.equivalence,
+        phase_rad=tuple(phases_rad().tolist()),
+        waveforms=_waveforms(a, b, aligned.names, design),
+        warnings=tuple(said),
+        provenance=_provenance(a, b, choices),
+    )
+
+
+def _design(a: Sequence[Seen], b: Sequence[Seen], choices: Choices) -> str:
+    if choices.paired:
+        return "pairs"
+    return "sessions" if len(a) == len(b) == 1 else "groups"
+
+
+def _partial(aligned: Alignment) -> str | None:
+    parts: list[str] = []
+    if aligned.left_out:
+        left = "; ".join(f"{name}: {why}" for name, why in aligned.left_out.items())
+        parts.append(f"only {len(aligned.names)} joints can be compared ({left})")
+    if aligned.gaits_differ is not None:
+        parts.append(f"the gaits differ: {aligned.gaits_differ}")
+    return "; ".join(parts) or None
+
+
+def _warn(a: Sequence[Seen], b: Sequence[Seen], design: str, warn: Warn) -> None:
+    if design == "sessions":
+        warn(
+            "one session a side: the intervals know the noise within each session, not how one "
+            "run differs from the next; record several runs a side and give them with --a and --b"
+        )
+        inputs = [next(iter(one.analysis.provenance.inputs.values())) for one in (a[0], b[0])]
+        if inputs[0] == inputs[1]:
+            warn("both files have the same content: one session is compared with itself")
+    if design == "groups" and max(len(a), len(b)) < 4:
+        warn(f"{len(a)} and {len(b)} runs: so few leave wide intervals; 6 a side are a good number")
+    for side, sessions in (("A", a), ("B", b)):
+        for one in sessions:
+            for text in one.analysis.warnings:
+                if text.startswith("not settled"):
+                    warn(f"{side}, {one.run.label}: {text}")
+
+
+def _waveforms(
+    a: Sequence[Seen], b: Sequence[Seen], names: Sequence[str], design: str
+) -> tuple[Waveform, ...]:
+    found: list[Waveform] = []
+    for name in names:
+        if not all(name in one.cycles for one in (*a, *b)):
+            continue
+        sides = [[_by_first(one, name, names[0]) for one in side] for side in (a, b)]
+        if design == "sessions":
+            first, second = sides[0][0], sides[1][0]
+            difference = independent(first, second)
+        else:
+            stacks = [np.stack([one.value for one in side]) for side in sides]
+            first, second, difference = differ(*stacks, paired_runs=design == "pairs")
+        half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
+        worst = int(np.argmax(np.abs(difference.value)))
+        found.append(
+            Waveform(
+                name=name,
+                a_rad=tuple(first.value.tolist()),
+                b_rad=tuple(second.value.tolist()),
+                difference_rad=tuple(difference.value.tolist()),
+                half_rad=tuple(half.tolist()),
+                rms_rad=float(np.sqrt(np.mean(difference.value**2))),
+                largest=Estimate(
+                    float(difference.value[worst]),
+                    around(float(difference.value[worst]), float(half[worst])),
+                ),
+                largest_at_rad=float(phases_rad()[worst]),
+            )
+        )
+    return tuple(found)
+
+
+def _by_first(one: Seen, name: str, reference: str) -> Quantities:
+    """A mean cycle by the phase of the first joint in common."""
+    run = one.run
+    commands = run.command[[0, run.names.index(reference)]]
+    return turned(one.cycles[name], float(np.angle(commands[0] / commands[1])))
+
+
+def _provenance(a: Sequence[Seen], b: Sequence[Seen], choices: Choices) -> Provenance:
+    paths = [[one.analysis.session.path for one in side] for side in (a, b)]
+    single = len(a) == len(b) == 1 and not choices.paired
+    files = [*paths[0], *paths[1]] if single else ["--a", *paths[0], "--b", *paths[1]]
+    words = [word for word in ("paired", "any_gait") if getattr(choices, word)]
+    default, margins = Margins(), choices.margins
+    if margins.gain != default.gain:
+        words.append(f"margin-gain={margins.gain!r}")
+    if margins.lag_rad != default.lag_rad:
+        words.append(f"margin-lag-deg={float(np.degrees(margins.lag_rad))!r}")
+    options = [f"--{word.replace('_', '-')}" for word in words]
+    inputs: dict[str, str] = {}
+    for one in (*a, *b):
+        inputs |= one.analysis.provenance.inputs
+    return Provenance(
+        command=shlex.join(["undulog", "compare", *files, *options, *choices.session.arguments()]),
+        versions=base_versions(),
+        inputs=inputs,
+        options={
+            **asdict(choices.session),
+            "paired": choices.paired,
+            "any_gait": choices.any_gait,
+            "margins": asdict(choices.margins),
+            "confidence": CONFIDENCE,
+        },
+    )

@@ -1,0 +1,157 @@
+"""What a comparison takes from one session: estimates with variances, and mean cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capture import Session
+from capture.arrays import FloatArray
+
+from ..analyse import Measured, measure_session
+from ..experiment_runs import GaitRun, gait_run
+from ..reading import Warn
+from ..result import Analysis
+from ..stretch import Options
+from .changes import facts_of
+from .differences import Quantities, from_runs
+from .motion import body_steps, cost_of_transport, mean_of_cycles, speed
+from .result import BODY
+from .waveform import cycles_by_phase, phases_rad
+
+Key = tuple[str, str]
+"""Quantity and where it is: a joint's name or ``body``."""
+
+Known = tuple[float, float, float]
+"""Value, variance, degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One session.
+
+    Attributes:
+        analysis: Its numbers.
+        run: Its gait.
+        facts: What it says of how it was made.
+        estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
+            cost of transport of the body.
+        cycles: Mean cycle of each joint by the phase of the first driven joint's command [rad].
+    """
+
+    analysis: Analysis
+    run: GaitRun
+    facts: Mapping[str, str]
+    estimates: Mapping[Key, Known]
+    cycles: Mapping[str, Quantities]
+
+
+def see(session: Session, options: Options, warn: Warn) -> Seen:
+    """Take from a session what a comparison needs.
+
+    Args:
+        session: An open session.
+        options: What the user chose.
+        warn: Told what the session lacks.
+
+    Returns:
+        The estimates.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
+    measured = measure_session(session, options)
+    analysis = measured.analysis
+    label = Path(analysis.session.path).name
+    run = gait_run(label, session.robot, analysis, measured.gait)
+    estimates = _responses(measured, run) | _energies(measured)
+    total = _total_energy(measured)
+    steps = None
+    if measured.gait is not None:
+        steps = body_steps(session, measured.responses, measured.span, warn)
+    if steps is not None:
+        moved = {"speed": speed(steps)}
+        if total is not None:
+            moved["cost_of_transport"] = cost_of_transport(steps, total)
+        for quantity, known in moved.items():
+            if known is None:
+                warn(f"no {quantity.replace('_', ' ')}: it hardly gets anywhere")
+            else:
+                estimates[quantity, BODY] = known
+    return Seen(analysis, run, facts_of(session), estimates, _cycles(measured, run))
+
+
+def turned(cycle: Quantities, by_rad: float) -> Quantities:
+    """A mean cycle by another joint's phase.
+
+    Args:
+        cycle: At evenly spaced phases, shape (p,).
+        by_rad: The new phase 0 lies this far behind the old one [rad].
+
+    Returns:
+        The same periodic function, shifted (exactly, by its Fourier coefficients).
+    """
+    if by_rad == 0:
+        return cycle
+    coefficients = np.fft.rfft(cycle.value)
+    order = np.arange(coefficients.size)
+    value = np.fft.irfft(coefficients * np.exp(1j * order * by_rad), cycle.value.size)
+    phase = phases_rad()
+    variance = np.interp(phase + by_rad, phase, cycle.variance, period=2 * np.pi)
+    return Quantities(value.astype(np.float64), variance, cycle.dof)
+
+
+def _responses(measured: Measured, run: GaitRun) -> dict[Key, Known]:
+    gait = measured.gait
+    found: dict[Key, Known] = {}
+    if gait is None or gait.response is None:
+        return found
+    sound = {n for n, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
+    response = gait.response
+    for k, name in enumerate(gait.answered):
+        if name in sound:
+            dof = float(response.dof[k])
+            gain = float(np.log(response.gain[k]))
+            found["gain", name] = gain, float(response.log_gain_variance[k]), dof
+            found["lag", name] = float(response.lag_rad[k]), float(response.lag_variance[k]), dof
+    return found
+
+
+def _energies(measured: Measured) -> dict[Key, Known]:
+    found: dict[Key, Known] = {}
+    for name, energies in measured.energies.items():
+        known = None if energies.mechanical is None else mean_of_cycles(energies.mechanical.abs_j)
+        if known is not None:
+            found["energy_abs", name] = known
+    return found
+
+
+def _total_energy(measured: Measured) -> FloatArray | None:
+    """E_abs of all joints together in each cycle [J]; None where one is not known."""
+    powers = [energies.mechanical for energies in measured.energies.values()]
+    known = [power.abs_j for power in powers if power is not None]
+    return np.sum(known, axis=0) if known and len(known) == len(powers) else None
+
+
+def _cycles(measured: Measured, run: GaitRun) -> dict[str, Quantities]:
+    gait, span = measured.gait, measured.span
+    found: dict[str, Quantities] = {}
+    if gait is None:
+        return found
+    for k, name in enumerate(gait.answered):
+        cut = cycles_by_phase(
+            measured.responses[name],
+            gait.fit,
+            len(gait.driven) + k,
+            zero_rad=float(np.angle(run.command[0])),
+            start_s=span.start_s,
+            stop_s=span.stop_s,
+        )
+        if len(cut) > 1:
+            found[name] = from_runs(cut)
+    return found

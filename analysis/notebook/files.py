@@ -1,0 +1,168 @@
+"""Results to files and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
+
+from capture.console import refuse_existing
+from capture.errors import DataError, LogError, MissingExtraError, UsageError
+from capture.part_file import part_file
+
+from .. import result_energy, result_over_time, result_sweep
+from ..compare.result import Comparison
+from ..oscillators import result as oscillators
+from ..result import Analysis, Coupling, Estimate, interval_key
+from ..result_coupling import LocalCoupling
+from ..result_experiment import Experiment, Reversal
+
+if TYPE_CHECKING:
+    from .shown import Shown
+
+_NAMES = {**vars(oscillators), **vars(result_energy), **vars(result_over_time)}
+"""Types that :mod:`analysis.result` names for type checkers only."""
+
+_KINDS: tuple[type[Shown], ...] = (
+    Analysis,
+    Experiment,
+    Comparison,
+    Reversal,
+    LocalCoupling,
+    result_sweep.LinearCoupling,
+    Coupling,
+)
+
+
+def save(result: Shown, path: Path, *, force: bool) -> Path:
+    """Write a result as JSON; see :meth:`analysis.notebook.shown.Shown.save`.
+
+    Args:
+        result: The result.
+        path: A name that ends in .json.
+        force: Replace the file if it exists.
+
+    Returns:
+        The path.
+
+    Raises:
+        UsageError: If the name ends in anything else.
+        OutputExistsError: If it is there and ``force`` is not given.
+        LogWriteError: If it can't be written.
+    """
+    if path.suffix.lower() != ".json":
+        raise UsageError(f"{path}: the result file is JSON; end its name in .json")
+    refuse_existing(path, force=force)
+    text = json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n"
+    with part_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
+
+
+def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
+    """Write the tables as Parquet; see :meth:`analysis.notebook.shown.Shown.to_parquet`.
+
+    Args:
+        result: The result.
+        folder: Made if it isn't there.
+        force: Replace files that exist.
+
+    Returns:
+        The files.
+
+    Raises:
+        OutputExistsError: If one is there and ``force`` is not given.
+        MissingExtraError: If pyarrow is not installed.
+        LogWriteError: If one can't be written.
+    """
+    frames = result.frames()
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {folder / f"{name}.parquet": frame for name, frame in frames.items()}
+    for path in paths:
+        refuse_existing(path, force=force)
+    for path, frame in paths.items():
+        with part_file(path) as part:
+            try:
+                frame.to_parquet(part, index=False, engine="pyarrow")
+            except ImportError as error:
+                raise MissingExtraError("to_parquet()", "parquet", "pyarrow") from error
+    return list(paths)
+
+
+def load(path: Path | str) -> Shown:
+    """Read a result that ``save`` wrote, or ``undulog analyse`` and ``compare`` with ``-o``.
+
+    Args:
+        path: The JSON file.
+
+    Returns:
+        The result, equal to the one that was written.
+
+    Raises:
+        LogError: If there is no such file or it can't be read.
+        DataError: If it holds no result.
+    """
+    path = Path(path)
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LogError(path, error.strerror or str(error)) from error
+    except ValueError as error:
+        raise DataError(f"{path}: not JSON: {error}") from error
+    for kind in _KINDS:
+        if isinstance(data, dict) and _required(kind) <= set(cast("dict[str, Any]", data)):
+            try:
+                return cast("Shown", _build(kind, data))
+            except (KeyError, TypeError, ValueError) as error:
+                raise DataError(f"{path}: a damaged {kind.__name__}: {error!r}") from error
+    known = ", ".join(kind.__name__ for kind in _KINDS)
+    raise DataError(f"{path}: holds no result; known are {known}")
+
+
+def _required(kind: type[Any]) -> set[str]:
+    return {
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+    }
+
+
+def _build(kind: Any, value: Any) -> Any:
+    """A value of an annotated type from plain JSON values."""
+    if value is None or kind is Any:
+        return value
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return _build(next(one for one in arguments if one is not type(None)), value)
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return tuple(_build(arguments[0], one) for one in value)
+        return tuple(_build(one, part) for one, part in zip(arguments, value, strict=True))
+    if origin is dict:
+        return {key: _build(arguments[1], one) for key, one in value.items()}
+    return _dataclass(kind, value) if dataclasses.is_dataclass(kind) else _plain(kind, value)
+
+
+def _plain(kind: type[Any], value: Any) -> Any:
+    return kind(value) if issubclass(kind, Enum) else value
+
+
+def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
+    """Of the kinds that fit, the one that says most."""
+    fitting = [one for one in (kind, *kind.__subclasses__()) if _required(one) <= set(data)]
+    chosen = max(fitting, key=lambda one: len(dataclasses.fields(one)), default=kind)
+    hints = get_type_hints(chosen, localns=_NAMES)
+    built: dict[str, Any] = {}
+    for field in dataclasses.fields(chosen):
+        name = field.name
+        if name not in data:
+            continue
+        if hints[name] is Estimate and not isinstance(data[name], dict):
+            ends = data[interval_key(name)]
+            built[name] = Estimate(data[name], None if ends is None else tuple(ends))
+        else:
+            built[name] = _build(hints[name], data[name])
+    return chosen(**built)

@@ -1,0 +1,145 @@
+"""The couplings of a chain of oscillators, with intervals, or the refusal of locked data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import fdtrc
+
+from capture.arrays import BoolArray, FloatArray
+
+from ..response import CONFIDENCE, around, t_factor
+from ..result import Estimate
+from .pieces import between_kicks
+from .result import ChainCoupling, Link, Rate
+from .weak_form import OscillatorFit, fit_oscillator, window_length
+
+MOST_CONDITION = 500.0
+"""Condition number beyond which couplings are refused: random kicks of up to 1 rad every 5 s give
+40 to 200, of up to 0.3 rad 500 to 2000, locked phases without noise more than 1e6."""
+
+MOST_NOISE = 0.5
+"""Standard errors beyond this share of the couplings, both root mean square, are refused: noise
+alone moves locked phases too, but so little that it tells its own size only."""
+
+RECORD = (
+    "the chain kicked as it runs: each phase turned at once by random amounts up to 1 rad, every "
+    "few seconds, for a minute (kick_every_s = 5, kick_size = 1 in the scenario's gait)"
+)
+
+
+def chain_coupling(
+    plane: str,
+    names: Sequence[str],
+    phases: FloatArray,
+    period_s: float,
+    *,
+    whole: BoolArray | None = None,
+    inputs: FloatArray | None = None,
+    reach: int = 1,
+) -> ChainCoupling:
+    """Tell the couplings of a chain from its phases.
+
+    Args:
+        plane: Of the chain's joints.
+        names: Of the n oscillators, head to tail.
+        phases: [rad], without wrap-around, shape (k, n).
+        period_s: From sample to sample [s].
+        whole: Whether each step lasts one period, shape (k - 1,); all do if None.
+        inputs: u, what else turns the oscillators, shape (k, n).
+        reach: Couplings are looked for up to abs(i - j) = reach; Eq. 1 has 1.
+
+    Returns:
+        The couplings, or why they can't be told and what to record.
+    """
+    n = len(names)
+    steps = np.ones(len(phases) - 1, dtype=np.bool_) if whole is None else whole
+    pieces = between_kicks(phases, steps, inputs)
+    kicks = sum(1 for _ in pairwise(pieces)) - int(np.count_nonzero(~steps))
+    duration_s = period_s * sum(len(piece.phases) - 1 for piece in pieces)
+
+    def refused(why: str, condition: float | None) -> ChainCoupling:
+        return ChainCoupling(plane, False, why, RECORD, condition, max(kicks, 0), duration_s, reach)
+
+    length = window_length(period_s)
+    windows = sum((len(piece.phases) - 1) // length for piece in pieces)
+    unknowns = 1 + 2 * min(2 * reach, n - 1) + (inputs is not None)
+    if windows <= 2 * unknowns:
+        told = f"{duration_s:.3g} s of phases are too short for {unknowns} unknowns an oscillator"
+        return refused(told, None)
+    fits = [
+        fit_oscillator(pieces, period_s, i, [j for j in range(n) if j != i and abs(i - j) <= reach])
+        for i in range(n)
+    ]
+    condition = max(fit.condition_number for fit in fits)
+    finite = condition if np.isfinite(condition) else None
+    if condition > MOST_CONDITION:
+        return refused(
+            f"the phases are locked: condition number {condition:.2g}, at most {MOST_CONDITION:g} "
+            "is taken",
+            finite,
+        )
+    share = _noise_share(fits)
+    if share > MOST_NOISE:
+        return refused(
+            f"the phases are all but locked (condition number {condition:.2g}): standard errors "
+            f"are {100 * share:.0f} % of the couplings, at most {100 * MOST_NOISE:.0f} % is taken",
+            finite,
+        )
+    return ChainCoupling(
+        plane=plane,
+        identifiable=True,
+        why=f"weak form over {windows} windows of {length * period_s:.2g} s between {kicks} kicks",
+        record=None,
+        condition_number=finite,
+        kicks=kicks,
+        duration_s=duration_s,
+        reach=reach,
+        links=tuple(
+            _link(names[j], names[i], fit, k)
+            for i, fit in enumerate(fits)
+            for k, j in enumerate(fit.sources)
+        ),
+        oscillators=tuple(_rate(name, fit) for name, fit in zip(names, fits, strict=True)),
+    )
+
+
+def _noise_share(fits: Sequence[OscillatorFit]) -> float:
+    """Root mean square of the standard errors over that of the couplings."""
+    squared = sum(float(np.square([fit.in_phase, fit.quadrature]).sum()) for fit in fits)
+    errors = sum(float(np.sum(np.trace(fit.covariance, axis1=1, axis2=2))) for fit in fits)
+    return (errors / squared) ** 0.5
+
+
+def _link(source: str, target: str, fit: OscillatorFit, k: int) -> Link:
+    """K and psi from (K cos psi, K sin psi), to first order in their errors."""
+    pair: FloatArray = np.array([fit.in_phase[k], fit.quadrature[k]])
+    size = float(np.hypot(pair[0], pair[1]))
+    covariance: FloatArray = fit.covariance[k]
+    along, across = pair / size, np.array([-pair[1], pair[0]]) / size
+    factor = t_factor(fit.dof)
+    half = factor * float(along @ covariance @ along) ** 0.5
+    turn = factor * float(across @ covariance @ across) ** 0.5 / size
+    # Can the pair be told from none? A length is never below zero.
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), pair)
+    F = float(np.square(whitened).sum()) / 2
+    shown = bool(fdtrc(2, fit.dof, F) < 1 - CONFIDENCE)
+    low = max(0.0, size - half) if shown else 0.0
+    lag = float(np.arctan2(pair[1], pair[0]))
+    return Link(
+        source,
+        target,
+        Estimate(size, (low, size + half)),
+        Estimate(lag, around(lag, turn)) if shown and turn < np.pi else Estimate(),
+    )
+
+
+def _rate(name: str, fit: OscillatorFit) -> Rate:
+    factor = t_factor(fit.dof)
+    feedback = Estimate()
+    if fit.gain is not None and fit.gain_error is not None:
+        feedback = Estimate(fit.gain, around(fit.gain, factor * fit.gain_error))
+    omega = Estimate(fit.omega, around(fit.omega, factor * fit.omega_error))
+    return Rate(name, omega, feedback, fit.noise)

@@ -1,0 +1,186 @@
+"""Modes of I - P, the signed Laplacian of what the body couples.
+
+With P = d psi / d psi_c of open-loop kicks (:mod:`analysis.kicks`) and generators that feel their
+own servos, eps P_ij is the embodied coupling, and deviations of the phases relax as
+
+    d phi' = -eps (I - P) d phi,
+
+for small lags (:mod:`.embodied` has the whole of it). Rows of P sum to 1, by time shift, so all
+phases together are a mode of rate 0, whatever noise says: it is left out exactly, by looking at
+deviations from the mean only, B'(I - P) B with columns of B orthonormal and orthogonal to 1.
+Entries of P may be negative: other rates may be near zero, or below it, and then the body leaves
+that pattern alone, or drives it.
+
+P is not normal. Its eigenvalues may move by far more than its entries, so each has an interval and
+its condition number |x| |y| / |y'x| (Golub & Van Loan, Matrix Computations, 2013, 7.2.2), and the
+pseudospectrum is told (Trefethen & Embree, Spectra and Pseudospectra, 2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eig
+from scipy.optimize import linear_sum_assignment
+
+from capture.arrays import ComplexArray, FloatArray
+
+from ..norm_ratio import Noisy, noise_draws
+from ..response import CONFIDENCE
+from ..result import Estimate
+
+STRONG = 0.1
+"""A rate of I - P above this counts as strong: the body brings such a pattern back in 10/eps."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenvalues of I - P without that of all phases together, the slowest first.
+
+    Attributes:
+        rates: Eigenvalues [eps], by their real parts, shape (m - 1,).
+        patterns: Right eigenvectors less their means, one a column, shape (m, m - 1).
+        sensitivity: Condition number of each eigenvalue, 1 in a normal matrix, shape (m - 1,).
+    """
+
+    rates: ComplexArray
+    patterns: ComplexArray
+    sensitivity: FloatArray
+
+    @property
+    def gap(self) -> float:
+        """Real part of the slowest rate [eps]."""
+        return float(self.rates[0].real)
+
+    @property
+    def strong(self) -> int:
+        """Modes with a rate above ``STRONG``."""
+        return int(np.count_nonzero(self.rates.real > STRONG))
+
+
+@dataclass(frozen=True)
+class SpectrumIntervals:
+    """What noise of P leaves open.
+
+    Attributes:
+        real: 95 % intervals of the rates' real parts, shape (m - 1, 2).
+        imag: Of their imaginary parts, shape (m - 1, 2).
+        gap: The slowest rate's real part.
+        strong: Number of strong modes.
+        growth: Largest rate at which the sum of squares of a deviation can grow for a while [eps].
+    """
+
+    real: FloatArray
+    imag: FloatArray
+    gap: Estimate
+    strong: Estimate
+    growth: Estimate
+
+
+def spectrum(P: FloatArray) -> Spectrum:
+    """Modes of I - P.
+
+    Args:
+        P: d psi / d psi_c, rows sum to 1, shape (m, m).
+
+    Returns:
+        The modes.
+    """
+    found = eig(of_deviations(P), left=True, right=True)
+    values, left, right = (np.asarray(one, dtype=np.complex128) for one in found)
+    overlap = np.abs(np.sum(left.conj() * right, axis=0))  # columns are of length 1
+    order = np.lexsort((values.imag, values.real))
+    patterns = (_basis(len(P)) @ right[:, order]).astype(np.complex128)
+    return Spectrum(values[order], patterns, 1.0 / overlap[order])
+
+
+def of_deviations(P: FloatArray) -> FloatArray:
+    """I - P as it acts on deviations from the mean phase.
+
+    Args:
+        P: d psi / d psi_c, rows sum to 1, shape (..., m, m).
+
+    Returns:
+        B'(I - P) B, shape (..., m - 1, m - 1).
+    """
+    basis = _basis(P.shape[-1])
+    return basis.T @ (np.eye(P.shape[-1]) - P) @ basis
+
+
+def _basis(m: int) -> FloatArray:
+    """Orthonormal columns, all orthogonal to 1, shape (m, m - 1)."""
+    whole = np.linalg.qr(np.column_stack([np.ones(m), np.eye(m)[:, 1:]]))[0]
+    return whole[:, 1:].astype(np.float64)
+
+
+def growth(P: FloatArray) -> float:
+    """Numerical abscissa of P - I: the fastest growth of |d phi| at its very start [eps].
+
+    Args:
+        P: d psi / d psi_c, shape (m, m).
+
+    Returns:
+        Largest eigenvalue of the symmetric part, on deviations that sum to 0.
+    """
+    rates = of_deviations(P)
+    return -float(np.linalg.eigvalsh((rates + rates.T) / 2)[0])
+
+
+def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
+    """What the noise of P leaves open, by drawing its errors anew.
+
+    Each draw's eigenvalues are dealt to those of P so that they move least. Noise pushes
+    eigenvalues apart and lowers the lowest, in P as in the draws made of it: an interval is the
+    draws' one, mirrored at the estimate (the basic bootstrap).
+
+    Args:
+        P: With standard errors.
+        seed: Of the draws.
+
+    Returns:
+        The intervals.
+    """
+    here = spectrum(P.value)
+    draws = [spectrum(P.value + noise) for noise in noise_draws(P, seed)]
+    dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
+    strong = np.array([one.strong for one in draws], dtype=np.float64)
+    tails = _quantiles(strong)
+    real = _mirrored(here.rates.real, dealt.real)
+    return SpectrumIntervals(
+        real=real,
+        imag=_mirrored(here.rates.imag, dealt.imag),
+        # Of the slowest mode itself: the lowest of several close ones is biased in every draw.
+        gap=Estimate(here.gap, (float(real[0, 0]), float(real[0, 1]))),
+        strong=Estimate(
+            float(here.strong),
+            (min(float(here.strong), tails[0]), max(float(here.strong), tails[1])),
+        ),
+        growth=_estimate(
+            growth(P.value),
+            np.array([growth(P.value + noise) for noise in noise_draws(P, seed)]),
+        ),
+    )
+
+
+def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
+    """Another draw's rates in the order of these."""
+    _, order = linear_sum_assignment(np.abs(rates[:, None] - others[None, :]))
+    return others[order]
+
+
+def _quantiles(draws: FloatArray) -> tuple[float, float]:
+    tail = (1.0 - CONFIDENCE) / 2
+    return float(np.quantile(draws, tail)), float(np.quantile(draws, 1.0 - tail))
+
+
+def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
+    """Basic bootstrap intervals, shape (..., 2)."""
+    tail = (1.0 - CONFIDENCE) / 2
+    low, high = np.quantile(draws, (1.0 - tail, tail), axis=0)
+    return np.stack([2.0 * value - low, 2.0 * value - high], axis=-1)
+
+
+def _estimate(value: float, draws: FloatArray) -> Estimate:
+    low, high = _quantiles(draws)
+    return Estimate(value, (2.0 * value - high, 2.0 * value - low))

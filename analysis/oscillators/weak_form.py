@@ -1,0 +1,185 @@
+"""K of a chain of oscillators from its phases, in weak form.
+
+    phi_i' = omega_i + sum_j K_ij sin(phi_j - phi_i - psi_ij) + eps_i u_i + noise     (Eq. 1)
+
+is linear in omega_i, eps_i, K_ij cos(psi_ij) and K_ij sin(psi_ij). It is multiplied by test
+functions w that vanish outside short windows, and integrated: the phases are never differentiated,
+w takes the difference. With w constant over each sampling period the left side is exact, and what
+state noise leaves of each window is independent of every other.
+
+Least squares would be biased all the same: noise early in a window moves the regressors later in
+it. The regressors at the window's start cannot know it, so they serve as instruments (Wooldridge,
+Econometric Analysis of Cross Section and Panel Data, 2010, ch. 5): b = (Z'X)^-1 Z'y.
+
+Of locked phases every regressor is constant, and X is singular: its condition number says how far
+the data are from telling anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.errors import UsageError
+
+WINDOW_S = 0.1
+"""Length of a test function: short beside 1/K, long beside the noise of a reading."""
+
+LEAST_SAMPLES = 4
+"""Sampling periods in a window, at least."""
+
+SINGULAR = 1e7
+"""Condition number beyond which nothing is solved: Z'X has its square."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Phases between two kicks.
+
+    Attributes:
+        phases: Without jumps [rad], shape (k, n).
+        inputs: u, what else turns each oscillator, shape (k, n); None where there is nothing.
+    """
+
+    phases: FloatArray
+    inputs: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class OscillatorFit:
+    """One oscillator's equation.
+
+    Attributes:
+        sources: Oscillators j that may act on it, p of them.
+        omega: Its own rate [rad/s].
+        omega_error: Standard error [rad/s].
+        in_phase: K_ij cos(psi_ij) [1/s], shape (p,).
+        quadrature: K_ij sin(psi_ij) [1/s], shape (p,).
+        covariance: Of each pair (in phase, quadrature), shape (p, 2, 2).
+        gain: eps_i [1/s] where there are inputs.
+        gain_error: Its standard error.
+        dof: Degrees of freedom.
+        noise: Of the state [rad/sqrt(s)].
+        condition_number: Of the regressors, each of which is of size 1 at most.
+    """
+
+    sources: tuple[int, ...]
+    omega: float
+    omega_error: float
+    in_phase: FloatArray
+    quadrature: FloatArray
+    covariance: FloatArray
+    gain: float | None
+    gain_error: float | None
+    dof: int
+    noise: float
+    condition_number: float
+
+
+def window_length(period_s: float) -> int:
+    """Sampling periods in a test function.
+
+    Args:
+        period_s: Of the samples [s].
+
+    Returns:
+        ``WINDOW_S``, and at least ``LEAST_SAMPLES`` periods.
+    """
+    return max(LEAST_SAMPLES, round(WINDOW_S / period_s))
+
+
+def fit_oscillator(
+    pieces: Sequence[Piece], period_s: float, target: int, sources: Sequence[int]
+) -> OscillatorFit:
+    """Estimate what turns one oscillator.
+
+    Args:
+        pieces: Phases between kicks.
+        period_s: Of their samples [s].
+        target: Which oscillator, i.
+        sources: Which may act on it, j.
+
+    Returns:
+        The estimate; all but the condition number is NaN where that is above ``SINGULAR``.
+
+    Raises:
+        UsageError: If there are fewer windows than unknowns.
+    """
+    length = window_length(period_s)
+    place = (np.arange(length) + 0.5) / length
+    test = place * (1.0 - place)  # a parabola; its mean is 1 from here on
+    test = test / test.mean()
+    rows = [_equations(piece, period_s, target, sources, test) for piece in pieces]
+    X, Z, y = (np.concatenate(part) for part in zip(*rows, strict=True))
+    count, unknowns = X.shape
+    if count <= unknowns:
+        raise UsageError(
+            f"{count} windows of {length * period_s:g} s for {unknowns} unknowns of each "
+            "oscillator; record longer"
+        )
+    condition = float(np.linalg.cond(X))
+    solved = condition < SINGULAR
+    inverse = np.linalg.inv(Z.T @ X) if solved else np.full((unknowns, unknowns), np.nan)
+    b = inverse @ (Z.T @ y)
+    residual = y - X @ b
+    variance = float(residual @ residual) / (count - unknowns)
+    covariance = variance * inverse @ (Z.T @ Z) @ inverse.T
+    error = np.sqrt(np.diag(covariance))
+    pairs = 1 + 2 * np.arange(len(sources))
+    extra = unknowns > 1 + 2 * len(sources)
+    return OscillatorFit(
+        sources=tuple(sources),
+        omega=float(b[0]),
+        omega_error=float(error[0]),
+        in_phase=b[pairs],
+        quadrature=-b[pairs + 1],
+        covariance=np.array(
+            [_mirrored(covariance[k : k + 2, k : k + 2]) for k in pairs.tolist()]
+        ).reshape(-1, 2, 2),
+        gain=float(b[-1]) if extra else None,
+        gain_error=float(error[-1]) if extra else None,
+        dof=count - unknowns,
+        # y is a window's mean rate: its noise is that of the state times sqrt(sum w^2 / dt) / span.
+        noise=(variance / float(np.square(test).mean()) * length * period_s) ** 0.5,
+        condition_number=condition,
+    )
+
+
+def _mirrored(covariance: FloatArray) -> FloatArray:
+    """Covariance of (a, -b) from that of (a, b)."""
+    return covariance * np.array([[1.0, -1.0], [-1.0, 1.0]])
+
+
+def _equations(
+    piece: Piece, period_s: float, target: int, sources: Sequence[int], test: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Regressors, instruments and left sides of a piece's windows, as mean rates."""
+    length = test.size
+    count = (len(piece.phases) - 1) // length
+    phases = piece.phases[: count * length + 1]
+    columns = [np.ones(len(phases))]
+    for source in sources:
+        ahead = phases[:, source] - phases[:, target]
+        columns += [np.sin(ahead), np.cos(ahead)]
+    if piece.inputs is not None:
+        columns.append(piece.inputs[: count * length + 1, target])
+    x = np.stack(columns, axis=1)
+    if count == 0:
+        return x[:0], x[:0], np.zeros(0)
+    means = _period_means(x).reshape(count, length, -1)
+    steps = np.diff(phases[:, target]).reshape(count, length)
+    weight = test / length
+    return (
+        np.einsum("l,wlc->wc", weight, means),
+        x[:-1:length],
+        steps @ weight / period_s,
+    )
+
+
+def _period_means(x: FloatArray) -> FloatArray:
+    """Mean of smooth columns over each sampling period, to fourth order (Euler-Maclaurin)."""
+    slope = np.gradient(x, axis=0, edge_order=2)
+    return (x[1:] + x[:-1]) / 2 - np.diff(slope, axis=0) / 12

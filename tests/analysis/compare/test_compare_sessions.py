@@ -1,0 +1,221 @@
+"""Whole sessions of known truth, written by a foreign writer: open, compare, answer."""
+
+import json
+import re
+from html import unescape
+
+import numpy as np
+import pytest
+
+import undulog
+from analysis import Choices, Options, compare_sessions
+from capture import Session
+from capture.errors import DataError
+
+SIGMA = 0.003
+
+
+@pytest.fixture
+def write(bag, wave, epoch_ns):
+    """Writes a session: 5 joints, 8 s at 0.97 Hz; all sessions have the same true response."""
+
+    def make(name, seed, *, late_s=0.0, frequency=0.97, joints=5, first=1, change=None, energy=1.0):
+        truth = wave(np.random.default_rng(11), joints=joints, frequency=frequency, duration=8.0)
+        truth.names = [f"joint{first + i:02d}" for i in range(joints)]
+        if change is not None:
+            change(truth)
+        rng = np.random.default_rng(seed)
+        one = bag(f"{name}.mcap")
+        for t_ns in truth.ticks_ns:
+            own_ns = t_ns + round(late_s * 1e9)
+            t = (own_ns - epoch_ns) * 1e-9
+            q = truth.response(np.full(joints, own_ns)) + rng.normal(0, SIGMA, joints)
+            size = truth.omega * truth.gain * truth.amplitude
+            rate = size * np.cos(truth.omega * t + truth.phase - truth.lag)
+            torque = energy * rate / size + rng.normal(0, 0.05, joints)
+            one.write("/joint_commands", t_ns, truth.names, truth.command(own_ns))
+            one.write("/joint_states", t_ns, truth.names, q, rate, torque)
+        one.close()
+        return one.path
+
+    return make
+
+
+def weaken(truth):
+    truth.gain[2] *= 0.95
+    truth.lag[2] += np.radians(3.0)
+
+
+def compared(a, b, **choices):
+    with Session.open(a) as first, Session.open(b) as second:
+        return compare_sessions(first, second, Choices(**choices))
+
+
+def by_key(comparison):
+    return {(one.quantity, one.place): one for one in comparison.differences}
+
+
+def test_the_weakened_joint_is_named_with_its_true_difference(write):
+    """B starts a third of a cycle later: phases of the gait are compared, not times."""
+    result = compared(write("a", 1), write("b", 2, late_s=0.34, change=weaken))
+    assert result.verdict == "different"
+    assert result.answer.startswith("B differs from A: joint03 most, gain −5.")
+    assert [one.name for one in result.named] == ["joint03"]
+    known = by_key(result)
+    low, high = known["gain", "joint03"].difference.ci95
+    assert low < -0.05 < high
+    low, high = known["lag", "joint03"].difference.ci95
+    assert low < np.radians(3.0) < high
+    assert all(one.p_holm > 0.05 for key, one in known.items() if key[1] != "joint03")
+    assert result.partial is None
+    assert any("one session a side" in warning for warning in result.warnings)
+
+
+def test_mean_cycles_differ_as_in_closed_form(write, wave):
+    result = compared(write("a", 3), write("b", 4, late_s=0.2, change=weaken))
+    before, after = (wave(np.random.default_rng(11), joints=5) for _ in range(2))
+    weaken(after)
+    phase = np.array(result.phase_rad)
+    for k, one in enumerate(result.waveforms):
+        # Phase 0 is the crest of joint01's command, a sine.
+        turn = phase + np.pi / 2 + before.phase[k] - before.phase[0]
+        a, b = (w.gain[k] * w.amplitude[k] * np.sin(turn - w.lag[k]) for w in (before, after))
+        off = np.abs(np.array(one.difference_rad) - (b - a))
+        assert np.mean(off <= np.array(one.half_rad)) > 0.9
+        np.testing.assert_allclose(one.a_rad, a + 0.04, atol=5 * SIGMA / np.sqrt(7))
+    named = max(result.waveforms, key=lambda one: one.rms_rad)
+    assert named.name == "joint03"
+
+
+def test_two_runs_of_one_truth_are_equivalent(write):
+    result = compared(write("a", 5), write("b", 6, late_s=0.5))
+    assert result.verdict == "same"
+    assert result.answer == (
+        "no difference found; gain and lag of all 5 joints are equivalent within 2 % and 1°"
+    )
+    assert result.named == ()
+
+
+def test_a_session_is_the_same_as_itself(write):
+    path = write("a", 7)
+    result = compared(path, path)
+    assert result.verdict == "same"
+    assert all(one.difference.value == 0 and one.p == 1 for one in result.differences)
+    assert any("the same content" in warning for warning in result.warnings)
+
+
+def test_with_much_noise_the_question_stays_open(write):
+    result = compared(write("a", 8), write("b", 9), session=Options(start_s=0.0, stop_s=3.3))
+    assert result.verdict in ("same", "open")
+    wide = max(one.difference.ci95[1] for one in result.differences if one.quantity == "gain")
+    if result.verdict == "open":
+        assert "could hide in the noise" in result.answer
+        assert wide > 0.0
+
+
+def test_energy_alone_may_differ(write):
+    result = compared(write("a", 10), write("b", 11, energy=1.2))
+    assert result.verdict == "small"
+    assert "are equivalent within 2 % and 1°; beyond doubt" in result.answer
+    ratios = [
+        one.difference.value / one.a for one in result.differences if one.quantity == "energy_abs"
+    ]
+    # E_abs of noisy torque is not quite proportional to it.
+    assert ratios == pytest.approx([0.2] * 5, abs=0.01)
+
+
+def test_another_gait_is_refused_or_labelled(write):
+    a, b = write("a", 12), write("b", 13, frequency=1.1)
+    with pytest.raises(DataError, match=r"the gaits differ, .* b.mcap has 1.1 Hz, a.mcap 0.97 Hz"):
+        compared(a, b)
+    result = compared(a, b, any_gait=True)
+    assert result.partial == "the gaits differ: b.mcap has 1.1 Hz, a.mcap 0.97 Hz"
+    assert result.answer.endswith("(partial comparison)")
+
+
+def test_another_amplitude_of_one_joint_is_another_gait(write):
+    def louder(truth):
+        truth.amplitude[3] *= 1.05
+
+    with pytest.raises(DataError, match=r"at joint04 the command of b.mcap is 5.0 % in amplitude"):
+        compared(write("a", 14), write("b", 15, change=louder))
+
+
+def test_other_joints_are_left_out_or_refused(write):
+    a = write("a", 16)
+    result = compared(a, write("b", 17, joints=4))
+    assert result.partial == "only 4 joints can be compared (joint05: no gain and lag in b.mcap)"
+    with pytest.raises(DataError, match=r"a.mcap drives joint01, .*, c.mcap joint11"):
+        compared(a, write("c", 18, first=11))
+
+
+def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    files = [str(write("a", 1)), str(write("b", 2, change=weaken))]
+    assert undulog.run(["compare", *files, "-o", str(page)]) == 0
+    assert capsys.readouterr().out.rstrip().endswith(f"Result: {page}")
+    html = page.read_text()
+    result = compared(*files)
+    heading = re.sub("<[^>]+>", "", re.search(r"<h1.*?</h1>", html, re.DOTALL)[0])
+    assert unescape(heading).replace("\N{NO-BREAK SPACE}", " ") == f"{result.answer}."
+    named = re.search(r'<table class="named">.*?</table>', html, re.DOTALL)[0]
+    assert re.findall(r"</span>(joint\d+)</th>", named) == [one.name for one in result.named]
+    assert result.named[0].name == "joint03"
+    every = re.search(r'<table class="quantities">.*?</table>', html, re.DOTALL)[0]
+    assert every.count("<tr") == 1 + len(result.differences)
+    shown = {float(v) for v in re.findall(r'<data value="([^"]+)"', every)}
+    for one in result.differences:
+        factor = {"gain": 100.0, "lag": np.degrees(1.0)}.get(one.quantity, 100.0 / one.a)
+        for value in (one.difference.value, *one.difference.ci95):
+            assert any(np.isclose(value * factor, other) for other in shown)
+    assert "://" not in html.replace(str(tmp_path), "")
+    assert "Mean cycles by gait phase" in html
+
+
+def test_a_page_is_not_replaced_unasked_and_other_endings_are_refused(write, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    page.write_text("mine")
+    files = [str(write("a", 1)), str(write("b", 2))]
+    assert undulog.run(["compare", *files, "-o", str(page)]) == 2
+    assert page.read_text() == "mine"
+    assert undulog.run(["compare", *files, "-o", str(tmp_path / "x.pdf")]) == 2
+    assert "end its name in .html for a page, in .json for numbers" in capsys.readouterr().err
+
+
+def test_groups_by_the_command_line(write, tmp_path, capsys):
+    a = [str(write(f"a{k}", 20 + k, late_s=0.1 * k)) for k in range(4)]
+    b = [str(write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken)) for k in range(4)]
+    out = tmp_path / "result.json"
+    assert undulog.run(["compare", "--a", *a, "--b", *b, "-o", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("B differs from A: joint03 most")
+    assert "What was changed" in said
+    assert said.rstrip().endswith(f"Result: {out}")
+    assert json.loads(out.read_text())["design"] == "groups"
+    assert undulog.run(["compare", "--a", *a, "--b", *b, "--paired", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["design"] == "pairs"
+    assert result["named"][0]["name"] == "joint03"
+    assert " --paired" in result["provenance"]["command"]
+    assert undulog.run(["compare", "--a", a[0], a[0], "--b", *b]) == 1
+    assert "a copy is not a run of its own" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "compare needs sessions on both sides"),
+        (["x.mcap"], "here are 1"),
+        (["x.mcap", "y.mcap", "--a", "z.mcap"], "not both"),
+        (["x.mcap", "y.mcap", "-o", "z.txt"], "in .json for numbers"),
+        (["x.mcap", "y.mcap", "--margin-gain", "2"], "--margin-gain lies between"),
+    ],
+)
+def test_wrong_usage_exits_2(words, said, capsys):
+    assert undulog.run(["compare", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_missing_file_exits_1(capsys):
+    assert undulog.run(["compare", "no.mcap", "such.mcap"]) == 1
+    assert "no.mcap" in capsys.readouterr().err

@@ -1,0 +1,91 @@
+"""Experiments for the page: a linear chain without physics, run both ways, and kicked."""
+
+import numpy as np
+import pytest
+
+from analysis import analyse_experiment
+from capture import Session, SessionWriter
+
+EPOCH_NS = 1_735_689_600_000_000_000
+NAMES = ("j1", "j2", "j3", "j4", "j5")
+M = len(NAMES)
+PLACE = np.arange(M)
+DISTANCE = np.abs(PLACE[:, None] - PLACE[None, :])
+CHAIN = np.diag(np.full(M, 0.9 * np.exp(-0.3j))) + 0.12 * np.exp(-DISTANCE + 0.5j)
+WAVE = 0.4 * np.exp(-1j * np.pi / 3 * PLACE)
+MODULE = np.ones(M, dtype=complex)
+MODULE[1] = 0.97 * np.exp(-0.02j)
+"""j2 is weak."""
+
+
+def write_run(path, command, answer, seed, sigma):
+    """Six cycles at 50 Hz."""
+    noise = np.random.default_rng(seed).normal(0.0, sigma, (300, M))
+    epoch_ns = EPOCH_NS + seed * 10_000_000_000
+    with SessionWriter(path, session_id=path.stem, epoch_ns=epoch_ns) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad")
+        for k in range(300):
+            turn = np.exp(2j * np.pi * k / 50)
+            t_ns = epoch_ns + k * 20_000_000
+            commands.write(t_ns, np.real(command * turn))
+            states.write(t_ns, np.real(answer * turn) + noise[k])
+    return path
+
+
+def analysed(paths):
+    def opened():
+        for path in paths:
+            with Session.open(path) as session:
+                yield session
+
+    return analyse_experiment(opened())
+
+
+@pytest.fixture(scope="session")
+def both_ways_files(tmp_path_factory):
+    """Six runs each way, in turn."""
+    folder = tmp_path_factory.mktemp("ways")
+    paths = []
+    for k in range(6):
+        for way, name in ((1, "forward"), (-1, "reverse")):
+            command = WAVE[::way]
+            answer = MODULE * (CHAIN @ command)
+            paths.append(write_run(folder / f"{name}{k}.mcap", command, answer, len(paths), 0.003))
+    return paths
+
+
+@pytest.fixture(scope="session")
+def both_ways(both_ways_files):
+    """A wave and its reverse; the second joint is weak."""
+    return analysed(both_ways_files)
+
+
+@pytest.fixture(scope="session")
+def kicked(tmp_path_factory):
+    """Every joint's command kicked in phase and amplitude, and a pattern held out."""
+    folder = tmp_path_factory.mktemp("kicks")
+    off = [np.zeros(M, dtype=complex)]
+    for step in (0.05j, -0.05j, 0.05, -0.05):
+        off += [np.where(joint == PLACE, step, 0) for joint in range(M)]
+    off.append(1j * np.array([0.1, -0.12, 0.05, 0.08, -0.11]))
+    return analysed(
+        write_run(
+            folder / f"run{k:02d}.mcap",
+            WAVE * np.exp(one),
+            CHAIN @ (WAVE * np.exp(one)),
+            k,
+            0.002,
+        )
+        for k, one in enumerate(off)
+    )
+
+
+@pytest.fixture(scope="session")
+def swept(tmp_path_factory):
+    """A lag sweep: the commands of the runs are the columns of a DFT."""
+    folder = tmp_path_factory.mktemp("sweep")
+    dft = 0.02 * np.exp(2j * np.pi * np.outer(PLACE, PLACE) / M)
+    return analysed(
+        write_run(folder / f"run{k}.mcap", dft[:, k], CHAIN @ dft[:, k], k, 1e-5) for k in PLACE
+    )

@@ -1,0 +1,113 @@
+"""What the verbs of the analysis refuse before they work, and what they say of a bad file."""
+
+import json
+
+import numpy as np
+import pytest
+
+import undulog
+from capture import SessionWriter
+
+EPOCH_NS = 1_735_689_600_000_000_000
+NAMES = ("j1", "j2", "j3")
+
+
+def written(path, *, states=True, lost=(), samples=300):
+    """A gait of 1 Hz whose responses at some samples are no numbers."""
+    with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        responses = writer.joint_state("/joint_states", NAMES, unit="rad") if states else None
+        noise = np.random.default_rng(5).normal(0, 1e-3, (samples, 3))
+        for k in range(samples):
+            phase = 2 * np.pi * k / 50 - np.arange(3)
+            t_ns = EPOCH_NS + k * 20_000_000
+            commands.write(t_ns, 0.4 * np.sin(phase))
+            if responses is not None:
+                angle = 0.38 * np.sin(phase - 0.2) + noise[k]
+                responses.write(t_ns, np.full(3, np.nan) if k in lost else angle)
+    return path
+
+
+@pytest.fixture
+def good(tmp_path):
+    return written(tmp_path / "good.mcap")
+
+
+def said(capsys, *words):
+    code = undulog.run([str(word) for word in words])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+@pytest.mark.parametrize("verb", ["analyse", "report", "compare"])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--start", "-1"], "--start -1 is before the session's start"),
+        (["--start", "5", "--stop", "3"], "--stop 3 is not after --start 5"),
+        (["--stop", "0"], "--stop 0 is not after --start 0"),
+        (["-o", "x.odt"], "x.odt: "),
+        (["-o", "nowhere/x.html"], "nowhere/x."),
+    ],
+)
+def test_wrong_usage_is_refused_before_the_work(verb, options, message, capsys):
+    if verb == "analyse":
+        options = [word.replace(".html", ".json") for word in options]
+    page = ["-o", "x.html"] if verb == "report" and "-o" not in options else []
+    files = ["a.mcap", "b.mcap"]  # not there: nothing was opened
+    code, out, err = said(capsys, verb, *files, *options, *page)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: {message}")
+
+
+@pytest.mark.parametrize("verb", ["analyse", "report", "compare"])
+def test_a_bad_file_is_named_and_leaves_nothing_behind(verb, good, tmp_path, capsys):
+    page = tmp_path / "out.html"
+    output = [] if verb == "analyse" else ["-o", page]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(good.read_bytes()[:1500])
+    text = tmp_path / "text.mcap"
+    text.write_text("hello")
+    for bad, why in (
+        (tmp_path / "missing.mcap", "no such file"),
+        (text, "not an MCAP file"),
+        (cut, "without any channel that could be read"),
+    ):
+        code, out, err = said(capsys, verb, good, bad, *output)
+        assert (code, out) == (1, "")
+        assert err.startswith(f"error: {bad}: ")
+        assert why in err
+        assert not page.exists()
+
+
+def test_a_topic_that_was_chosen_must_be_there(good, capsys):
+    code, _, err = said(capsys, "analyse", good, "--command-topic", "/foo")
+    assert code == 1
+    assert err == f"error: {good}: has no /foo; it has /joint_commands, /joint_states\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ({"states": False}, "No positions on /joint_states: gain and lag are null."),
+        ({"lost": range(300)}, "Too few response samples for j1, j2, j3: gain and lag are null."),
+    ],
+)
+def test_no_answer_says_what_is_lacking(kind, why, tmp_path, capsys):
+    path = written(tmp_path / "lacking.mcap", **kind)
+    code, out, _ = said(capsys, "analyse", path)
+    assert code == 0
+    assert out.splitlines()[1] == why
+
+
+def test_a_sample_that_is_no_number_is_flagged_and_json_stays_json(tmp_path, capsys):
+    path = written(tmp_path / "nan.mcap", lost=(200,))
+    code, out, _ = said(capsys, "analyse", path, "--json")
+    assert code == 0
+
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    result = json.loads(out, parse_constant=refuse)
+    assert all("nan" in joint["flags"] for joint in result["joints"])
+    assert all(abs(joint["gain"] - 0.95) < 0.01 for joint in result["joints"])

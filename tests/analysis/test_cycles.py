@@ -1,0 +1,91 @@
+"""Gain, lag and power cycle by cycle, against what was written into the session."""
+
+import numpy as np
+import pytest
+
+from analysis.analyse import measure_session
+from analysis.cycle_sums import starts_of
+from analysis.cycles import amplitudes, cycle_maps
+from analysis.series import Series
+from capture import Session, SessionWriter
+
+EPOCH_NS = 1_735_689_600_000_000_000
+NAMES = ("a", "b", "c")
+RATE_HZ = 100
+CYCLES = 12
+AMPLITUDE = 0.4
+LAG = np.array([0.1, 0.2, -0.05])
+
+
+def gains(cycle):
+    """Joint b gets weaker by 1 % a cycle."""
+    return np.array([0.9, 1.0 - 0.01 * cycle, 1.1])
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    """One cycle a second; the samples of the fifth second are lost."""
+    path = tmp_path_factory.mktemp("session") / "run.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
+        for k in range(CYCLES * RATE_HZ):
+            t_ns = EPOCH_NS + k * 10_000_000
+            turn = 2 * np.pi * k / RATE_HZ - np.pi / 3 * np.arange(3)
+            commands.write(t_ns, AMPLITUDE * np.sin(turn))
+            if 5 * RATE_HZ <= k < 6 * RATE_HZ:
+                continue
+            size = AMPLITUDE * gains(k // RATE_HZ)
+            speed = 2 * np.pi * size * np.cos(turn - LAG)
+            states.write(t_ns, size * np.sin(turn - LAG), speed, np.array([0.5, -0.2, 0.1]) * speed)
+    with Session.open(path) as session:
+        return cycle_maps(measure_session(session))
+
+
+def test_each_cycle_tells_its_own_gain_and_lag(maps):
+    assert maps.driven == NAMES
+    assert maps.start_s.size == CYCLES
+    assert maps.period_s == pytest.approx(1.0, abs=1e-5)
+    known = np.arange(CYCLES) != 5
+    truth = np.array([gains(cycle) for cycle in range(CYCLES)]).T
+    # The period is told from the responses, too, whose steps move it by 1e-6; the limits of the
+    # cycles move with it.
+    np.testing.assert_allclose(maps.gain[:, known], truth[:, known], atol=1e-4)
+    np.testing.assert_allclose(
+        maps.lag_rad[:, known], np.tile(LAG[:, None], CYCLES)[:, known], atol=1e-3
+    )
+
+
+def test_power_is_torque_times_velocity_with_its_sign(maps):
+    # Mean of drag v^2 is drag (2 pi f A)^2 / 2.
+    truth = np.array(
+        [
+            np.array([0.5, -0.2, 0.1]) * (2 * np.pi * AMPLITUDE * gains(cycle)) ** 2 / 2
+            for cycle in range(CYCLES)
+        ]
+    ).T
+    known = np.arange(CYCLES) != 5
+    assert maps.powered == NAMES
+    np.testing.assert_allclose(maps.power_w[:, known], truth[:, known], rtol=0.02)
+
+
+def test_a_cycle_without_samples_is_missing_not_zero(maps):
+    for values in (maps.gain, maps.lag_rad, maps.power_w):
+        assert np.isnan(values[:, 5]).all()
+        assert np.isfinite(np.delete(values, 5, axis=1)).all()
+
+
+def test_amplitudes_are_exact_on_uneven_times():
+    rng = np.random.default_rng(2)
+    t_s = np.sort(rng.uniform(0.0, 3.0, 240))
+    values = 0.3 + np.real(0.7 * np.exp(0.4j) * np.exp(2j * np.pi * t_s))
+    found = amplitudes(Series("x", t_s, values), starts_of(t_s, np.arange(4.0)), 2 * np.pi)
+    np.testing.assert_allclose(found, 0.7 * np.exp(0.4j), atol=1e-12)
+
+
+def test_too_few_samples_tell_nothing():
+    t_s = np.array([0.1, 0.2, 0.3, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6])
+    series = Series("x", t_s, np.cos(2 * np.pi * t_s))
+    found = amplitudes(series, starts_of(t_s, np.arange(3.0)), 2 * np.pi)
+    assert np.isnan(found[0])
+    assert found[1] == pytest.approx(1.0)

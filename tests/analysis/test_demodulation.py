@@ -1,0 +1,153 @@
+"""Gain and lag over time against planted truth: slow changes, a frequency that changes, noise."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from analysis.demodulation import Phase, cycles_of, demodulate
+from analysis.demodulation_session import response_over_time
+from analysis.reading import read_columns
+from analysis.response import t_factor
+from analysis.series import Series
+from capture import Session, SessionWriter
+
+T = np.arange(6000) / 100
+
+
+def phase_of(omega):
+    """The integral of a frequency over time, as a controller steps it."""
+    return np.concatenate(([0.0], np.cumsum(omega[:-1] * 0.01)))
+
+
+def wave(omega, gain, lag, amplitude, offset=0.0):
+    phi = phase_of(omega)
+    command = Series("q", T, amplitude * np.sin(phi - 0.4) + offset)
+    return phi, command, gain * amplitude * np.sin(phi - 0.4 - lag) + 0.9 * offset
+
+
+def cycles(phi, command, response, **options):
+    phase = Phase(T, phi)
+    edges = phase.edges_s()
+    pair = demodulate(command, response, phase, edges)
+    return cycles_of([edges], [pair[0]], [pair[1]], **options)
+
+
+def middle(found):
+    return (found.start_s + found.stop_s) / 2
+
+
+OMEGA = np.pi * (1 + 0.3 * np.sin(2 * np.pi * T / 23))
+GAIN = 0.9 + 0.08 * np.sin(2 * np.pi * T / 31)
+LAG = 0.25 + 0.15 * np.cos(2 * np.pi * T / 41)
+AMPLITUDE = 0.3 + 0.06 * np.sin(2 * np.pi * T / 29)
+OFFSET = 0.15 * np.sin(2 * np.pi * T / 17)
+
+
+def test_a_steady_wave_is_told_to_rounding():
+    same = np.ones(T.size)
+    phi, command, response = wave(np.pi * same, 0.9 * same, 0.3 * same, 0.4 * same)
+    found = cycles(phi, command, Series("q", T, response))
+    assert found.ratio.size == 28  # of thirty cycles less a sample, half a one at either end
+    np.testing.assert_allclose(found.ratio, 0.9 * np.exp(-0.3j), atol=1e-9)
+
+
+def test_slow_changes_of_everything_are_followed():
+    """Frequency +-30 %, gain +-9 %, lag +-0.15 rad, amplitude and offset of the steering."""
+    phi, command, response = wave(OMEGA, GAIN, LAG, AMPLITUDE, OFFSET)
+    found = cycles(phi, command, Series("q", T, response))
+    at = middle(found)
+    gain, lag = np.interp(at, T, GAIN), np.interp(at, T, LAG)
+    # A cycle's gain is its mean; in one cycle the truth changes by up to 0.03 and 2.6 degrees.
+    np.testing.assert_allclose(np.abs(found.ratio), gain, atol=0.007)
+    np.testing.assert_allclose(-np.angle(found.ratio), lag, atol=np.radians(0.4))
+    turns = np.interp(found.stop_s, T, phi) - np.interp(found.start_s, T, phi)
+    np.testing.assert_allclose(turns, 2 * np.pi, atol=1e-6)
+
+
+def test_responses_on_their_own_times():
+    phi, command, _ = wave(OMEGA, GAIN, LAG, AMPLITUDE)
+    own = T + 0.004
+    lagging = np.interp(own, T, phi) - 0.4 - np.interp(own, T, LAG)
+    values = np.interp(own, T, GAIN * AMPLITUDE) * np.sin(lagging)
+    found = cycles(phi, command, Series("q", own, values))
+    np.testing.assert_allclose(
+        -np.angle(found.ratio), np.interp(middle(found), T, LAG), atol=np.radians(0.4)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [0.0, 0.9])
+def test_intervals_cover_in_white_and_coloured_noise(memory):
+    """3,480 gains and lags, noise of 0.01 rad, white and AR(1), omega and amplitude changing."""
+    rng = np.random.default_rng(5)
+    same = np.ones(T.size)
+    phi, command, response = wave(OMEGA, 0.9 * same, 0.3 * same, AMPLITUDE, OFFSET)
+    exact = cycles(phi, command, Series("q", T, response)).ratio
+    inside = []
+    for _ in range(60):
+        noise = lfilter([1], [1, -memory], rng.normal(0, 0.01 * (1 - memory**2) ** 0.5, T.size))
+        found = cycles(phi, command, Series("q", T, response + noise))
+        half = t_factor(found.dof) * found.variance**0.5
+        error = np.log(found.ratio / exact)
+        inside += [np.abs(error.real) < half, np.abs(error.imag) < half]
+    assert 0.93 <= np.mean(inside) <= 0.97
+
+
+def test_what_a_cycle_cannot_tell_is_missing():
+    phi, command, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
+    kept = (T < 20) | (T > 23)
+    found = cycles(phi, command, Series("q", T[kept], response[kept]))
+    holed = (found.stop_s > 20) & (found.start_s < 23)
+    # Also the neighbours, whose mean over a cycle around each sample reaches in.
+    assert np.isnan(found.ratio[holed]).all()
+    far = (found.stop_s < 18) | (found.start_s > 25)
+    assert np.isfinite(found.ratio[far]).all()
+    still = Series("q", T, np.where(T < 30, 0.0, command.values))
+    found = cycles(phi, still, Series("q", T, response))
+    assert np.isnan(found.ratio[found.stop_s < 28]).all()
+    assert np.isfinite(found.ratio[found.start_s > 32]).all()
+
+
+def test_a_phase_that_does_not_drive_the_command_tells_nothing():
+    phi, _, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
+    other = Series("q", T, 0.3 * np.sin(9.0 * T))
+    assert np.isnan(cycles(phi, other, Series("q", T, response)).ratio).all()
+
+
+def test_too_few_cycles_have_no_interval():
+    phi, command, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
+    phase = Phase(T[:800], phi[:800])
+    edges = phase.edges_s()
+    pair = demodulate(command, Series("q", T, response), phase, edges)
+    found = cycles_of([edges], [pair[0]], [pair[1]])
+    assert np.isfinite(found.ratio).all()
+    assert np.isnan(found.variance).all()
+    assert found.dof == 0
+
+
+def over_time(path, phi):
+    """What a session of two joints tells whose controller logged this phase."""
+    with SessionWriter(path, session_id="phase", epoch_ns=0) as writer:
+        commands = writer.joint_state("/joint_commands", ["j1", "j2"], unit="rad")
+        states = writer.joint_state("/joint_states", ["j1", "j2"], unit="rad")
+        gait = writer.joint_state("/gait", ["plane.A", "plane.omega", "plane.phase"], unit="rad")
+        turned = phase_of(OMEGA)[:, None] - np.array([0.0, 1.0])
+        for k, t_s in enumerate(T.tolist()):
+            t_ns = round(t_s * 1e9)
+            commands.write(t_ns, 0.3 * np.sin(turned[k]))
+            states.write(t_ns, 0.3 * GAIN[k] * np.sin(turned[k] - LAG[k]))
+            gait.write(t_ns, [0.3, OMEGA[k], phi[k]])
+    with Session(path) as session:
+        columns = read_columns(session, "/joint_commands", "/joint_states", lambda _: None)
+        return response_over_time(session, columns, (), lambda _: None)
+
+
+def test_a_phase_may_be_logged_within_a_turn(tmp_path):
+    phi = phase_of(OMEGA)
+    running = over_time(tmp_path / "running.mcap", phi)
+    turning = over_time(tmp_path / "turning.mcap", phi % (2 * np.pi))
+    assert len(running.joints[0].gain) == int((phi[-1] - 2 * np.pi) / (2 * np.pi))
+    for one, other in zip(running.joints, turning.joints, strict=True):
+        assert one.start_s == pytest.approx(other.start_s, abs=1e-9)
+        assert one.gain == pytest.approx(other.gain, rel=1e-9)
+        assert one.lag_rad == pytest.approx(other.lag_rad, abs=1e-9)

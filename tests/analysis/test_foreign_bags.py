@@ -1,0 +1,92 @@
+"""A bag of another make, written by rosbags: commands and states on topics of its own names."""
+
+import json
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+import undulog
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]
+GAIN = np.array([0.95, 0.9, 0.85])
+LAG = np.array([0.1, 0.2, 0.3])
+OMEGA = 2 * np.pi * 0.8
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """No robot, no torque; the commands at 50 Hz, the states at 100 Hz, nothing undulog wrote."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state = store.types["sensor_msgs/msg/JointState"]
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    folder = tmp_path_factory.mktemp("foreign") / "bag"
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {
+            topic: writer.add_connection(topic, state.__msgtype__, typestore=store)
+            for topic in ("/snake/targets", "/snake/encoders")
+        }
+
+        def write(topic, t_ns, position):
+            empty = np.zeros(0)
+            sent = stamp(sec=t_ns // 10**9, nanosec=t_ns % 10**9)
+            message = state(
+                header=header(stamp=sent, frame_id=""),
+                name=NAMES,
+                position=position,
+                velocity=empty,
+                effort=empty,
+            )
+            data = store.serialize_cdr(message, state.__msgtype__)
+            writer.write(topics[topic], t_ns, data)
+
+        rng = np.random.default_rng(3)
+        for tick in range(1000):
+            phase = OMEGA * tick / 100 - np.arange(3)
+            if tick % 2 == 0:
+                write("/snake/targets", EPOCH_NS + tick * 10**7, 0.4 * np.sin(phase))
+            answer = 0.4 * GAIN * np.sin(phase - LAG) + rng.normal(0, 1e-3, 3)
+            write("/snake/encoders", EPOCH_NS + tick * 10**7, answer)
+    (file,) = folder.glob("*.mcap")
+    return file
+
+
+def test_naming_the_topics_is_enough(bag, capsys):
+    topics = ["--command-topic", "/snake/targets", "--response-topic", "/snake/encoders"]
+    assert undulog.run(["analyse", str(bag), *topics, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["gait"]["frequency_hz"] == pytest.approx(0.8, abs=1e-3)
+    assert [joint["name"] for joint in result["joints"]] == NAMES
+    assert [joint["gain"] for joint in result["joints"]] == pytest.approx(GAIN, abs=5e-4)
+    assert [joint["lag_rad"] for joint in result["joints"]] == pytest.approx(LAG, abs=5e-4)
+    assert result["artefacts"] == []
+    # Its limits, said one by one: no torque, no current, no robot, no phase.
+    for joint in result["joints"]:
+        assert joint["energy_net_j"] is None
+        assert joint["energy_el_j"] is None
+        assert joint["plane"] is None
+    assert result["over_time"] is None
+    assert result["energy"]["electrical"] is None
+    assert result["energy"]["closure"] is None
+    assert result["energy"]["transport"]["abs"] is None
+    said = " ".join(result["warnings"])
+    assert "/snake/encoders carries no effort and velocity: mechanical energies are null" in said
+    assert "no /joint_current and no /joint_voltage: electrical energies are null" in said
+    assert "cost of transport is not applicable: " in said
+    assert "gain and lag over time are null: the session has no /gait" in said
+    assert f"{topics[0]} {topics[1]}" in result["provenance"]["command"]
+
+
+def test_topics_that_are_not_named_are_listed(bag, capsys):
+    assert undulog.run(["analyse", str(bag)]) == 1
+    assert "it has /snake/encoders, /snake/targets" in capsys.readouterr().err
+    assert undulog.run(["analyse", str(bag), "--response-topic", "/snake/encoders", "--json"]) == 0
+    (said,) = [
+        text
+        for text in json.loads(capsys.readouterr().out)["warnings"]
+        if text.startswith("no commands on /joint_commands")
+    ]
+    assert said.endswith("(other JointStates: /snake/targets; choose with --command-topic)")
+    assert undulog.run(["analyse", str(bag), "--reference-topic", "/none"]) == 1
