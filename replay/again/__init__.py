@@ -1,0 +1,1 @@
+"""Run a recorded experiment again in the twin, and say what differs."""

@@ -1,0 +1,228 @@
+"""A session's commands and joint states, and the twin's parameters that fit them best."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capture import Session
+from capture.errors import DataError
+from sim.physics.engine import Kernels
+from sim.scenario import Scenario
+
+from ..again.run import find_repetition
+from .answers import Answers, read_measured
+from .determined import Ridge, half_widths, ridges, what_would_tell
+from .misfit import Misfit, misfit
+from .parameters import DELAY, Unknown, module_unknown, unknowns, with_values
+from .solve import Solution, solve
+from .weak_module import Search, find_weak_module
+
+SPREAD = 0.5
+WITHIN = 0.05
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be fitted.
+
+    Attributes:
+        only: Names of shared parameters; all if empty.
+        module: A joint whose stall torque is its own, or None.
+        search: Try every module.
+        delay: Fit a dead time.
+        spread: Prior standard deviation of each ln theta.
+        within: A parameter is determined if its 95 % interval is no wider than this to either side,
+            as a share of it; of a dead time: of a control period.
+        settle_s: The first part to leave out [s]; what the session says if None.
+    """
+
+    only: tuple[str, ...] = ()
+    module: str | None = None
+    search: bool = False
+    delay: bool = False
+    spread: float = SPREAD
+    within: float = WITHIN
+    settle_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One parameter; values in its unit, of a module its factor on the shared one.
+
+    Attributes:
+        name: Its name.
+        label: How it is called in text.
+        unit: SI.
+        module: The joint whose own it is, or None.
+        start: Where the fit started.
+        value: Where it ended.
+        ci95: 95 % interval.
+        determined: Whether the session tells it.
+    """
+
+    name: str
+    label: str
+    unit: str
+    module: str | None
+    start: float
+    value: float
+    ci95: tuple[float, float]
+    determined: bool
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What came of a fit.
+
+    Attributes:
+        session: The file.
+        world: Scenario that it started from.
+        scenario: That scenario with the fitted values.
+        parameters: All that were fitted.
+        ridges: Directions that the session leaves open.
+        would_tell: What else to record.
+        before, after: Joint to misfit.
+        search: What came of the search for a module, if there was one.
+        memory: Autocorrelation time of what is left, in samples; 1 is white noise.
+        iterations: Of the last fit.
+        converged: Whether it came to an end.
+        runs: Of the twin.
+        speed: Simulated seconds a second.
+    """
+
+    session: str
+    world: str
+    scenario: Scenario
+    parameters: tuple[Fitted, ...]
+    ridges: tuple[Ridge, ...]
+    would_tell: tuple[str, ...]
+    before: dict[str, Misfit]
+    after: dict[str, Misfit]
+    search: Search | None
+    memory: float
+    iterations: int
+    converged: bool
+    runs: int
+    speed: float
+
+
+def calibrate(
+    path: Path,
+    world: str | None = None,
+    wanted: Wanted | None = None,
+    *,
+    kernels: Kernels = Kernels.NUMPY,
+    on_tick: Callable[[], None] = lambda: None,
+    on_iteration: Callable[[int, float, float], None] = lambda _k, _rms, _speed: None,
+) -> Calibration:
+    """Fit the twin to a session.
+
+    Args:
+        path: The session: commands and joint states.
+        world: Scenario to start from, by name or file; the one it was recorded in if None.
+        wanted: What is to be fitted.
+        kernels: What computes the force laws.
+        on_tick: Called at every tick of every run; may raise to end the fit.
+        on_iteration: Told each iteration, the residuals' RMS [rad] and the real-time factor.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        UsageError: If no world is known, or what is wanted isn't there.
+        DataError: If the session has too little to fit.
+        SimulationError: If the twin fails with the starting values.
+        LogError: If the session can't be read.
+    """
+    wish = wanted or Wanted()
+    repetition = find_repetition(path, world)
+    driven, scenario = repetition.driven, repetition.scenario
+    open_ones = unknowns(scenario, spread=wish.spread, only=wish.only, delay=wish.delay)
+    if wish.module is not None:
+        open_ones = (*open_ones, module_unknown(scenario, wish.module, wish.spread))
+    settle_s = scenario.settle_s if wish.settle_s is None else wish.settle_s
+    with Session.open(path) as session:
+        measured = read_measured(session, settle_s, scenario.duration_s)
+    if strange := [name for name in measured.joints if name not in scenario.robot.joint_names]:
+        raise DataError(f"{path}: {scenario.robot.name} has no joint {', '.join(strange)}")
+    count = sum(map(len, measured.angles))
+    if count <= 2 * len(open_ones):
+        raise DataError(
+            f"{path}: {count} settled samples are too few for {len(open_ones)} unknowns"
+        )
+    answers = Answers(
+        scenario,
+        lambda: driven.make(scenario.robot, scenario),
+        measured,
+        kernels,
+        on_tick,
+    )
+
+    def told(k: int, rms: float) -> None:
+        on_iteration(k, rms, answers.speed)
+
+    first = solution = solve(answers, open_ones, on_iteration=told)
+    search = None
+    if wish.search:
+        search, with_module = find_weak_module(answers, first, wish.spread, told)
+        solution = with_module if search.named else first
+    return _calibration(path, answers, first, solution, search=search, within=wish.within)
+
+
+def _calibration(
+    path: Path,
+    answers: Answers,
+    first: Solution,
+    solution: Solution,
+    *,
+    search: Search | None,
+    within: float,
+) -> Calibration:
+    half = half_widths(solution.covariance)
+    parameters = [
+        _fitted(one, x, h, within)
+        for one, x, h in zip(solution.unknowns, solution.x.tolist(), half.tolist(), strict=True)
+    ]
+    return Calibration(
+        session=str(path),
+        world=answers.scenario.name,
+        scenario=with_values(answers.scenario, solution.unknowns, solution.x),
+        parameters=tuple(parameters),
+        ridges=ridges(solution.unknowns, solution.covariance),
+        would_tell=what_would_tell(
+            solution.unknowns, [i for i, one in enumerate(parameters) if not one.determined]
+        ),
+        before=_misfits(answers, first.before),
+        after=_misfits(answers, solution.after),
+        search=search,
+        memory=solution.memory,
+        iterations=solution.iterations,
+        converged=solution.converged,
+        runs=answers.runs,
+        speed=answers.speed,
+    )
+
+
+def _fitted(one: Unknown, x: float, half: float, within: float) -> Fitted:
+    # A dead time is no share of itself: 5 % of a control period stand for 5 %.
+    wide = one.value(half) * 100.0 if one.name == DELAY else float(np.expm1(half))
+    return Fitted(
+        name=one.name,
+        label=one.label,
+        unit=one.unit,
+        module=one.module,
+        start=one.start,
+        value=one.value(x),
+        ci95=(one.value(x - half), one.value(x + half)),
+        determined=wide <= within,
+    )
+
+
+def _misfits(answers: Answers, residuals: Sequence[np.ndarray]) -> dict[str, Misfit]:
+    measured = answers.measured
+    rows = zip(measured.joints, measured.times_s, measured.angles, residuals, strict=True)
+    return {joint: misfit(t, angle, angle - rest) for joint, t, angle, rest in rows}

@@ -1,0 +1,125 @@
+"""A calibration as files: the robot with its fitted servo, the scenario with the fitted ground.
+
+A robot description is what all modules are meant to be: a module that differs goes into the
+scenario's ``servo_of``, the ground is the scenario's, too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tomllib
+from pathlib import Path
+from typing import Any, cast
+
+from capture.errors import DataError
+from capture.part_file import part_file
+from capture.robot import Robot
+from capture.robot.description import parse_robot
+from sim.modules import Modules
+from sim.toml_text import toml_text
+
+from .fit import Calibration
+
+
+def robot_text(calibration: Calibration) -> str:
+    """The robot description with the fitted servo.
+
+    Args:
+        calibration: The fit.
+
+    Returns:
+        TOML; its comments say where it comes from, those of the former description are gone.
+
+    Raises:
+        DataError: If the scenario's robot has no description.
+    """
+    robot = calibration.scenario.robot
+    if not robot.toml:
+        raise DataError(f"{robot.name} has no description to put a servo into")
+    values: dict[str, Any] = tomllib.loads(robot.toml)
+    for joint in cast("list[dict[str, Any]]", values.get("joints", [])):
+        joint.pop("servo", None)
+    defaults = cast("dict[str, Any]", values.setdefault("defaults", {}))
+    # Of a joint that keeps to what all share; a module's own factor is taken out again.
+    factor = {one.module: one.value for one in calibration.parameters if one.module is not None}
+    first = robot.joints[0]
+    shared = dataclasses.replace(
+        first.servo, stall_torque=first.servo.stall_torque / factor.get(first.name, 1.0)
+    )
+    defaults["servo"] = dict(vars(shared))
+    head = [f"# {robot.name}, its servo fitted to {Path(calibration.session).name}."]
+    for one in calibration.parameters:
+        low, high = one.ci95
+        unit = "" if one.unit == "1" else f" {one.unit}"
+        known = "" if one.determined else "; not determined by this session"
+        head.append(f"# {one.label}: {one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}{known}")
+    text = "\n".join(head) + "\n" + toml_text(values)
+    parse_robot(text, "fitted robot", dict(robot.databases))  # it can be read back
+    return text
+
+
+def scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Path) -> str:
+    """The scenario in which the session can be run again.
+
+    Args:
+        calibration: The fit.
+        robot_file: Where the robot description is.
+        scenario_file: Where the scenario will be.
+
+    Returns:
+        TOML.
+    """
+    scenario = calibration.scenario
+    own = {
+        one.module: {
+            "stall_torque": scenario.robot.joints[
+                scenario.robot.joint_names.index(one.module)
+            ].servo.stall_torque
+        }
+        for one in calibration.parameters
+        if one.module is not None
+    }
+    named = dataclasses.replace(
+        scenario,
+        robot_name=os.path.relpath(robot_file, scenario_file.parent),
+        modules=Modules({}, own, scenario.modules.link_of),
+    )
+    return named.toml()
+
+
+def write_calibration(
+    calibration: Calibration, robot_file: Path, scenario_file: Path | None
+) -> None:
+    """Write the robot, and what its description lists, and the scenario if it is wanted.
+
+    Args:
+        calibration: The fit.
+        robot_file: The robot description.
+        scenario_file: The scenario, or None.
+
+    Raises:
+        DataError: If the robot has no description.
+        LogWriteError: If a file can't be written.
+    """
+    texts = {robot_file: robot_text(calibration)}
+    if scenario_file is not None:
+        texts[scenario_file] = scenario_text(calibration, robot_file, scenario_file)
+    for path, text in texts.items():
+        with part_file(path) as part:
+            part.write_text(text, encoding="utf-8")
+    _write_listed(calibration.scenario.robot, robot_file.parent)
+
+
+def _write_listed(robot: Robot, folder: Path) -> None:
+    """The DBC files and meshes that a description lists lie beside it; those there are left."""
+    listed = {
+        **{name: text.encode() for name, text in robot.databases},
+        **dict(robot.meshes),
+    }
+    for name, content in listed.items():
+        path = folder / name
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with part_file(path) as part:
+                part.write_bytes(content)

@@ -1,0 +1,169 @@
+"""What is fitted: x = ln(theta / theta_0), so that every parameter stays positive.
+
+The servo's parameters are shared by all modules, the ground's by all links; one module may have a
+stall torque of its own. A dead time is no parameter of the twin: it is fitted to the times of the
+samples, in units of its own prior deviation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from capture.arrays import FloatArray
+from capture.errors import UsageError
+from capture.robot import Servo
+from sim.scenario import Scenario
+from sim.world import FrictionLaw, Ground
+
+SERVO = {
+    "stall_torque": "N m",
+    "proportional_gain": "1/rad",
+    "coulomb_friction": "N m",
+    "viscous_friction": "N m s/rad",
+    "gear_stiffness": "N m/rad",
+    "gear_damping": "N m s/rad",
+}
+"""Shared servo parameters and their units."""
+
+_DRY = {"mu_tangential": "1", "mu_normal": "1"}
+_VISCOUS = {"drag_tangential": "N s/m", "drag_normal": "N s/m"}
+
+DELAY = "delay"
+DELAY_S = 0.02
+"""Prior standard deviation of the dead time [s]."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One entry of x.
+
+    Attributes:
+        name: A servo's or the ground's parameter, or :data:`DELAY`.
+        unit: SI.
+        start: theta_0; 0 for a dead time.
+        spread: Prior standard deviation of its entry of x.
+        module: The joint whose own parameter it is, as a factor on the shared one; None for all.
+    """
+
+    name: str
+    unit: str
+    start: float
+    spread: float
+    module: str | None = None
+
+    @property
+    def label(self) -> str:
+        """How it is called in text."""
+        words = self.name.replace("_", " ")
+        return words if self.module is None else f"{words} of {self.module}"
+
+    def value(self, x: float) -> float:
+        """Theta in its unit: of a module, its factor on the shared value."""
+        return DELAY_S * x if self.name == DELAY else self.start * math.exp(x)
+
+
+def unknowns(
+    scenario: Scenario, *, spread: float, only: Sequence[str] = (), delay: bool = False
+) -> tuple[Unknown, ...]:
+    """What can be fitted of a scenario.
+
+    Args:
+        scenario: Where the commands will be given; its servos identical.
+        spread: Prior standard deviation of each ln theta.
+        only: Names of the parameters wanted; all if empty.
+        delay: Fit a dead time, too.
+
+    Returns:
+        Those of its servos and of its ground that aren't 0: what is absent stays absent.
+
+    Raises:
+        UsageError: If the servos differ, or a name is none of them.
+    """
+    servos = {joint.servo for joint in scenario.robot.joints}
+    if len(servos) > 1:
+        raise UsageError(
+            f"{scenario.name}: its servos differ and shared parameters are to be fitted; leave out "
+            "servo_of and the joints' own servos"
+        )
+    (servo,) = servos
+    found: dict[str, tuple[str, float]] = {
+        name: (unit, float(getattr(servo, name))) for name, unit in SERVO.items()
+    }
+    ground = scenario.world.ground
+    if ground is not None:
+        of_law = _VISCOUS if ground.law is FrictionLaw.VISCOUS else _DRY
+        found |= {name: (unit, float(getattr(ground, name))) for name, unit in of_law.items()}
+    for name in only:
+        if name not in found:
+            raise UsageError(f"--only {name}: expected one of {', '.join(found)}")
+        if found[name][1] == 0.0:
+            raise UsageError(f"--only {name}: it is 0 in {scenario.name} and can't be scaled")
+    chosen = tuple(
+        Unknown(name, unit, value, spread)
+        for name, (unit, value) in found.items()
+        if value > 0.0 and (not only or name in only)
+    )
+    return (*chosen, Unknown(DELAY, "s", 0.0, 1.0)) if delay else chosen
+
+
+def module_unknown(scenario: Scenario, joint: str, spread: float) -> Unknown:
+    """The stall torque of one module, as a factor on that of all.
+
+    Args:
+        scenario: Where the commands will be given.
+        joint: Its joint.
+        spread: Prior standard deviation of the factor's logarithm.
+
+    Returns:
+        The unknown.
+
+    Raises:
+        UsageError: If there is no such joint.
+    """
+    names = scenario.robot.joint_names
+    if joint not in names:
+        raise UsageError(f"--module {joint}: {scenario.robot.name} has {', '.join(names)}")
+    return Unknown("stall_torque", "1", 1.0, spread, joint)
+
+
+def with_values(scenario: Scenario, wanted: Sequence[Unknown], x: FloatArray) -> Scenario:
+    """The scenario with other parameters.
+
+    Args:
+        scenario: With theta_0.
+        wanted: K unknowns.
+        x: Shape (K,).
+
+    Returns:
+        The scenario to run; its tables of modules are left as they were.
+    """
+    shared: dict[str, float] = {}
+    of_ground: dict[str, float] = {}
+    factor: dict[str, float] = {}
+    for one, entry in zip(wanted, x.tolist(), strict=True):
+        if one.module is not None:
+            factor[one.module] = one.value(entry)
+        elif one.name in SERVO:
+            shared[one.name] = one.value(entry)
+        elif one.name != DELAY:
+            of_ground[one.name] = one.value(entry)
+    joints = tuple(
+        dataclasses.replace(joint, servo=_servo(joint.servo, shared, factor.get(joint.name, 1.0)))
+        for joint in scenario.robot.joints
+    )
+    ground: Ground | None = scenario.world.ground
+    if ground is not None:
+        ground = dataclasses.replace(ground, **of_ground)
+    return dataclasses.replace(
+        scenario,
+        robot=dataclasses.replace(scenario.robot, joints=joints),
+        world=dataclasses.replace(scenario.world, ground=ground),
+    )
+
+
+def _servo(servo: Servo, shared: dict[str, float], factor: float) -> Servo:
+    given = dataclasses.replace(servo, **shared)
+    return dataclasses.replace(given, stall_torque=given.stall_torque * factor)
