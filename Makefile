@@ -7,6 +7,9 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 DEMO   := out/demo
 
+# The matrices are small: more threads of linear algebra only get in each other's way.
+export OPENBLAS_NUM_THREADS ?= 1
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow check format bench docs pictures lock clean
 
@@ -65,6 +68,7 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/record_buses.py
 	$(BIN)/python bench/live_view.py
 	$(BIN)/python bench/one_hour.py
+	$(BIN)/python bench/analyse_hour.py
 	$(BIN)/python bench/twin_step.py
 	$(BIN)/python bench/replay_convert.py 5
 

@@ -1,5 +1,6 @@
 """The manual: `make docs` builds it to docs/_build/html."""
 
+import sys
 from collections.abc import Callable
 from importlib.metadata import version as package_version
 from pathlib import Path
@@ -57,7 +58,16 @@ def _command_line_page() -> str:
     return "\n".join(parts)
 
 
+def _notebook_page() -> str:
+    """The example notebook, run anew."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    from notebook_page import executed_page
+
+    return executed_page()
+
+
 (Path(__file__).parent / "command-line.md").write_text(_command_line_page())
+(Path(__file__).parent / "notebook.md").write_text(_notebook_page())
 
 
 def setup(app: Sphinx) -> None:

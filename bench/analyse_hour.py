@@ -1,0 +1,132 @@
+"""An hour of the 25-joint snake, analysed and reported: time and memory of the commands.
+
+Each command runs as a process of its own, as a user starts it: wall-clock time from start to exit,
+and the peak of its resident memory, mapped file included. Processor time is printed beside, which
+other processes disturb less. The file is in the page cache; the best of several runs counts.
+
+Writing the hour takes longer than measuring it: with --keep the session stays where it is, and the
+next run with the same file measures it again.
+
+Run: python bench/analyse_hour.py [--minutes 60] [--runs 2] [--folder DIR | --keep FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+MIB = 1 << 20
+HOUR_S = 3600
+ANALYSE_S, ANALYSE_MIB, REPORT_S, PAGE_MIB = 10.0, 1.5e9 / MIB, 30.0, 3e6 / MIB
+"""The bars, for an hour."""
+
+
+class Cost(NamedTuple):
+    """What a command took.
+
+    Attributes:
+        wall_s: From start to exit.
+        processor_s: User and system time, all threads.
+        peak_mib: Largest resident memory.
+    """
+
+    wall_s: float
+    processor_s: float
+    peak_mib: float
+
+
+def cost(*words: str) -> Cost:
+    """Run one command line of ours.
+
+    Args:
+        words: After ``undulog``.
+
+    Returns:
+        What it took.
+    """
+    start = time.perf_counter()
+    child = subprocess.Popen([sys.executable, "-m", "undulog", *words], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(child.pid, 0)
+    took = time.perf_counter() - start
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"undulog {' '.join(words)} failed with exit code {child.returncode}")
+    return Cost(took, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / MIB)
+
+
+def verdict(what: str, value: float, bar: float, unit: str) -> bool:
+    """Print a figure beside its bar."""
+    good = value <= bar
+    print(f"{'PASS' if good else 'FAIL'}  {what}: {value:.2f} {unit} (bar: at most {bar:g} {unit})")
+    return good
+
+
+def measure(path: Path, part: float, runs: int) -> bool:
+    """Run both verbs and print; whether all bars are met.
+
+    Args:
+        path: The session.
+        part: Its length over an hour; the bars of time shrink with it.
+        runs: Of each verb.
+
+    Returns:
+        Whether all bars are met.
+    """
+    page = path.with_suffix(".html")
+    analysed = [cost("analyse", str(path)) for _ in range(runs)]
+    reported = [cost("report", str(path), "-o", str(page), "--force") for _ in range(runs)]
+    length = f"{part * 60:g} min"
+    good: list[bool] = []
+    for verb, costs, bar in (("analyse", analysed, ANALYSE_S), ("report", reported, REPORT_S)):
+        best = min(costs)
+        what = f"undulog {verb}, {length}"
+        good.append(verdict(what, best.wall_s, round(bar * part, 2), "s"))
+        print(f"      processor time {min(one.processor_s for one in costs):.2f} s")
+        peak = max(one.peak_mib for one in costs)
+        if verb == "analyse":
+            good.append(verdict(f"{what}, peak memory", peak, round(ANALYSE_MIB), "MiB"))
+        else:
+            print(f"      peak memory {peak:.0f} MiB")
+            size = page.stat().st_size / MIB
+            good.append(verdict(f"{what}, page", size, round(PAGE_MIB, 2), "MiB"))
+    return all(good)
+
+
+def write(path: Path, seconds: int) -> None:
+    """Write the session in another process, so that its memory is not this one's."""
+    code = (
+        "import sys; from pathlib import Path; from hour_session import write_session; "
+        "write_session(Path(sys.argv[1]), int(sys.argv[2]), can=False)"
+    )
+    folder = Path(__file__).parent
+    subprocess.run([sys.executable, "-c", code, str(path), str(seconds)], check=True, cwd=folder)
+
+
+def main() -> None:
+    """Write, measure, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--runs", type=int, default=2)
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--folder", type=Path, help="a folder with 1 GB to spare")
+    place.add_argument("--keep", type=Path, help="the session, written if it is not there")
+    options = parser.parse_args()
+    seconds = max(round(options.minutes * 60), 60)
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
+        if not path.exists():
+            write(path, seconds)
+        good = measure(path, seconds / HOUR_S, options.runs)
+    sys.exit(0 if good else 1)
+
+
+if __name__ == "__main__":
+    main()

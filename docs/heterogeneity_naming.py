@@ -1,0 +1,142 @@
+"""The second power table of docs/heterogeneity.md: is the right module named, whichever it is?
+
+Every module but the middle one in turn, its servo weakened: by 20, 10 or 5 % in the 25-joint twin
+(``weak-servo-pi3`` and its reverse), by 20 % in chains of 13 joints (7 yaw) with gaits, servos and
+ground drawn at random. The twin's noise is on the encoders only, so the two runs of a case are made
+once, and the noise of 6 + 6 runs is drawn 100 times.
+
+``.venv/bin/python docs/heterogeneity_naming.py`` prints it; it takes a quarter of an
+hour of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import runpy
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from heterogeneity_tables import LEVEL, WAYS
+
+from analysis import analyse_session
+from analysis.reversal import mirror_test
+from analysis.reversal_modules import weak_modules
+from capture import Session
+from sim import Wave, load_scenario, parse_scenario
+from sim.modules import Modules
+from sim.physics.engine import Kernels
+from sim.record import record
+
+WEAKENED = (0.2, 0.1, 0.05)
+SCATTER = (0.05, 0.1, 0.3)
+"""Of a run's lag [degrees], and of its log gain in the same measure."""
+
+SETS = 100
+
+CHAINS = Path(__file__).parents[1] / "tests" / "analysis" / "twin_chains.py"
+shared = runpy.run_path(str(CHAINS))
+
+
+def drawn(seed, folder):
+    """Two scenarios, a wave and its reverse, with a gait, servos and ground of their own."""
+    random = np.random.default_rng(seed)
+    frequency = random.uniform(0.4, 1.0)
+    numbers = {
+        "frequency_hz": frequency,
+        "amplitude": random.uniform(0.25, 0.45),
+        "lag": random.uniform(np.pi / 6, np.pi / 2),
+    }
+    ground = {
+        "mu_tangential": random.uniform(0.03, 0.1),
+        "mu_normal": random.uniform(0.3, 0.8),
+    }
+    text = shared["wave"](
+        duration_s=10 / frequency,
+        settle_s=5 / frequency,
+        gait={"ramp_s": 1.0},
+        horizontal=numbers,
+        world={"ground": ground},
+        servo={"stall_torque": random.uniform(0.2, 0.5)},
+    )
+    (folder / "chain.toml").write_text(shared["chain"](13))
+    forward = parse_scenario(text, folder / "random.toml")
+    plane, wave = next(iter(forward.gait.planes.items()))
+    turned = dataclasses.replace(wave, wave=Wave.TAIL_TO_HEAD)
+    gait = dataclasses.replace(forward.gait, planes={plane: turned})
+    return forward, dataclasses.replace(forward, gait=gait)
+
+
+def profile(scenario, weak, folder):
+    """Responses of the driven joints with one servo weakened: names, and y, shape (m,)."""
+    name, share = weak
+    stall = scenario.modules.servo["stall_torque"]
+    modules = Modules(scenario.modules.servo, {name: {"stall_torque": stall * (1 - share)}})
+    chosen = dataclasses.replace(scenario, modules=modules, robot=modules.fitted(scenario.robot))
+    record(chosen, folder / "run.mcap", kernels=Kernels.NUMBA, force=True)
+    with Session.open(folder / "run.mcap") as session:
+        joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
+    y = [np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints]
+    return [one.name for one in joints], np.array(y)
+
+
+def cases(ways, weakened, folder):
+    """Every driven module but the middle one: share and rate of being found and named."""
+    names, _ = profile(ways[0], (ways[0].robot.joints[0].name, 0.0), folder)
+    middle = names[len(names) // 2] if len(names) % 2 else None
+    for share in weakened:
+        for name in names:
+            if name == middle:
+                continue
+            runs = [profile(way, (name, share), folder)[1] for way in ways]
+            for scatter in SCATTER:
+                yield name, share, scatter, *rates(names, name, runs, np.radians(scatter))
+
+
+def rates(names, weak, ways, scatter, *, runs=6, seed=1):
+    """Shares of experiments in which a difference is found, and the weak module is named first."""
+    random = np.random.default_rng(seed)
+    found = named = 0
+    for _ in range(SETS):
+        noise = random.normal(0.0, scatter, (2, 2, runs, len(names)))
+        test = mirror_test(*(y + one[0] + 1j * one[1] for y, one in zip(ways, noise, strict=True)))
+        first = weak_modules(names, test)[:1]
+        found += test.p < LEVEL
+        named += bool(first) and first[0].name == weak
+    return found / SETS, named / SETS
+
+
+def table(title, ways_of, weakened, folder):
+    """Print one row for each weakening and scatter: mean rates, and the worst case."""
+    rows = defaultdict(list)
+    for label, ways in ways_of:
+        for name, share, scatter, found, named in cases(ways, weakened, folder):
+            rows[share, scatter].append((named, found, f"{label} {name}".strip()))
+    print(title)
+    for (share, scatter), seen in sorted(rows.items(), reverse=True):
+        named, found = (np.mean([one[k] for one in seen]) for k in (0, 1))
+        low = min(seen)
+        print(
+            f"  {100 * share:3.0f} %  {scatter:4.2f}°  {len(seen):3d} cases  found {found:6.1%}  "
+            f"named {named:6.1%}  worst {low[0]:4.0%} ({low[2]})",
+            flush=True,
+        )
+
+
+def main():
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=16, help="random chains of 13 joints")
+    draws = parser.parse_args().draws
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        long = [("", tuple(load_scenario(way) for way in WAYS))]
+        table("25 joints, 12 modules", long, WEAKENED, folder)
+        short = ((f"draw {seed}", drawn(seed, folder)) for seed in range(1, draws + 1))
+        table("13 joints, 6 modules, random gaits, servos and ground", short, WEAKENED[:1], folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""The figures of docs/oscillators.md: P in contact, its modes, and what they predict.
+
+``nice .venv/bin/python docs/oscillator_tables.py 5 9 13`` prints those of chains with so many yaw
+joints (every other joint is a yaw joint, as in snake25), ``13:1.5`` those with servos of 1.5 N m
+instead of 0.25 N m. Each chain takes 2 m + 6 runs of 20 s or more on the compiled twin: half a
+minute to one and a half.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from analysis.oscillators.comparator import homogeneous
+from analysis.oscillators.laplacian import spectrum
+
+shared = runpy.run_path(str(Path(__file__).parents[1] / "tests" / "analysis" / "closed_loop.py"))
+
+HELD_OUT = (0.05, 0.1, 0.15)
+
+
+def told(m, stall):
+    """Print the figures of one chain."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shared["write_chain"](folder, m, stall)
+        experiment = shared["open_loop"](folder, m, HELD_OUT)
+        print(f"{m} yaw joints, {stall} N m")
+        print("\n".join(f"  {line}" for line in coupling_lines(experiment.coupling)))
+        print(f"  {experiment.oscillators.answer}")
+        found = shared["closed_loop"](folder, experiment)
+        print(f"  closed loop, eps {shared['EPS']}, {found.t_s[-1]:.1f} s after a kick:")
+        print(f"    moved by {found.moved[-1]:.1%} of it; prediction off by {found.error[-1]:.1%}")
+        print(f"    of it, at most {found.error.max():.1%}", flush=True)
+
+
+def coupling_lines(coupling):
+    """What there is to say of P and R."""
+    P, R = (np.array(one.value) for one in (coupling.P, coupling.R))
+    diagonal = np.diag(P)
+    yield f"P, diagonal: {np.round(diagonal, 3)}"
+    yield f"  ends {diagonal[[0, -1]].mean():.3f}, inside {diagonal[1:-1].mean():.3f}"
+    yield f"  half widths up to {np.max(coupling.P.ci95_half):.1e}"
+    yield f"  next joint tailwards {np.round(np.diag(P, 1), 3)}"
+    yield f"  next joint headwards {np.round(np.diag(P, -1), 3)}"
+    yield f"  ||I - P|| {np.linalg.norm(np.eye(len(P)) - P):.3f}"
+    yield f"rows: P to {abs(P.sum(axis=1) - 1).max():.1e}, R to {abs(R.sum(axis=1)).max():.1e}"
+    for one in coupling.held_out:
+        better = one.error_kept / one.error
+        yield (
+            f"held out {one.size:.3f} rad: {one.error:.2%}, kept {one.error_kept:.2%}, "
+            f"{better:.1f} times better"
+        )
+    for label, matrix in (("P", P), ("homogeneous", homogeneous(P))):
+        found = spectrum(matrix)
+        rates = np.round(found.rates, 3)
+        yield f"{label}: slowest {found.gap:+.4f}, strong {found.strong}, rates {rates}"
+
+
+def main():
+    """Print the figures of every chain that is asked for."""
+    for word in sys.argv[1:] or ("5",):
+        m, _, stall = word.partition(":")
+        told(int(m), float(stall or 0.25))
+
+
+if __name__ == "__main__":
+    main()

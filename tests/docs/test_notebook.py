@@ -1,0 +1,42 @@
+"""The example notebook of the manual runs from the first cell to the last."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def page_module():
+    spec = importlib.util.spec_from_file_location("notebook_page", DOCS / "notebook_page.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_notebook_is_one_to_the_format_and_holds_no_outputs():
+    notebook = json.loads((DOCS / "notebook.ipynb").read_text())
+    assert notebook["nbformat"] == 4
+    ids = [cell["id"] for cell in notebook["cells"]]
+    assert len(set(ids)) == len(ids)
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+
+
+def test_a_cell_shows_what_it_prints_and_its_last_expression():
+    run_cell, names = page_module().run_cell, {}
+    assert run_cell("x = 2\nprint(x)", names) == ("2\n", None)
+    assert run_cell("x += 1\nx * 2", names) == ("", 6)
+    assert run_cell("", names) == ("", None)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_says_what_its_text_says():
+    page = page_module().executed_page()
+    assert "B differs from A: joint03 most" in page
+    assert "scenario.toml: servo_of.joint03.stall_torque: not set -> 0.2" in page
+    assert page.count("<figure") == 3
+    assert "```text\nTrue\n```" in page
+    assert "differences.parquet" in page
