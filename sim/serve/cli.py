@@ -67,8 +67,8 @@ def serve(
             first command, too.
         fast: With lockstep: don't keep to real time.
         fault: Something to go wrong, `KIND[:JOINT][:NUMBER][@FROM[+FOR]]`: `lost:joint07:0.1`,
-            `stuck:joint07@5`, `frozen:joint07@5`, `bus-off@5+2`, `noise:0.001`, `delay:0.02`. May
-            be repeated.
+            `stuck:joint07@5`, `frozen:joint07@5`, `over-current:joint07:1.5@5`, `bus-off@5+2`,
+            `noise:0.001`, `delay:0.02`. May be repeated.
         seed: Seed of noise and faults, instead of the scenario's.
         json: Print one JSON object a line: first that it is ready and where, at the end how it
             went.

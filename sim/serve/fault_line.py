@@ -77,21 +77,27 @@ class FaultLine:
             time_s: Time since the start [s].
 
         Returns:
-            The same, but for a frozen encoder its last angle.
+            The same, but for a frozen encoder its last angle, and for a servo with a winding
+            that draws too much that current.
         """
-        acting = [fault for fault in self._of[FaultKind.FROZEN] if fault.acts(time_s)]
-        if not acting:
+        frozen, drawing = (
+            [fault for fault in self._of[kind] if fault.acts(time_s)]
+            for kind in (FaultKind.FROZEN, FaultKind.OVER_CURRENT)
+        )
+        if not (frozen or drawing):
             return list(samples)
         told: list[SensorSample] = []
         for sample in samples:
             if not isinstance(sample, JointSample):
                 told.append(sample)
                 continue
-            position = sample.position.copy()
-            for fault in acting:
+            position, current = sample.position.copy(), sample.current.copy()
+            for fault in frozen:
                 i = self._joint[fault.joint]
                 position[i] = self._held.setdefault(fault, float(position[i]))
-            told.append(sample._replace(position=position))
+            for fault in drawing:
+                current[self._joint[fault.joint]] = fault.value
+            told.append(sample._replace(position=position, current=current))
         return told
 
     def hears(self, time_s: float) -> bool:

@@ -5,6 +5,7 @@ On the command line a fault is ``KIND[:JOINT][:NUMBER][@FROM[+FOR]]``, times in 
     lost:joint07:0.1      each reply of joint07 is lost with a probability of 0.1; lost:0.1: all
     stuck:joint07@5       from 5 s on the servo holds the angle that it has by then
     frozen:joint07@5+2    for 2 s its encoder tells the last angle again and again
+    over-current:joint07:1.5@5  from 5 s on the servo draws 1.5 A, and says so
     bus-off@5+2           for 2 s the robot is off the bus
     noise:0.001           each frame is hit with this probability: an error frame, then the frame
     delay:0.02            what the robot sends comes 0.02 s late
@@ -34,6 +35,7 @@ class FaultKind(StrEnum):
     LOST = "lost"
     STUCK = "stuck"
     FROZEN = "frozen"
+    OVER_CURRENT = "over-current"
     BUS_OFF = "bus-off"
     NOISE = "noise"
     DELAY = "delay"
@@ -55,6 +57,7 @@ _GRAMMAR = {
     FaultKind.LOST: _Grammar(None, ("a probability", 1.0)),
     FaultKind.STUCK: _Grammar(True, None),
     FaultKind.FROZEN: _Grammar(True, None),
+    FaultKind.OVER_CURRENT: _Grammar(True, ("a current in A", 100.0)),
     FaultKind.BUS_OFF: _Grammar(False, None),
     FaultKind.NOISE: _Grammar(False, ("a probability", 0.9)),  # frames are repeated until heard
     FaultKind.DELAY: _Grammar(False, ("a time in s", 10.0)),
@@ -72,7 +75,7 @@ class BusFault:
     Attributes:
         kind: What goes wrong.
         joint: The joint; empty for all, or for the whole bus.
-        value: A probability or a time [s], as the kind has it; 0 where it has none.
+        value: A probability, a current [A] or a time [s], as the kind has it; 0 where it has none.
         from_s: When it begins, after the start [s].
         for_s: How long it lasts [s].
     """

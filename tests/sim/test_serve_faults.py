@@ -33,6 +33,10 @@ lag = 0.5
         ("lost:0.5@2", BusFault(FaultKind.LOST, "", 0.5, 2.0)),
         ("stuck:joint01@5", BusFault(FaultKind.STUCK, "joint01", 0.0, 5.0)),
         ("frozen:joint25@5+2.5", BusFault(FaultKind.FROZEN, "joint25", 0.0, 5.0, 2.5)),
+        (
+            "over-current:joint07:1.5@5",
+            BusFault(FaultKind.OVER_CURRENT, "joint07", 1.5, 5.0),
+        ),
         ("bus-off@5+2", BusFault(FaultKind.BUS_OFF, "", 0.0, 5.0, 2.0)),
         ("noise:1e-3", BusFault(FaultKind.NOISE, "", 0.001)),
         ("delay:0.02", BusFault(FaultKind.DELAY, "", 0.02)),
@@ -54,6 +58,8 @@ def test_faults_on_the_command_line(text, fault):
         ("lost:jiont07:0.1", "did you mean joint07?"),
         ("lost:joint07:0.1:3", "3 is too much for lost"),
         ("stuck", "expected a joint"),
+        ("over-current:1.5", "expected a joint"),
+        ("over-current:joint07", "'' is not a current in A up to 100"),
         ("stuck:joint07:0.1", "0.1 is too much for stuck"),
         ("bus-off:joint07", "joint07 is too much for bus-off"),
         ("noise:0.95", "above 0 and up to 0.9"),
@@ -79,8 +85,8 @@ numbers = st.floats(1e-3, 0.9)
         st.builds(
             lambda kind, joint, value, from_s, for_s: BusFault(
                 kind,
-                joint if kind in ("stuck", "frozen") else "",
-                value if kind in ("lost", "noise", "delay") else 0.0,
+                joint if kind in ("stuck", "frozen", "over-current") else "",
+                value if kind in ("lost", "over-current", "noise", "delay") else 0.0,
                 from_s,
                 for_s,
             ),

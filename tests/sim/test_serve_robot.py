@@ -135,14 +135,14 @@ def running():
         each.close()
 
 
-def positions(robot, frames):
-    """Angles that frames of one cycle tell, in the order of the joints."""
+def positions(robot, frames, quantity=Quantity.POSITION):
+    """What frames of one cycle tell, by default angles, in the order of the joints."""
     samples, _ = BusDecoder(robot).decode(frames)
-    (found,) = [one for one in samples if one.signals[0].quantity is Quantity.POSITION]
+    (found,) = [one for one in samples if one.signals[0].quantity is quantity]
     order = [robot.joint_names.index(found.signals[k].target) for k in found.member]
-    angles = np.full(JOINTS, np.nan)
-    angles[order] = found.values
-    return angles
+    told = np.full(JOINTS, np.nan)
+    told[order] = found.values
+    return told
 
 
 def answer(angle, tick):
@@ -362,6 +362,21 @@ def test_a_frozen_encoder_tells_its_last_angle_and_a_stuck_servo_holds_it(robot)
     assert line.command(command, angle, 0.10).tolist() == [0.1, 0.3, 0.3, 0.3]
     assert line.command(-command, angle + 1, 0.15).tolist() == [0.1, -0.3, -0.3, -0.3]
     assert line.command(-command, angle, 0.20).tolist() == [-0.3] * 4
+
+
+def test_a_servo_that_draws_too_much_says_so_and_nothing_else_is_changed(robot):
+    clean, struck = (
+        cycles(robot, fault_line(robot, *faults), 30)
+        for faults in ((), ("over-current:joint02:1.5@0.1+0.1",))
+    )
+    for quantity in (Quantity.POSITION, Quantity.VELOCITY, Quantity.EFFORT, Quantity.CURRENT):
+        told, expected = (
+            np.array([positions(robot, frames, quantity) for frames in shown])
+            for shown in (struck, clean)
+        )
+        if quantity is Quantity.CURRENT:
+            expected[10:20, 1] = 1.5
+        np.testing.assert_array_equal(told, expected)
 
 
 def test_a_stuck_servo_does_not_follow_its_commands(scenario, robot, running):
