@@ -14,6 +14,7 @@ from .model import (
     SensorKind,
     Servo,
 )
+from .safety import OnFault, Safety
 
 __all__ = [
     "Bus",
@@ -22,9 +23,11 @@ __all__ = [
     "Direction",
     "Joint",
     "Link",
+    "OnFault",
     "Plane",
     "Quantity",
     "Robot",
+    "Safety",
     "Sensor",
     "SensorKind",
     "Servo",

@@ -17,7 +17,8 @@ A description has the head first::
 A ``[chain]`` with ``joints = 100`` and ``planes = ["horizontal", "vertical"]`` (taken in turn from
 the head) stands for ``joints`` of a long chain. ``links`` may be left out: then there is one more
 than joints, ``link01`` the head, all as the defaults say. ``[defaults.joint]``,
-``[defaults.servo]`` and ``[defaults.<sensor kind>]`` work the same way. In an entry of
+``[defaults.servo]`` and ``[defaults.<sensor kind>]`` work the same way. ``[safety]`` says how far
+the robot may be driven, ``[safety_of.joint07]`` what is otherwise for one joint. In an entry of
 ``bus.signals`` whose target is ``{joint}``, the entry stands for one a joint, and ``{joint}`` in
 its message and signal for that joint's name. The keys are the fields of the classes of
 :mod:`capture.robot`. Every fault of a file is reported at once.
@@ -39,6 +40,7 @@ from .chain_table import read_joints, read_links
 from .mesh import read_meshes
 from .model import ClockDomain, Robot
 from .repeated import note_repeated
+from .safety_table import read_safety
 from .sensor_table import read_sensors
 
 _SHELF = Shelf("robot", "capture.robot", "shipped", RobotFileError)
@@ -165,6 +167,7 @@ def _parse(
     bus, databases = None, ()
     if "bus" in top:
         bus, databases = read_bus(top.table("bus"), joints, sensors, read_database)
+    safety = read_safety(top, joints)
     meshes = () if read_mesh is None else read_meshes(links, faults, read_mesh)
     defaults.close()
     top.close()
@@ -182,4 +185,5 @@ def _parse(
         databases=databases,
         meshes=meshes,
         assumed=assumed,
+        safety=safety,
     )

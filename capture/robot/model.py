@@ -16,6 +16,7 @@ from enum import StrEnum
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, frozen
+from .safety import Safety
 
 
 class Plane(StrEnum):
@@ -249,6 +250,7 @@ class Robot:
         meshes: Mesh file name to bytes, likewise.
         assumed: Parts of the description (``links``, ``servo``, ``bus``, ...) that were assumed
             rather than known.
+        safety: How far it may be driven, or None.
     """
 
     name: str
@@ -262,6 +264,7 @@ class Robot:
     databases: tuple[tuple[str, str], ...] = ()
     meshes: tuple[tuple[str, bytes], ...] = field(default=(), repr=False)
     assumed: tuple[str, ...] = ()
+    safety: Safety | None = None
 
     @property
     def joint_names(self) -> tuple[str, ...]:

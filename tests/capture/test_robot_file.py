@@ -8,8 +8,19 @@ import pytest
 
 from capture import load_robot, robot_names
 from capture.errors import RobotFileError, UsageError
-from capture.robot import ClockDomain, Direction, Plane, Quantity, Sensor, SensorKind, Servo
+from capture.robot import (
+    ClockDomain,
+    Direction,
+    OnFault,
+    Plane,
+    Quantity,
+    Safety,
+    Sensor,
+    SensorKind,
+    Servo,
+)
 from capture.robot.description import parse_robot
+from capture.robot.safety import missing_limits, safety_example
 
 MINIMAL = """
 name = "worm"
@@ -205,7 +216,7 @@ assumed = ["postion"]
         "  joints and sensors: found 2 times joint01; valid: every name once",
         (
             "  clok: found an unknown key; valid: defaults, name, description, clock, assumed, "
-            "chain, joints, links, sensors, bus (did you mean clock?)"
+            "chain, joints, links, sensors, bus, safety, safety_of (did you mean clock?)"
         ),
     ]
 
@@ -391,3 +402,78 @@ def test_numbers_with_a_meaning_of_their_own_must_fit_the_signal():
     robot = parse_robot(MINIMAL + good, "worm.toml", {"worm.dbc": DBC})
     assert robot.bus is not None
     assert robot.bus.signals[0].unknown == -32768
+
+
+@pytest.mark.parametrize("name", ["snake25", "snake13", "snake13-planar"])
+def test_shipped_snakes_can_be_armed(name):
+    robot = load_robot(name)
+    assert missing_limits(robot) == ()
+    assert robot.safety is not None
+    assert robot.safety.on_fault is OnFault.RAMP_DOWN
+    rate = robot.safety.values("max_rate", robot.joint_names)
+    assert rate.tolist() == [4.0] * len(robot.joints)
+
+
+def test_safety_of_one_joint_may_be_otherwise():
+    text = (
+        MINIMAL
+        + """
+[safety]
+max_rate = 2.0
+fault_after_s = 0.1
+on_fault = "hold"
+
+[safety_of.joint02]
+max_rate = 1.0
+max_current = 0.5
+"""
+    )
+    safety = parse_robot(text, "worm.toml", {}).safety
+    assert safety == Safety(
+        max_rate=2.0,
+        fault_after_s=0.1,
+        on_fault=OnFault.HOLD,
+        of=(("joint02", "max_rate", 1.0), ("joint02", "max_current", 0.5)),
+    )
+    names = ("joint01", "joint02")
+    assert safety.values("max_rate", names).tolist() == [2.0, 1.0]
+    assert safety.values("max_current", names).tolist() == pytest.approx(
+        [math.nan, 0.5], nan_ok=True
+    )
+
+
+def test_what_arming_lacks_is_named_with_an_example():
+    bare = parse_robot(MINIMAL, "worm.toml", {})
+    assert bare.safety is None
+    always = ("max_rate", "ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
+    assert missing_limits(bare) == always  # it has no bus that tells currents
+    arm = load_robot("arcsnake-joint")
+    assert missing_limits(arm) == (*always, "max_current", "max_temperature")
+    # The example is a whole table: with it nothing is missing.
+    whole = parse_robot(f"{MINIMAL}\n{safety_example(missing_limits(bare))}", "worm.toml", {})
+    assert missing_limits(whole) == ()
+    # A limit that only one joint has is missing for the others.
+    single = MINIMAL + "[safety]\n[safety_of.joint01]\nmax_rate = 1.0\n"
+    assert "max_rate" in missing_limits(parse_robot(single, "worm.toml", {}))
+
+
+def test_faults_of_safety_are_told_together():
+    text = (
+        MINIMAL
+        + """
+[safety]
+max_rate = 0.0
+max_curent = 1.0
+on_fault = "jump"
+
+[safety_of.joint03]
+max_rate = 1.0
+"""
+    )
+    told = "\n".join(faults_of(text))
+    assert "safety.max_rate: found 0.0; valid: a finite number > 0" in told
+    assert "safety.max_curent: found an unknown key" in told
+    assert 'safety.on_fault: found "jump"; valid: hold, ramp-down' in told
+    assert "safety_of.joint03: found an unknown key" in told
+    alone = MINIMAL + "[safety_of.joint01]\nmax_rate = 1.0\n"
+    assert "safety_of: found a table; valid: leave it out" in "\n".join(faults_of(alone))
