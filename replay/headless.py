@@ -22,6 +22,8 @@ from .viewer import LOOPBACK, free_ports, viewer_binary
 _START_S = 60.0
 _REST_S = 30.0
 _LOOK_AGAIN_S = 0.2
+_GREETINGS_GONE = 8
+"""Equal pictures in a row of the empty window after which its greetings are over."""
 
 
 class HeadlessViewer:
@@ -43,12 +45,18 @@ class HeadlessViewer:
             self._process = subprocess.Popen(  # noqa: S603  our own arguments
                 [
                     str(viewer_binary()),
-                    *("--headless", *window, "--bind", LOOPBACK, "--port", str(port)),
+                    *("--headless", "--hide-welcome-screen", *window),
+                    *("--bind", LOOPBACK, "--port", str(port)),
                 ],
                 stdout=sink,
                 stderr=sink,
             )
         self._client = self._connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+        try:
+            self._let_greetings_pass()
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         """Nothing to do: it runs."""
@@ -79,6 +87,14 @@ class HeadlessViewer:
         self._client.open(str(recording.resolve()))
         while self._client.get_state().loading:
             time.sleep(_LOOK_AGAIN_S)
+        self.seek(seconds)
+
+    def seek(self, seconds: float) -> None:
+        """Stand still at another time.
+
+        Args:
+            seconds: Place on ``session_time`` [s].
+        """
         self._client.set_time(SESSION_TIME, duration=seconds, play_state="paused")
 
     @property
@@ -108,9 +124,23 @@ class HeadlessViewer:
             ConnectionError: If the view is behind a tab.
             UndulogError: If the picture doesn't come to rest.
         """
-        view_id = None if view is None else self.views[view].view_id
+        return self.picture_of(None if view is None else self.views[view].view_id)
+
+    def picture_of(self, view_id: str | None) -> bytes:
+        """A picture by a view's id, for many in a row.
+
+        Args:
+            view_id: As :attr:`views` has it, or None for the whole window.
+
+        Returns:
+            PNG.
+
+        Raises:
+            ConnectionError: If the view is behind a tab.
+            UndulogError: If the picture doesn't come to rest.
+        """
         deadline = time.monotonic() + _REST_S
-        last = b""
+        last = self._client.take_screenshot(view_id)
         while time.monotonic() < deadline:
             shot = self._client.take_screenshot(view_id)
             if shot == last:
@@ -118,6 +148,16 @@ class HeadlessViewer:
             last = shot
             time.sleep(_LOOK_AGAIN_S)
         raise UndulogError("the viewer's picture doesn't come to rest")
+
+    def _let_greetings_pass(self) -> None:
+        """Wait for the end of its notices, which lie over the first pictures and don't move."""
+        deadline = time.monotonic() + _REST_S
+        last, equal = b"", 0
+        while equal < _GREETINGS_GONE:
+            if time.monotonic() > deadline:
+                raise UndulogError("the headless viewer's notices don't go away")
+            shot = self._client.take_screenshot(max_size=64)
+            last, equal = shot, equal + 1 if shot == last else 0
 
     def _connect(self, address: str) -> ViewerClient:
         """Wait until it answers."""
