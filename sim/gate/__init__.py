@@ -1,0 +1,1 @@
+"""The safety gate: what stands between whoever drives and a robot's bus."""

@@ -1,0 +1,81 @@
+"""The last stage before the encoder: no command passes it that is beyond position or rate."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from capture.arrays import BoolArray, FloatArray
+
+from .limits import GateLimits
+
+_ROUNDING = 1e-12  # rad; a command that is off a limit in its last bits was not cut
+
+
+class Clamped(NamedTuple):
+    """A command that may be sent.
+
+    Attributes:
+        command: Joint angles [rad], shape (m,); finite, whatever was wanted.
+        by_position: Joints that were cut to their position limits, shape (m,).
+        by_rate: Joints that were held back to their greatest rate, shape (m,).
+        not_finite: Joints for which something was wanted that is no angle, shape (m,).
+    """
+
+    command: FloatArray
+    by_position: BoolArray
+    by_rate: BoolArray
+    not_finite: BoolArray
+
+
+class Clamp:
+    """Cuts commands to position limits, and their steps to the greatest rate.
+
+    It knows the command before, which the servos hold: a step is measured from there. The time
+    between two commands counts as one control period at most, so that what was late is caught up
+    step by step and never by a jump.
+    """
+
+    def __init__(self, limits: GateLimits, pose: FloatArray, period_s: float) -> None:
+        """Start from a pose.
+
+        Args:
+            limits: Position and rate limits.
+            pose: The angles that the joints have [rad], shape (m,); finite.
+            period_s: Control period [s].
+
+        Raises:
+            ValueError: If the pose isn't known.
+        """
+        if not np.isfinite(pose).all():
+            raise ValueError("the pose to start from has angles that are not known")
+        self._limits, self._period_s = limits, period_s
+        self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
+        """What was commanded last, at first the pose [rad], shape (m,)."""
+        self.cuts = dict.fromkeys(("by_position", "by_rate", "not_finite"), 0)
+        """Commands of single joints that were changed, by why."""
+
+    def apply(self, wanted: FloatArray, elapsed_s: float | None = None) -> Clamped:
+        """Make a command fit to be sent; it counts as sent.
+
+        Args:
+            wanted: Joint angles [rad], shape (m,); anything.
+            elapsed_s: Time since the last command [s]; a control period if None.
+
+        Returns:
+            The command, and what was changed.
+        """
+        limits = self._limits
+        finite = np.isfinite(wanted)
+        within = np.clip(np.where(finite, wanted, self.last), limits.lower, limits.upper)
+        step_s = self._period_s if elapsed_s is None else min(max(elapsed_s, 0.0), self._period_s)
+        reach = limits.rate * step_s
+        command = np.clip(within, self.last - reach, self.last + reach)
+        by_position = finite & (np.abs(within - wanted) > _ROUNDING)
+        by_rate = np.abs(command - within) > _ROUNDING
+        self.last = command
+        found = Clamped(command.copy(), by_position, by_rate, ~finite)
+        for why, joints in zip(self.cuts, found[1:], strict=True):
+            self.cuts[why] += int(joints.sum())
+        return found

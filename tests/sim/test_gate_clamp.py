@@ -1,0 +1,163 @@
+"""The gate's last stage: whatever is wanted, no command is beyond position or rate."""
+
+import dataclasses
+import math
+
+import cantools
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from capture import load_robot
+from capture.errors import UsageError
+from capture.robot import OnFault
+from sim.drive.loop import CommandEncoder
+from sim.gait import GaitTick
+from sim.gate.clamp import Clamp
+from sim.gate.ending import Ending
+from sim.gate.limits import gate_limits
+from sim.gate.ramp import Ramp
+from sim.gate.status import JointStatus
+from sim.gate.yielding import Yielding
+
+ROBOT = load_robot("snake25")
+LIMITS = gate_limits(ROBOT)
+PERIOD_S = 0.01
+STEP = math.radians(0.01)  # of a command on the bus of snake25
+ENCODER = CommandEncoder(ROBOT)
+MESSAGES = {
+    message.frame_id: message
+    for message in cantools.database.load_string(
+        dict(ROBOT.databases)["snake25.dbc"], "dbc"
+    ).messages
+}
+
+anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
+near = st.floats(-0.7, 0.7)
+wishes = st.lists(arrays(np.float64, 25, elements=anything | near), min_size=1, max_size=20)
+times = st.floats(allow_nan=False, min_value=-1.0, max_value=100.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(wishes, arrays(np.float64, 25, elements=st.floats(-0.6, 0.6)), st.lists(times, max_size=20))
+def test_no_sequence_of_wishes_gives_a_command_beyond_a_limit_on_the_bus(wanted, pose, elapsed):
+    clamp = Clamp(LIMITS, pose, PERIOD_S)
+    before = clamp.last
+    for k, wish in enumerate(wanted):
+        elapsed_s = elapsed[k] if k < len(elapsed) else None
+        command = clamp.apply(wish, elapsed_s).command
+        frames = ENCODER.frames(GaitTick(command, np.empty(0), "walk", ()))
+        # What another decoder finds in the frames.
+        sent = np.radians(
+            [
+                MESSAGES[int(f["id_flags"])].decode(bytes(f["data"][: f["dlc"]]))["position"]
+                for f in frames
+            ]
+        )
+        assert len(sent) == 25
+        assert (sent >= np.radians(-30) - 1e-9).all()
+        assert (sent <= np.radians(30) + 1e-9).all()
+        reach = 4.0 * PERIOD_S if elapsed_s is None else 4.0 * min(max(elapsed_s, 0.0), PERIOD_S)
+        assert (np.abs(command - before) <= reach + 1e-12).all()
+        assert (np.abs(sent - command) <= STEP / 2 + 1e-9).all()
+        before = command
+
+
+def test_what_is_within_the_limits_passes_bit_by_bit():
+    pose = np.zeros(25)
+    clamp = Clamp(LIMITS, pose, PERIOD_S)
+    for k in range(200):
+        wanted = 0.4 * np.sin(np.pi * k * PERIOD_S + np.arange(25)) * min(k / 100, 1.0)
+        found = clamp.apply(wanted)
+        np.testing.assert_array_equal(found.command, wanted)
+    assert clamp.cuts == {"by_position": 0, "by_rate": 0, "not_finite": 0}
+
+
+def test_cuts_are_told_by_joint_and_reason():
+    clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
+    wanted = np.zeros(25)
+    wanted[[3, 4, 5]] = 1.0, 0.3, np.nan
+    found = clamp.apply(wanted)
+    assert np.flatnonzero(found.by_position).tolist() == [3]
+    assert np.flatnonzero(found.by_rate).tolist() == [3, 4]
+    assert np.flatnonzero(found.not_finite).tolist() == [5]
+    assert found.command[[3, 4, 5]].tolist() == [0.04, 0.04, 0.0]
+    assert clamp.cuts == {"by_position": 1, "by_rate": 2, "not_finite": 1}
+
+
+def test_a_pose_that_is_not_known_is_no_start():
+    with pytest.raises(ValueError, match="not known"):
+        Clamp(LIMITS, np.full(25, np.nan), PERIOD_S)
+
+
+@given(
+    arrays(np.float64, 25, elements=near),
+    arrays(np.float64, 25, elements=near),
+    arrays(np.float64, 25, elements=st.floats(0.05, 5.0)),
+)
+def test_a_ramp_arrives_and_no_joint_is_faster_than_it_may(start, target, rate):
+    ramp = Ramp(start, target, rate)
+    np.testing.assert_array_equal(ramp.at(0.0), start if ramp.duration_s else ramp.at(0.0))
+    np.testing.assert_allclose(ramp.at(ramp.duration_s), target, atol=1e-15)
+    t = np.linspace(0.0, ramp.duration_s, 500)
+    way = np.array([ramp.at(each) for each in t])
+    if ramp.duration_s > 0:
+        assert (np.abs(np.diff(way, axis=0)).max(axis=0) / np.diff(t)[0] <= rate * (1 + 1e-6)).all()
+
+
+def told(angle, current=0.0):
+    count = len(LIMITS.joint_names)
+    unknown = np.full(count, np.nan)
+    return JointStatus(
+        np.broadcast_to(angle, count).copy(),
+        np.broadcast_to(current, count).copy(),
+        unknown,
+        unknown,
+        np.zeros(count),
+    )
+
+
+@pytest.mark.parametrize("how", list(OnFault))
+def test_an_ending_starts_where_the_joints_are(how):
+    limits = dataclasses.replace(LIMITS, on_fault=how)
+    last, angle = np.full(25, 0.2), np.full(25, 0.15)
+    angle[6] = -0.3  # blocked: 0.5 rad from where it was sent
+    angle[7] = np.nan
+    ending = Ending(limits, last, told(angle))
+    begin = last.copy()
+    begin[6] = -0.3
+    np.testing.assert_array_equal(ending.at(0.0), begin)
+    end = begin if how is OnFault.HOLD else np.zeros(25)
+    np.testing.assert_allclose(ending.at(ending.duration_s), end, atol=1e-15)
+    expected_s = 0.0 if how is OnFault.HOLD else 1.5 * 0.3 / 0.5
+    assert ending.duration_s == pytest.approx(expected_s + 0.2)
+
+
+def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():
+    limit = np.array([1.0, 1.0, np.nan])
+    yielding = Yielding(limit)
+    wanted, angle = np.array([0.3, 0.3, 0.3]), np.array([0.1, 0.1, np.nan])
+    current = np.array([8.0 * 0.2, 0.5, 5.0])  # of a stiff servo: proportional to the distance
+    pushed = []
+    for _ in range(40):
+        command = yielding.apply(wanted, angle, current)
+        current[0] = 8.0 * (command[0] - angle[0])
+        pushed.append(current[0])
+    assert max(pushed[3:]) <= 1.0 * 1.05  # it grows back until the limit is met again
+    assert min(pushed[3:]) > 0.5
+    assert command[1] == command[2] == 0.3  # untouched, bit by bit
+
+
+def test_limits_that_are_missing_are_named_with_an_example():
+    bare = dataclasses.replace(ROBOT, safety=None)
+    with pytest.raises(UsageError) as refused:
+        gate_limits(bare)
+    text = str(refused.value)
+    assert text.startswith(
+        "snake25 can't be armed: its description lacks max_rate, ramp_rate, max_tracking_error, "
+        "reply_timeout_s, max_late_s, max_current, max_temperature in [safety]"
+    )
+    assert "\n[safety]\nmax_rate = 4.0" in text
+    assert "min_voltage" not in text  # its bus doesn't tell voltages
