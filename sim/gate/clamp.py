@@ -53,7 +53,7 @@ class Clamp:
         self._limits, self._period_s = limits, period_s
         self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
         """What was commanded last, at first the pose [rad], shape (m,)."""
-        self.cuts = dict.fromkeys(("by_position", "by_rate", "not_finite"), 0)
+        self.cuts: dict[str, int] = {"by_position": 0, "by_rate": 0, "not_finite": 0}
         """Commands of single joints that were changed, by why."""
 
     def apply(self, wanted: FloatArray, elapsed_s: float | None = None) -> Clamped:
