@@ -16,13 +16,20 @@ from capture.bus.decoding import BusDecoder, DecodedSignals, FrameTally
 from capture.log.frames import FrameArray
 from capture.robot import Quantity, Robot
 
+from ..gate.status import JointStatus
 from ..readings import Readings
 
 OLDEST_S = 0.5
 """A value older than this counts as unknown [s]; the slowest sensors come several times in it."""
 
 _AXES = "xyz"
-_OF_JOINTS = (Quantity.POSITION, Quantity.VELOCITY)
+_OF_JOINTS = (
+    Quantity.POSITION,
+    Quantity.VELOCITY,
+    Quantity.CURRENT,
+    Quantity.TEMPERATURE,
+    Quantity.VOLTAGE,
+)
 _VECTORS = (Quantity.ACCELERATION, Quantity.MAGNETIC_FIELD)
 _TOLD = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
 
@@ -57,7 +64,6 @@ class BusReadings:
         self._vectors: dict[Quantity, dict[str, tuple[float, FloatArray]]] = {
             q: {} for q in _VECTORS
         }
-        self._last_s = -math.inf
         self.tally = FrameTally()
         """What became of the frames so far."""
 
@@ -70,21 +76,8 @@ class BusReadings:
         """
         samples, tally = self._decoder.decode(frames)
         self.tally.add(tally)
-        if samples:
-            self._last_s = time_s
         for decoded in samples:
             self._take(decoded, time_s)
-
-    def silence_s(self, time_s: float) -> float:
-        """How long the robot has said nothing.
-
-        Args:
-            time_s: Now, on the loop's clock [s].
-
-        Returns:
-            Time since the last frame with a value [s]; inf before the first.
-        """
-        return time_s - self._last_s
 
     def readings(self, time_s: float) -> Readings:
         """What is known.
@@ -96,10 +89,8 @@ class BusReadings:
             The newest values; NaN, or absent, what has not come or is too old.
         """
         since_s = time_s - self._oldest_s
-        angle, velocity = (
-            frozen(np.where(self._joint_times[q] >= since_s, values, np.nan))
-            for q, values in self._joint_values.items()
-        )
+        angle = self._newest(Quantity.POSITION, since_s)
+        velocity = self._newest(Quantity.VELOCITY, since_s)
         acceleration, field = (
             {name: vector for name, (at_s, vector) in self._vectors[q].items() if at_s >= since_s}
             for q in _VECTORS
@@ -107,20 +98,46 @@ class BusReadings:
         ranges = {name: value for name, (at_s, value) in self._ranges.items() if at_s >= since_s}
         return Readings(angle, velocity, ranges, acceleration, field)
 
+    def status(self, time_s: float) -> JointStatus:
+        """What is known of the servos.
+
+        Args:
+            time_s: Now, on the loop's clock [s].
+
+        Returns:
+            The newest values of each joint, NaN likewise, and how long it has been silent.
+        """
+        since_s = time_s - self._oldest_s
+        return JointStatus(
+            angle=self._newest(Quantity.POSITION, since_s),
+            current=self._newest(Quantity.CURRENT, since_s),
+            temperature=self._newest(Quantity.TEMPERATURE, since_s),
+            voltage=self._newest(Quantity.VOLTAGE, since_s),
+            silence_s=frozen(time_s - self._joint_times[Quantity.POSITION]),
+        )
+
+    def _newest(self, quantity: Quantity, since_s: float) -> FloatArray:
+        """A joint quantity, NaN where it is older."""
+        values, times = self._joint_values[quantity], self._joint_times[quantity]
+        return frozen(np.where(times >= since_s, values, np.nan))
+
     def _take(self, decoded: DecodedSignals, time_s: float) -> None:
         """Keep the values that are known; of several of one target the last one stays."""
         quantity, axis = decoded.signals[0].quantity, decoded.signals[0].axis
+        if quantity in self._joint_values:
+            own = np.array([self._joints[signal.target] for signal in decoded.signals])
+            known = ~np.isnan(decoded.values)
+            joints = own[decoded.member[known]]
+            self._joint_values[quantity][joints] = decoded.values[known]
+            self._joint_times[quantity][joints] = time_s
+            return
         members: list[int] = decoded.member.tolist()
         values: list[float] = decoded.values.tolist()
         for member, value in zip(members, values, strict=True):
             if math.isnan(value):
                 continue
             target = decoded.signals[member].target
-            if quantity in self._joint_values:
-                joint = self._joints[target]
-                self._joint_values[quantity][joint] = value
-                self._joint_times[quantity][joint] = time_s
-            elif quantity is Quantity.RANGE:
+            if quantity is Quantity.RANGE:
                 # REP 117: a reading beyond the greatest range means that nothing is in it.
                 beyond = value > self._range_max[target]
                 self._ranges[target] = time_s, math.inf if beyond else value

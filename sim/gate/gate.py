@@ -1,0 +1,370 @@
+"""The safety gate: one state machine for everything that is driven over a bus.
+
+::
+
+    reading the pose -> approach -> run -> done
+            |              |         |
+            |              +-> ending +-> done
+            +-> refused
+
+It is asked once a control tick what to send. Until the pose of every joint is known it sends
+nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
+(:mod:`sim.gate.clamp`). A fault or a request to stop leads to the ending that the robot's file
+names. It opens nothing and waits for nothing: what it knows it is told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from capture.arrays import FloatArray
+from capture.errors import SourceError, UsageError
+from capture.robot import OnFault
+
+from ..gait import Gait, GaitTick
+from ..readings import Readings
+from .clamp import Clamp, Clamped
+from .ending import Ending
+from .faults import MUTE, FaultKind, GateFault
+from .limits import GateLimits
+from .outcome import How, Outcome
+from .ramp import Ramp
+from .status import JointStatus
+from .watch import Watch
+from .yielding import Yielding
+
+POSE_S = 3.0
+"""So long the gate waits for the pose of every joint [s]."""
+
+_SHOWN = 8
+
+
+class Phase(StrEnum):
+    """What the gate is about."""
+
+    POSE = "reading the pose"
+    APPROACH = "approach"
+    RUN = "run"
+    ENDING = "ending"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What is known at a tick.
+
+    Attributes:
+        readings: For the gait.
+        status: For the gate.
+        trouble: What the bus itself told: bus-off, or somebody else's commands.
+        another_robot: Why this can't be the robot, None if it may be.
+        late_s: How late the tick is [s].
+        elapsed_s: Time since the tick before [s].
+    """
+
+    readings: Readings
+    status: JointStatus
+    trouble: GateFault | None = None
+    another_robot: str | None = None
+    late_s: float = 0.0
+    elapsed_s: float = 0.0
+
+
+class Remark(NamedTuple):
+    """Something to be logged: level and text."""
+
+    level: str
+    text: str
+
+
+class GateStep(NamedTuple):
+    """What to do at a tick.
+
+    Attributes:
+        phase: What the gate is about.
+        command: What to send, joint angles [rad], shape (m,); None: nothing.
+        wanted: What that was made from, before the gate changed anything; None likewise.
+        gait: What the gait said, while it runs.
+        remarks: What is worth a line in the log.
+    """
+
+    phase: Phase
+    command: FloatArray | None
+    wanted: FloatArray | None
+    gait: GaitTick | None
+    remarks: tuple[Remark, ...]
+
+
+class Gate:
+    """Asked once a tick; see the module."""
+
+    def __init__(
+        self,
+        gait: Gait,
+        limits: GateLimits,
+        *,
+        duration_s: float,
+        rate_hz: int,
+        place: str,
+        listen_s: float = 0.0,
+    ) -> None:
+        """Begin by reading the pose.
+
+        Args:
+            gait: Who wants to command.
+            limits: What the robot may do.
+            duration_s: Time of the gait's last tick.
+            rate_hz: Control ticks a second.
+            place: The bus, for messages.
+            listen_s: So long the bus is listened to at least before anything is sent [s].
+        """
+        self.phase = Phase.POSE
+        self.outcome: Outcome | None = None
+        """How it ended; None until it has."""
+        self.run_from: int | None = None
+        """The tick at which the gait began; None before."""
+        self.run_ticks = 0
+        """Ticks that the gait commanded."""
+        self.run_s = 0.0
+        """The gait's time [s]."""
+        self._gait, self._limits, self._place = gait, limits, place
+        self._rate_hz, self._listen_s = rate_hz, listen_s
+        self._last = round(duration_s * rate_hz)
+        self._watch, self._yielding = Watch(limits), Yielding(limits.current)
+        self._first: GaitTick | None = None
+        self._clamp: Clamp | None = None
+        self._way: Ramp | Ending | None = None
+        self._progress_s = 0.0
+        self._said: set[str] = set()
+        self._remarks: list[Remark] = []
+
+    @property
+    def cuts(self) -> dict[str, int]:
+        """How often commands of single joints were changed, by why."""
+        return dict(self._clamp.cuts) if self._clamp is not None else {}
+
+    @property
+    def joints_that_yielded(self) -> tuple[str, ...]:
+        """Joints whose commands gave way, as they drew too much."""
+        names = self._limits.joint_names
+        return tuple(name for name in names if f"yields {name}" in self._said)
+
+    def step(self, tick: int, heard: Heard, stop: str = "", *, at_once: bool = False) -> GateStep:
+        """Say what to do.
+
+        Args:
+            tick: Number of the control tick, from 0; never less than in the call before.
+            heard: What is known.
+            stop: Why it is to stop, one sentence; empty: go on.
+            at_once: Whether to stop without an ending.
+
+        Returns:
+            What to do; nothing more after the phase is done.
+
+        Raises:
+            SourceError: If the pose isn't known in time, or is no pose to start from.
+            UsageError: If another robot is there.
+        """
+        self._remarks = []
+        if not tick:
+            self._remark("info", f"gate: {Phase.POSE}")
+        clamp = self._clamp or self._begin(tick, heard, stop)
+        if clamp is None:
+            return self._quiet()
+        found = self._trouble(tick, heard, clamp)
+        if found is not None and (self.phase is not Phase.ENDING or found.kind in MUTE):
+            self._fail(found, clamp, heard.status)
+        elif at_once:
+            self._halt(stop)
+        elif stop and self.phase is not Phase.ENDING:
+            self.outcome = Outcome(How.STOPPED, stop, "")
+            self._end(clamp, heard.status)
+        if self.phase is Phase.DONE:
+            return self._quiet()
+        wanted, gait = self._wanted(tick, heard)
+        pulled = self._yielding.apply(wanted, heard.status.angle, heard.status.current)
+        given = clamp.apply(pulled, heard.elapsed_s)
+        self._tell_changes(given)
+        phase = Phase.ENDING if self.phase is Phase.DONE else self.phase
+        if self.phase is Phase.RUN and self.run_s * self._rate_hz >= self._last - 1e-6:
+            self.outcome = Outcome(How.COMPLETE, "", "the servos hold their last commands")
+            self._become(Phase.DONE)
+        return GateStep(phase, given.command, wanted, gait, tuple(self._remarks))
+
+    def lost(self, why: str) -> None:
+        """The bus can't be used any more: nothing more is sent.
+
+        Args:
+            why: What happened.
+        """
+        if self.outcome is None or self.outcome.how is not How.FAULT:
+            self.outcome = Outcome(
+                How.FAULT, why, "nothing more was sent", GateFault(FaultKind.BUS, why)
+            )
+        self.phase = Phase.DONE
+
+    # -- reading the pose ------------------------------------------------------------------
+
+    def _begin(self, tick: int, heard: Heard, stop: str) -> Clamp | None:
+        """Start from the pose, once it is known; None while it isn't."""
+        waited_s = tick / self._rate_hz
+        if heard.trouble is not None:
+            raise SourceError(self._place, f"nothing was sent: {heard.trouble.text}")
+        if stop:
+            self.outcome = Outcome(How.STOPPED, stop, "nothing was sent")
+            self.phase = Phase.DONE
+            return None
+        unknown = np.isnan(heard.status.angle)
+        if waited_s < self._listen_s or (unknown.any() and waited_s < POSE_S):
+            return None
+        if heard.another_robot is not None:
+            raise UsageError(f"{self._place}: nothing was sent: {heard.another_robot}")
+        names = self._limits.joint_names
+        if unknown.any():
+            silent = _listed(tuple(names[i] for i in np.flatnonzero(unknown)), len(names))
+            raise SourceError(
+                self._place,
+                f"nothing was sent: the pose is not known, {silent} told no angle within "
+                f"{waited_s:.2g} s; is the robot switched on, and does it report unasked?",
+            )
+        angle, limits = heard.status.angle, self._limits
+        beyond = np.maximum(limits.lower - angle, angle - limits.upper)
+        worst = int(np.argmax(beyond - limits.tracking_error))
+        if beyond[worst] > limits.tracking_error[worst]:
+            raise SourceError(
+                self._place,
+                f"nothing was sent: {names[worst]} is at {angle[worst]:.3f} rad, "
+                f"{beyond[worst]:.3f} rad beyond its limits; bring it back by hand",
+            )
+        clamp = self._clamp = Clamp(limits, angle, 1.0 / self._rate_hz)
+        first = self._first = self._gait.step(0.0, heard.readings)
+        target = np.clip(first.command, limits.lower, limits.upper)
+        target = np.where(np.isfinite(target), target, clamp.last)
+        far = np.abs(target - clamp.last)
+        if (far <= limits.ramp_rate / self._rate_hz).all():
+            self._run(tick)
+            return clamp
+        self._way, self._progress_s = Ramp(clamp.last, target, limits.ramp_rate), 0.0
+        joint = int(np.argmax(far))
+        self._become(
+            Phase.APPROACH,
+            f"{self._way.duration_s:.2g} s to the first pose, {names[joint]} has the longest way, "
+            f"from {clamp.last[joint]:.3f} to {target[joint]:.3f} rad",
+        )
+        return clamp
+
+    # -- what is wanted --------------------------------------------------------------------
+
+    def _wanted(self, tick: int, heard: Heard) -> tuple[FloatArray, GaitTick | None]:
+        """What the phase wants to be commanded."""
+        if self.phase is Phase.APPROACH and self._way is not None:
+            self._progress_s += self._step_s(heard)
+            if self._progress_s < self._way.duration_s:
+                return self._way.at(self._progress_s), None
+            self._run(tick)
+        if self.phase is Phase.ENDING and self._way is not None:
+            self._progress_s += self._step_s(heard)
+            if self._progress_s >= self._way.duration_s:
+                self._become(Phase.DONE)
+            return self._way.at(self._progress_s), None
+        run_tick = min(tick - (self.run_from or 0), self._last)
+        self.run_s = run_tick / self._rate_hz
+        self.run_ticks += 1
+        said, self._first = self._first, None
+        said = said or self._gait.step(self.run_s, heard.readings)
+        return said.command, said
+
+    def _step_s(self, heard: Heard) -> float:
+        """How far a ramp goes on in this tick: what was late is not made up for."""
+        return min(max(heard.elapsed_s, 0.0), 1.0 / self._rate_hz)
+
+    def _run(self, tick: int) -> None:
+        self.run_from = tick
+        self._become(Phase.RUN)
+
+    # -- what goes wrong -------------------------------------------------------------------
+
+    def _trouble(self, tick: int, heard: Heard, clamp: Clamp) -> GateFault | None:
+        if heard.trouble is not None:
+            return heard.trouble
+        if heard.late_s > self._limits.late_s:
+            text = (
+                f"a control tick was {heard.late_s:.2g} s late, more than {self._limits.late_s:g} s"
+            )
+            return GateFault(FaultKind.LATE, text, "", heard.late_s, self._limits.late_s)
+        return self._watch.look(tick / self._rate_hz, heard.status, clamp.last)
+
+    def _fail(self, fault: GateFault, clamp: Clamp, status: JointStatus) -> None:
+        self._remark("error", f"fault: {fault.text}")
+        if self.outcome is None or self.outcome.how is How.STOPPED:
+            self.outcome = Outcome(How.FAULT, fault.text, "", fault)
+        if fault.kind in MUTE:
+            self._halt(self.outcome.why)
+        else:
+            self._end(clamp, status)
+
+    def _end(self, clamp: Clamp, status: JointStatus) -> None:
+        """Begin the ending that the robot's file names."""
+        ending = Ending(self._limits, clamp.last, status)
+        self._way, self._progress_s = ending, 0.0
+        if self._limits.on_fault is OnFault.HOLD:
+            how = "the joints were held where they were"
+        else:
+            how = f"the joints were brought straight within {ending.duration_s:.2g} s"
+        if self.outcome is not None:
+            self.outcome = Outcome(self.outcome.how, self.outcome.why, how, self.outcome.fault)
+            self._become(Phase.ENDING, f"{self.outcome.why}; {self._limits.on_fault}")
+
+    def _halt(self, why: str) -> None:
+        """Send nothing from here on."""
+        before = self.outcome or Outcome(How.STOPPED, why, "")
+        self.outcome = Outcome(
+            before.how,
+            before.why,
+            "nothing more was sent; the servos hold their last commands",
+            before.fault,
+        )
+        self._become(Phase.DONE, "nothing is sent any more")
+
+    # -- telling ---------------------------------------------------------------------------
+
+    def _become(self, phase: Phase, detail: str = "") -> None:
+        self.phase = phase
+        self._remark("info", f"gate: {phase}" + (f", {detail}" if detail else ""))
+
+    def _remark(self, level: str, text: str) -> None:
+        self._remarks.append(Remark(level, text))
+
+    def _quiet(self) -> GateStep:
+        return GateStep(self.phase, None, None, None, tuple(self._remarks))
+
+    def _tell_changes(self, given: Clamped) -> None:
+        """Say once for each joint what the gate changes."""
+        limits, names = self._limits, self._limits.joint_names
+        reasons = (
+            ("cut", given.by_position, "command cut to the limits of the joint"),
+            ("rate", given.by_rate, "command held back to {rate:g} rad/s"),
+            ("nan", given.not_finite, "command is no number; the one before is held"),
+            (
+                "yields",
+                self._yielding.yields,
+                "draws more than {current:g} A: its command gives way",
+            ),
+        )
+        for key, joints, text in reasons:
+            for i in np.flatnonzero(joints).tolist():
+                if f"{key} {names[i]}" not in self._said:
+                    self._said.add(f"{key} {names[i]}")
+                    said = text.format(rate=limits.rate[i], current=limits.current[i])
+                    self._remark("warn", f"gate: {names[i]}: {said}")
+
+
+def _listed(names: tuple[str, ...], of: int) -> str:
+    if len(names) == of:
+        return f"all {of} joints"
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
