@@ -12,7 +12,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "sim": ("pybullet",),
     "mujoco": ("mujoco",),
     "numba": ("numba",),
-    "replay": ("rerun-sdk",),
+    "replay": ("rerun-sdk", "av"),
     "report": ("jinja2", "matplotlib"),
     "parquet": ("pyarrow",),
     "mf4": ("asammdf",),

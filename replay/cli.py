@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
 
 from capture.console import emit_json, progress, refuse_existing
 from capture.errors import UndulogError, UsageError
+
+from .clip_cli import ClipOptions, view_clip
 
 if TYPE_CHECKING:
     from analysis.result import Analysis
@@ -24,6 +28,8 @@ def view(
     save: Path | None = None,
     web: bool = False,
     connect: str | None = None,
+    clip: Path | None = None,
+    shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -45,10 +51,19 @@ def view(
         web: Serve the viewer to a browser on this machine (127.0.0.1 only) until interrupted.
         connect: With `--live`: send to a Rerun viewer that runs already, by its address, e.g.
             `rerun+http://127.0.0.1:9876/proxy`.
-        force: Replace the recording if it is there.
-        json: Print one JSON object: what was written and what is missing. Needs `--save`.
+        clip: Write a moving picture of the body to this `.gif` or `.mp4` file instead of opening
+            the viewer; it is drawn off screen.
+        shot: How the clip is filmed.
+        force: Replace the recording or the clip if it is there.
+        json: Print one JSON object: what was written and what is missing. Needs `--save` or
+            `--clip`.
     """
-    _check_usage(file, live, save=save, web=web, connect=connect, json=json)
+    _check_usage(file, live, save=save, web=web, connect=connect, clip=clip, json=json)
+    if shot is not None and clip is None:
+        raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
+    if clip is not None and file is not None:
+        view_clip(file, clip, shot or ClipOptions(), force=force, json=json)
+        return
     if save is not None:
         if save.suffix.lower() != ".rrd":
             raise UsageError(f"{save}: a Rerun recording; end its name in .rrd")
@@ -68,18 +83,23 @@ def _check_usage(
     save: Path | None,
     web: bool,
     connect: str | None,
+    clip: Path | None,
     json: bool,
 ) -> None:
     if (file is None) == (live is None):
         raise UsageError("give a session to see, or --live with the recorder's socket")
+    if clip is not None and (live is not None or save is not None or web):
+        raise UsageError("--clip films a session's file; give it without --live, --save and --web")
     if connect is not None and live is None:
         raise UsageError("--connect sends what is recorded now; give --live as well")
     if connect is not None and (web or save is not None):
         raise UsageError("--connect sends to a viewer; give it without --web and --save")
     if save is not None and web:
         raise UsageError("--save writes a file and --web serves one; give one of them")
-    if json and save is None:
-        raise UsageError("--json reports what --save wrote; give --save X.rrd as well")
+    if json and save is None and clip is None:
+        raise UsageError(
+            "--json reports what was written; give --save X.rrd or --clip X.mp4 as well"
+        )
 
 
 def _view_file(file: Path, *, save: Path | None, web: bool, json: bool) -> None:
