@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -73,6 +74,56 @@ class Driver:
         return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
 
 
+@contextmanager
+def open_session(
+    scenario: Scenario,
+    path: Path | str,
+    driver: Driver | None = None,
+    *,
+    kernels: Kernels = Kernels.NUMPY,
+    force: bool = False,
+) -> Generator[SessionWriter]:
+    """Create the session of a run, and finalise it after the block.
+
+    Args:
+        scenario: What is run.
+        path: The file to create.
+        driver: Who commands the joints; the scenario's own gait if None.
+        kernels: What computes the force laws.
+        force: Replace an existing file.
+
+    Yields:
+        The session, with everything that explains the run and no sample.
+
+    Raises:
+        OutputExistsError: If the file is there and ``force`` is not given.
+        LogWriteError: If the file can't be written.
+    """
+    with SessionWriter(
+        path,
+        session_id=_session_id(scenario, driver, kernels),
+        epoch_ns=scenario.epoch_ns,
+        robot=scenario.robot,
+        clock={"twin": ClockDomain.SIMULATED},
+        metadata={
+            **session_facts(scenario, kernels),
+            **(driver.facts if driver is not None else {}),
+        },
+        force=force,
+    ) as writer:
+        if driver is not None:
+            writer.explain(driver.attachments, driver.records)
+        yield writer
+
+
+def _session_id(scenario: Scenario, driver: Driver | None, kernels: Kernels) -> str:
+    session_id = scenario.session_id if driver is None else driver.session_id(scenario)
+    if kernels is Kernels.NUMPY:
+        return session_id
+    # Others round otherwise.
+    return hashlib.sha256(f"{session_id}\0{kernels}".encode()).hexdigest()[:32]
+
+
 def record(
     scenario: Scenario,
     path: Path | str,
@@ -106,26 +157,10 @@ def record(
         LogWriteError: If the file can't be written.
     """
     sample: Sample | None = None
-    session_id = scenario.session_id if driver is None else driver.session_id(scenario)
-    if kernels is not Kernels.NUMPY:  # they round otherwise
-        session_id = hashlib.sha256(f"{session_id}\0{kernels}".encode()).hexdigest()[:32]
     with (
         Twin(scenario, None if driver is None else driver.gait, kernels=kernels) as twin,
-        SessionWriter(
-            path,
-            session_id=session_id,
-            epoch_ns=scenario.epoch_ns,
-            robot=scenario.robot,
-            clock={"twin": ClockDomain.SIMULATED},
-            metadata={
-                **session_facts(scenario, kernels),
-                **(driver.facts if driver is not None else {}),
-            },
-            force=force,
-        ) as writer,
+        open_session(scenario, path, driver, kernels=kernels, force=force) as writer,
     ):
-        if driver is not None:
-            writer.explain(driver.attachments, driver.records)
         log = SessionLog(writer, twin)
         try:
             for sample in twin.samples():
@@ -155,7 +190,7 @@ def record(
             writer.set_verdict("degraded", [text])
     return Recording(
         path=Path(path),
-        session_id=session_id,
+        session_id=_session_id(scenario, driver, kernels),
         sample_count=sample.tick + 1,
         duration_s=sample.time_s,
         complete=complete,

@@ -46,6 +46,8 @@ class Sample(NamedTuple):
             arrive after the run, by :meth:`Twin.flush`.
         energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (23,).
         contact_s: For how long each link has touched an obstacle so far [s], shape (n,).
+        joint_energy: The part of each joint in it [J], rows as
+            :data:`sim.physics.energy_flows.JOINT_TERMS`, shape (9, m).
     """
 
     tick: int
@@ -54,6 +56,7 @@ class Sample(NamedTuple):
     sensed: list[SensorSample]
     energy: FloatArray
     contact_s: FloatArray
+    joint_energy: FloatArray
 
     @property
     def time_s(self) -> float:
@@ -144,8 +147,9 @@ class Twin:
             gait = gait._replace(command=quantised(gait.command, resolution))
             self._plant.command(gait.command)
             step = self._plant.now
-            energy, contact_s = self._ledger.read(step), self._ledger.contact_s
-            yield Sample(tick, gait, step, self.sensed, energy, contact_s)
+            ledger = self._ledger
+            booked = ledger.read(step), ledger.contact_s, ledger.joints
+            yield Sample(tick, gait, step, self.sensed, *booked)
 
     def flush(self) -> list[SensorSample]:
         """End the run, wherever it stands: sensor samples that have not arrived yet.
