@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ from cyclopts import Parameter
 from capture.console import emit_json, progress, refuse_existing
 from capture.errors import UndulogError, UsageError
 
+from .beside.options import BesideOptions
 from .clip_cli import ClipOptions, view_clip
 
 if TYPE_CHECKING:
@@ -21,19 +23,18 @@ if TYPE_CHECKING:
 
 
 def view(
-    file: Path | None = None,
-    /,
-    *,
+    *files: Path,
     live: Path | None = None,
     save: Path | None = None,
     web: bool = False,
     connect: str | None = None,
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
+    beside: Annotated[BesideOptions | None, Parameter(name="*")] = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
-    """See a session in Rerun: the body in space, its joints, power and response.
+    """See a session in Rerun, or several side by side: body, joints, power and response.
 
     Opens the viewer and waits until its window is closed. The recording that it shows is a cache:
     it can be made again from the session at any time. The session stays on this machine; the
@@ -41,10 +42,15 @@ def view(
 
     With `--live` it shows a session while it is recorded; the recorder never waits for it.
 
+    Several sessions lie in one view: bodies overlaid, plots of all of them, and the differences
+    of the others from the first.
+
     Example: `undulog view run.mcap --save run.rrd`
 
+    Robot and twin: `undulog view robot.mcap twin.mcap --align phase --names robot,twin`
+
     Args:
-        file: The session, `.mcap`.
+        files: The session, `.mcap`, or several.
         live: Instead of a file, the socket that a recorder on this machine sends to.
         save: Write the recording to this `.rrd` file instead of opening the viewer. Of what is
             recorded live, one session, when it has ended.
@@ -54,15 +60,18 @@ def view(
         clip: Write a moving picture of the body to this `.gif` or `.mp4` file instead of opening
             the viewer; it is drawn off screen.
         shot: How the clip is filmed.
+        beside: How several sessions are put side by side.
         force: Replace the recording or the clip if it is there.
         json: Print one JSON object: what was written and what is missing. Needs `--save` or
             `--clip`.
     """
-    _check_usage(file, live, save=save, web=web, connect=connect, clip=clip, json=json)
+    _check_usage(files, live, save=save, web=web, connect=connect, clip=clip, json=json)
+    if beside is not None and len(files) < 2:
+        raise UsageError(f"{', '.join(beside.given)}: of sessions side by side; give two or more")
     if shot is not None and clip is None:
         raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
-    if clip is not None and file is not None:
-        view_clip(file, clip, shot or ClipOptions(), force=force, json=json)
+    if clip is not None:
+        view_clip(files[0], clip, shot or ClipOptions(), force=force, json=json)
         return
     if save is not None:
         if save.suffix.lower() != ".rrd":
@@ -72,12 +81,16 @@ def view(
         from .live_cli import view_live
 
         view_live(live, save=save, web=web, connect=connect, json=json)
-    elif file is not None:
-        _view_file(file, save=save, web=web, json=json)
+    elif len(files) == 1:
+        _view_file(files[0], save=save, web=web, json=json)
+    else:
+        from .beside.cli import view_beside
+
+        view_beside(files, beside or BesideOptions(), save=save, web=web, json=json)
 
 
 def _check_usage(
-    file: Path | None,
+    files: Sequence[Path],
     live: Path | None,
     *,
     save: Path | None,
@@ -86,10 +99,10 @@ def _check_usage(
     clip: Path | None,
     json: bool,
 ) -> None:
-    if (file is None) == (live is None):
+    if bool(files) == (live is not None):
         raise UsageError("give a session to see, or --live with the recorder's socket")
-    if clip is not None and (live is not None or save is not None or web):
-        raise UsageError("--clip films a session's file; give it without --live, --save and --web")
+    if clip is not None and (live is not None or save is not None or web or len(files) > 1):
+        raise UsageError("--clip films one session's file, without --live, --save and --web")
     if connect is not None and live is None:
         raise UsageError("--connect sends what is recorded now; give --live as well")
     if connect is not None and (web or save is not None):

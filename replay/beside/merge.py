@@ -1,0 +1,57 @@
+"""Recordings of several sessions as one stream of chunks: columns are moved, never rows.
+
+Every entity gets its session's name in front, and a session whose zero isn't that of its own
+recording is moved along the timelines.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+
+from ..timeline import GAIT_CYCLE, SESSION_TIME
+
+_ARROW: Any = pa  # comes without types
+_CHUNK: Any = Chunk
+_PROPERTIES = "/__properties/**"
+
+
+def chunks_of(
+    recording: Path, entity: str, *, later_ns: int = 0, more_cycles: int = 0
+) -> LazyChunkStream:
+    """A recording's chunks under a path of their own.
+
+    Args:
+        recording: The .rrd file.
+        entity: Path to put in front of every entity's, e.g. ``/twin``.
+        later_ns: Added to ``session_time`` [ns].
+        more_cycles: Added to ``gait_cycle``.
+
+    Returns:
+        The stream, which reads when it is used. The recording's own properties are left out.
+    """
+    moves = {SESSION_TIME: later_ns, GAIT_CYCLE: more_cycles * 1_000_000_000}
+    moves = {timeline: by for timeline, by in moves.items() if by}
+
+    def placed(chunk: Chunk) -> Chunk:
+        chunk = chunk.with_entity_path(f"{entity}{chunk.entity_path}")
+        return chunk if chunk.is_static or not moves else _moved(chunk, moves)
+
+    return RrdReader(recording).stream().drop(content=_PROPERTIES).map(placed)
+
+
+def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
+    """A chunk further on along its timelines; rows that aren't on one stay off it."""
+    batch = chunk.to_record_batch()
+    for timeline, by in moves.items():
+        place = batch.schema.get_field_index(timeline)
+        if place >= 0:
+            field = batch.schema.field(place)
+            later = batch.column(place).to_numpy() + np.timedelta64(by, "ns")
+            batch = batch.set_column(place, field, _ARROW.array(later, field.type))
+    (moved,) = _CHUNK.from_record_batch(batch)
+    return moved

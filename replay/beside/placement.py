@@ -1,0 +1,159 @@
+"""Bodies of several sessions in one world.
+
+Where a robot's world has its origin is the choice of whoever tracked it, so by default the other
+bodies are laid on the first one: turned about the vertical and moved on the ground, so that middle
+and direction of the bodies are the same at the first moment that both sessions share. A body's
+direction is the mean of its links' directions, which doesn't swing with the head.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import FloatArray, IntArray
+from capture.robot.kinematics import link_poses, rotation_from_quaternion
+
+from ..motion import HeadPath
+from ..sampling import interpolate
+from ..tracks import resampled
+from .alignment import Align, Aligned, counterparts
+from .side import Side
+
+_LOOK_AT = 1000
+"""Samples of the head among which a first moment is looked for."""
+
+_ROTATION = 0.99
+"""A quaternion shorter than this is none."""
+
+_SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A turn about the vertical through the origin, then a step on the ground.
+
+    Attributes:
+        turn: Angle [rad].
+        x: Step [m].
+        y: Step [m].
+    """
+
+    turn: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Move points.
+
+        Args:
+            points: [m], shape (..., 3).
+
+        Returns:
+            [m], shape (..., 3).
+        """
+        cos, sin = math.cos(self.turn), math.sin(self.turn)
+        x, y, z = np.moveaxis(points, -1, 0)
+        return np.stack([cos * x - sin * y + self.x, sin * x + cos * y + self.y, z], axis=-1)
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The turn as x, y, z, w."""
+        return (0.0, 0.0, math.sin(self.turn / 2), math.cos(self.turn / 2))
+
+
+def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
+    """How one body is laid on another.
+
+    Args:
+        a: The session whose world stays.
+        b: The one that is moved.
+        how: What happens at once.
+
+    Returns:
+        The placement, or None where either has no body at any shared moment.
+    """
+    one, other = a.side.head, b.side.head
+    if one is None or other is None:
+        return None
+    at_ns, known = counterparts(a, b, how, one.t_ns)
+    shared = known & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1])
+    shared &= np.isfinite(_poses(one)).all(axis=1)
+    rows = np.flatnonzero(shared)[:_LOOK_AT]
+    here = _middle(a.side, one, one.t_ns[rows])
+    there = _middle(b.side, other, at_ns[rows])
+    both = np.flatnonzero(np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1))
+    if not both.size:
+        return None
+    (x, y, heading), (own_x, own_y, own_heading) = here[both[0]], there[both[0]]
+    turn = math.remainder(heading - own_heading, 2 * math.pi)
+    turned_x, turned_y, _ = Placement(turn)(np.array([own_x, own_y, 0.0])).tolist()
+    return Placement(turn, float(x - turned_x), float(y - turned_y))
+
+
+def told_placed(placed: Placement, name: str, first: str) -> str:
+    """A placement in words.
+
+    Args:
+        placed: The placement.
+        name: The session that is moved.
+        first: The one it is laid on.
+
+    Returns:
+        One sentence without its full stop.
+    """
+    step = math.hypot(placed.x, placed.y)
+    if step < _SAME_M and abs(placed.turn) < _SAME_RAD:
+        return f"{name} starts where {first} does"
+    return (
+        f"{name} is drawn where {first} starts: turned by {math.degrees(placed.turn):.1f}° about "
+        f"its origin and moved by ({placed.x:.3f}, {placed.y:.3f}) m"
+    )
+
+
+def head_distance(
+    a: Aligned, b: Aligned, how: Align, placed: Placement, t_ns: IntArray
+) -> FloatArray:
+    """How far the heads are from each other as they are drawn.
+
+    Args:
+        a: One session, with a head.
+        b: The other, with a head.
+        how: What happens at once.
+        placed: How ``b`` is moved.
+        t_ns: Times in ``a`` [Unix ns], shape (n,).
+
+    Returns:
+        Distance on the ground [m], shape (n,); NaN where either isn't known.
+    """
+    one, other = a.side.head, b.side.head
+    assert one is not None  # noqa: S101 - the caller drew both
+    assert other is not None  # noqa: S101
+    at_ns, known = counterparts(a, b, how, t_ns)
+    there = np.full((t_ns.size, 3), np.nan)
+    there[known] = placed(interpolate(other.t_ns, other.position, at_ns[known]))
+    apart = there - interpolate(one.t_ns, one.position, t_ns)
+    return np.asarray(np.hypot(apart[:, 0], apart[:, 1]), dtype=np.float64)
+
+
+def _poses(head: HeadPath) -> FloatArray:
+    return np.concatenate([head.position, head.quaternion], axis=1)
+
+
+def _middle(side: Side, head: HeadPath, t_ns: IntArray) -> FloatArray:
+    """Middle of the body on the ground [m] and its direction [rad], shape (n, 3)."""
+    robot = side.robot
+    assert robot is not None  # noqa: S101 - a head is read of a robot
+    pose = interpolate(head.t_ns, _poses(head), t_ns)
+    norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    # Between q and -q, which are the same pose, the straight line leaves the rotations.
+    quaternion = np.where(norm > _ROTATION, pose[:, 3:] / norm, np.nan)
+    names = robot.joint_names
+    angles = resampled(side.measured, names, t_ns, interpolate)
+    known = {track.name for track in side.measured}
+    angles[:, [name not in known for name in names]] = 0.0  # drawn up to there, but it has a middle
+    centre, rotation = link_poses(robot, pose[:, :3], rotation_from_quaternion(quaternion), angles)
+    middle, forward = centre.mean(axis=1), rotation[..., 0].mean(axis=1)
+    return np.column_stack([middle[:, :2], np.arctan2(forward[:, 1], forward[:, 0])])
