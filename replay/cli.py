@@ -67,7 +67,7 @@ def view(
     """
     _check_usage(files, live, save=save, web=web, connect=connect, clip=clip, json=json)
     if beside is not None and len(files) < 2:
-        raise UsageError(f"{', '.join(beside.given)}: of sessions side by side; give two or more")
+        raise UsageError(f"{', '.join(beside.given)}: needs two sessions or more, side by side")
     if shot is not None and clip is None:
         raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
     if clip is not None:
