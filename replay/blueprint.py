@@ -1,4 +1,7 @@
-"""The layout: body on the left, plots on the right, made for a laptop's 1440 x 900."""
+"""The layout, made for a laptop's 1440 x 900: a tab each for session, cycles and mean cycle.
+
+In the session's the body is on the left and plots are on the right.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import rerun.blueprint as rrb
 
 from .content import Content
 from .timeline import SESSION_TIME
-from .views import build_views
+from .views import Views, build_views
 
 
 def build_blueprint(content: Content) -> rrb.Blueprint:
@@ -22,6 +25,23 @@ def build_blueprint(content: Content) -> rrb.Blueprint:
         following the end of what still grows.
     """
     views = build_views(content)
+    tabs = [_session(content, views)]
+    if views.maps or views.steps:
+        rows = [rrb.Horizontal(*row) for row in (views.maps, views.steps) if row]
+        tabs.append(rrb.Vertical(*rows, row_shares=[1.35, 1.0][: len(rows)], name="Cycles"))
+    if views.mean_plots and views.mean_words is not None:
+        tabs.append(_mean(views, views.mean_words))
+    return rrb.Blueprint(
+        tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        _time_panel(content),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _session(content: Content, views: Views) -> rrb.Container:
     # A mode that never changes isn't worth a lane of its own.
     lane = [views.mode] if views.mode is not None and content.modes > 1 else []
     words = [*views.words, *([views.mode] if views.mode is not None and not lane else [])]
@@ -32,31 +52,35 @@ def build_blueprint(content: Content) -> rrb.Blueprint:
     if views.bars:
         plots.append(rrb.Horizontal(*views.bars))
         heights.append(3.0)
-    root: rrb.Container
     if views.scene is None:
         shares = [*heights, *[0.8] * len(lane), 2.0]
-        root = rrb.Vertical(*plots, *lane, _tabs(words), row_shares=shares)
-    else:
-        shares = [3.2, *[0.62] * len(lane), 1.1]
-        left = rrb.Vertical(views.scene, *lane, _tabs(words), row_shares=shares)
-        root = rrb.Horizontal(
-            left, rrb.Vertical(*plots, row_shares=heights), column_shares=[1.1, 1.0]
-        )
-    return rrb.Blueprint(
-        root,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        _time_panel(live=content.live),
-        auto_views=False,
-        auto_layout=False,
-    )
+        return rrb.Vertical(*plots, *lane, _tabs(words), row_shares=shares, name="Session")
+    shares = [3.2, *[0.62] * len(lane), 1.1]
+    left = rrb.Vertical(views.scene, *lane, _tabs(words), row_shares=shares)
+    right = rrb.Vertical(*plots, row_shares=heights)
+    return rrb.Horizontal(left, right, column_shares=[1.1, 1.0], name="Session")
 
 
-def _time_panel(*, live: bool) -> rrb.TimePanel:
-    if live:
+def _mean(views: Views, words: rrb.TextDocumentView) -> rrb.Container:
+    first, *others = views.mean_plots
+    plots = [first, _tabs(others)] if others else [first]
+    right = rrb.Vertical(*plots)
+    left = words
+    if views.mean_scene is not None:
+        left = rrb.Vertical(views.mean_scene, words, row_shares=[2.6, 1.0])
+    return rrb.Horizontal(left, right, column_shares=[1.1, 1.0], name="Mean cycle")
+
+
+def _time_panel(content: Content) -> rrb.TimePanel:
+    if content.live:
         return rrb.TimePanel(state="collapsed", timeline=SESSION_TIME, play_state="following")
     return rrb.TimePanel(
-        state="collapsed", timeline=SESSION_TIME, play_state="playing", loop_mode="all"
+        state="collapsed",
+        timeline=SESSION_TIME,
+        play_state="playing",
+        loop_mode="all",
+        # The one timeline of numbers is that of the mean cycle's degrees: at the gait's own speed.
+        fps=None if content.mean is None else 360.0 / content.mean.period_s,
     )
 
 

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 
 from capture.robot import Robot
 
+from .cycles import Quantity
+from .heat_maps import HeatMap
 from .joints import Places, Series
+from .mean_cycle import MeanCycle
 from .response import Chart
 
 
@@ -58,6 +61,9 @@ class Content:
         has_events: Whether events were written.
         signals: Further quantities of the joints.
         live: Whether it still grows: the views follow its end.
+        cycles: Quantities that were written cycle by cycle, each with where.
+        maps: Maps of segments against cycles.
+        mean: The mean cycle, or None.
     """
 
     robot: Robot | None
@@ -74,3 +80,6 @@ class Content:
     has_events: bool
     signals: tuple[Signal, ...]
     live: bool = False
+    cycles: tuple[tuple[Quantity, tuple[Series, ...]], ...] = ()
+    maps: tuple[HeatMap, ...] = ()
+    mean: MeanCycle | None = None

@@ -1,7 +1,7 @@
-"""The views: the body, and plots of a stretch about the time cursor.
+"""The views: the body, plots of a stretch about the time cursor, cycles, and the mean cycle.
 
-A plot of a whole hour is slow and shows nothing, so every plot has a window. Only what the session
-holds gets a view.
+A plot of a whole hour of samples is slow and shows nothing, so every such plot has a window; what
+has one value a cycle is plotted whole. Only what the session holds gets a view.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from rerun.encodings import EntityPathLike
 
 from capture.robot import Plane, Robot
 
-from . import body, facts, gait, joints, power, trail
+from . import body, facts, gait, joints, mean_cycle, power, trail
 from .content import Content, Start
+from .heat_maps import VISIBLE
 from .joints import Series
 from .response import SEGMENTS
 from .timeline import GAIT_CYCLE, SESSION_TIME
 
 BEFORE_CURSOR_S = 4.0
 AFTER_CURSOR_S = 2.0
+
+_BACKGROUND = rrb.Background(color=(16, 18, 22, 255))
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,11 @@ class Views:
         angles: Joint angles.
         effort: Power and whatever else the joints report.
         bars: Response of each joint.
+        maps: Segments against cycles.
+        steps: Cycle by cycle.
+        mean_scene: The body in the mean cycle, or None.
+        mean_words: What the mean cycle is.
+        mean_plots: Its angles and power.
     """
 
     scene: rrb.Spatial3DView | None
@@ -46,12 +54,19 @@ class Views:
     angles: tuple[rrb.View, ...]
     effort: tuple[rrb.View, ...]
     bars: tuple[rrb.View, ...]
+    maps: tuple[rrb.View, ...] = ()
+    steps: tuple[rrb.View, ...] = ()
+    mean_scene: rrb.Spatial3DView | None = None
+    mean_words: rrb.TextDocumentView | None = None
+    mean_plots: tuple[rrb.View, ...] = ()
 
     @property
     def all(self) -> tuple[rrb.View, ...]:
         """Every view, in reading order."""
-        single = tuple(view for view in (self.scene, self.mode) if view is not None)
-        return (*single, *self.words, *self.angles, *self.effort, *self.bars)
+        session = (self.scene, self.mode, *self.words, *self.angles, *self.effort, *self.bars)
+        mean = (self.mean_scene, self.mean_words, *self.mean_plots)
+        found = (*session, *self.maps, *self.steps, *mean)
+        return tuple(view for view in found if view is not None)
 
 
 def build_views(content: Content) -> Views:
@@ -78,6 +93,13 @@ def build_views(content: Content) -> Views:
         angles=tuple(angles),
         effort=tuple(effort),
         bars=tuple(_bar_views(content)),
+        maps=tuple(_map_views(content)),
+        steps=tuple(_step_views(content)),
+        mean_scene=_mean_scene(content),
+        mean_words=None
+        if content.mean is None
+        else rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT]),
+        mean_plots=tuple(_mean_plots(content)),
     )
 
 
@@ -119,14 +141,38 @@ def _body_view(content: Content, start: Start) -> rrb.Spatial3DView:
         name=body_title(content),
         origin="/world",
         eye_controls=eye,
-        background=rrb.Background(color=(16, 18, 22, 255)),
-        line_grid=rrb.LineGrid3D(
-            visible=True,
-            spacing=_grid_spacing(span),
-            stroke_width=1.0,
-            color=(255, 255, 255, 12),
-        ),
+        background=_BACKGROUND,
+        line_grid=_grid(span),
         overrides={trail.TRAIL: rrb.VisibleTimeRanges([tail_time])},
+    )
+
+
+def _mean_scene(content: Content) -> rrb.Spatial3DView | None:
+    if content.mean is None or not content.mean.has_body or content.robot is None:
+        return None
+    span = sum(link.length for link in content.robot.links)
+    # The frame goes along with the body: its middle stays where it is.
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=(-0.35 * span, -0.6 * span, 0.75 * span),
+        look_target=(0.0, 0.0, 0.0),
+        eye_up=(0.0, 0.0, 1.0),
+    )
+    return rrb.Spatial3DView(
+        name="Mean cycle: body",
+        origin=mean_cycle.BODY,
+        eye_controls=eye,
+        background=_BACKGROUND,
+        line_grid=_grid(span),
+    )
+
+
+def _grid(span: float) -> rrb.LineGrid3D:
+    return rrb.LineGrid3D(
+        visible=True,
+        spacing=_grid_spacing(span),
+        stroke_width=1.0,
+        color=(255, 255, 255, 12),
     )
 
 
@@ -168,6 +214,47 @@ def _bar_views(content: Content) -> list[rrb.View]:
     ]
 
 
+def _map_views(content: Content) -> list[rrb.View]:
+    return [
+        rrb.Spatial2DView(
+            name=shown.title,
+            origin=shown.entity,
+            visual_bounds=rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1]),
+        )
+        for shown in content.maps
+    ]
+
+
+def _step_views(content: Content) -> list[rrb.View]:
+    return [
+        _whole_plot(f"{quantity.name} by cycle [{quantity.unit}]", [one.entity for one in series])
+        for quantity, series in content.cycles
+    ]
+
+
+def _mean_plots(content: Content) -> list[rrb.View]:
+    mean = content.mean
+    if mean is None:
+        return []
+    found: list[rrb.View] = []
+    if mean.has_places:
+        corner = rrb.Corner2D.LeftBottom  # where a sine isn't
+        contents = [f"{mean_cycle.PLACES}/**"]
+        found.append(_whole_plot("Mean angle [°]", contents, legend=corner))
+    plane = None if content.places is None else content.places.plane
+    names = None if plane is None else _names(content.robot, plane)
+    for title, series in (
+        ("Mean angle of all joints [°]", mean.measured),
+        ("Mean error [°]", mean.error),
+        ("Mean power [W]", mean.power),
+    ):
+        if series:
+            shown = None if series is mean.power else names
+            contents = [one.entity for one in series]
+            found.append(_whole_plot(title, contents, overrides=_lines(series, shown)))
+    return found
+
+
 def _angle_views(content: Content) -> list[rrb.View]:
     views: list[rrb.View] = []
     if content.places is not None:
@@ -199,7 +286,14 @@ def _joint_plot(
     title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
     """A line a joint; ``names`` chooses the lines that are visible at first."""
-    overrides: dict[EntityPathLike, rrb.Visualizer] = {
+    contents = [one.entity for one in series]
+    return _plot(title, contents, overrides=_lines(series, names), legend=legend)
+
+
+def _lines(
+    series: Sequence[Series], names: set[str] | None
+) -> dict[EntityPathLike, rrb.Visualizer]:
+    return {
         one.entity: rr.SeriesLines.from_fields(
             visible_series=[names is None or name in names for name in one.names]
         ).visualizer(
@@ -213,7 +307,22 @@ def _joint_plot(
         )
         for one in series
     }
-    return _plot(title, [one.entity for one in series], overrides=overrides, legend=legend)
+
+
+def _whole_plot(
+    title: str,
+    contents: list[str],
+    *,
+    overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
+    legend: rrb.Corner2D | None = None,
+) -> rrb.TimeSeriesView:
+    """All there is on its timeline, whatever the cursor does."""
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=contents,
+        overrides=overrides,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+    )
 
 
 def _plot(
