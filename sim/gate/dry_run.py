@@ -27,6 +27,7 @@ from ..record import Driver, open_session
 from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from ..scenario_file import parse_scenario
 from ..session_log import SessionLog
+from ..stability import warnings
 from ..twin import Twin
 from .dry_run_gait import GatedGait
 from .dry_run_tally import Demand, JointDemand
@@ -45,6 +46,7 @@ amplitude = 0.0
 frequency_hz = 1.0
 lag = 0.0
 """
+_FASTEST_HZ = 16_000  # physics; an hour there takes hours
 _NO_LIMIT = {"min_voltage": -math.inf}
 
 
@@ -141,6 +143,7 @@ class DryRun:
 def dry_run(
     driven: Driven,
     *,
+    robot: Robot | None = None,
     world: Scenario | None = None,
     duration_s: float | None = None,
     output: Path | None = None,
@@ -152,6 +155,7 @@ def dry_run(
 
     Args:
         driven: What to drive.
+        robot: On which robot; the one that it was made for if None.
         world: Where; by default the world that it was made for, and flat ground if that is not
             known.
         duration_s: How long [s]; its own length if None.
@@ -169,7 +173,9 @@ def dry_run(
         OutputExistsError: If the session is there and ``force`` is not given.
         LogWriteError: If the session can't be written.
     """
-    where = world or driven.world() or nominal_world(driven.robot)
+    where = world or driven.world() or nominal_world(robot or driven.robot)
+    if robot is not None:
+        where = dataclasses.replace(where, robot=where.modules.fitted(robot))
     planned = driven.scenario(where, duration_s)
     robot = planned.robot
     missing = missing_limits(robot)
@@ -222,7 +228,7 @@ def dry_run(
         duration_s=gate.run_s,
         joints=gait.tally.joints(),
         first_pose=first,
-        approach_s=_approach_s(first, limits),
+        approach_s=math.nan if "ramp_rate" in missing else _approach_s(first, limits),
         cut=gait.inner.cut,
         missing=missing,
         fault=None if outcome is None else outcome.fault,
@@ -240,10 +246,13 @@ def nominal_world(robot: Robot) -> Scenario:
         robot: The robot.
 
     Returns:
-        A scenario in which nothing moves by itself.
+        A scenario in which nothing moves by itself, at a physics rate that the robot's gears need.
     """
     text = _NOMINAL.format(robot=robot.name, plane=robot.joints[0].plane)
-    return parse_scenario(text, "nominal", robot)
+    world = parse_scenario(text, "nominal", robot)
+    while world.physics_rate_hz < _FASTEST_HZ and warnings(world):
+        world = dataclasses.replace(world, physics_rate_hz=2 * world.physics_rate_hz)
+    return world
 
 
 def _unlimited(robot: Robot, missing: tuple[str, ...]) -> Robot:
@@ -260,7 +269,4 @@ def _approach_s(first: FloatArray, limits: GateLimits) -> float:
     """How long the ramp takes from straight joints to the first pose."""
     rest = np.clip(np.zeros_like(first), limits.lower, limits.upper)
     target = np.clip(first, limits.lower, limits.upper)
-    moved = target != rest
-    if np.isinf(limits.ramp_rate[moved]).any():
-        return math.nan
     return Ramp(rest, target, limits.ramp_rate).duration_s

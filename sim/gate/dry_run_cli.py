@@ -9,6 +9,7 @@ from pathlib import Path
 
 from capture.console import emit_json, progress
 from capture.interruption import interruptible
+from capture.robot import Robot
 
 from ..drive.driven import Driven
 from ..scenario import Scenario
@@ -22,6 +23,7 @@ def run_dry(
     driven: Driven,
     on: str,
     *,
+    robot: Robot | None = None,
     world: Scenario | None = None,
     duration_s: float | None = None,
     output: Path | None = None,
@@ -33,6 +35,7 @@ def run_dry(
     Args:
         driven: What to drive.
         on: The bus that it would be driven on, as the command line names it.
+        robot: On which robot; the one that it was made for if None.
         world: Where; by default the world that it was made for, and flat ground if that is not
             known.
         duration_s: How long [s]; its own length if None.
@@ -59,6 +62,7 @@ def run_dry(
 
         run = dry_run(
             driven,
+            robot=robot,
             world=world,
             duration_s=duration_s,
             output=output,

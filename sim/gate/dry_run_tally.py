@@ -141,15 +141,14 @@ class DemandTally:
         self._energy = self._energy_before = np.zeros((len(JOINT_TERMS), count))
         self._begun = False
 
-    def command(self, wanted: FloatArray, clamped: BoolArray, before: FloatArray) -> None:
-        """Take the commands of one tick.
+    def command(self, wanted: FloatArray, clamped: BoolArray) -> None:
+        """Take the commands of one tick; before the first one the joints rest in that pose.
 
         Args:
             wanted: What the gait wants [rad], shape (m,).
             clamped: Whether the gate changes it, shape (m,).
-            before: The command in force until now [rad]; what the first rate is from, shape (m,).
         """
-        past = self._wanted or [before, before]
+        past = self._wanted or [wanted, wanted]
         newest, older = past[-1], past[0]
         self._least = np.fmin(self._least, wanted)
         self._greatest = np.fmax(self._greatest, wanted)

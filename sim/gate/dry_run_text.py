@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .dry_run_tally import Demand, JointDemand
 
 _NAMED = 3
+_REMARKS = 6
 _NOTHING = "-"
 _TITLES = (
     *("joint", "least °", "greatest °", "of limit", "rate °/s", "of max"),
@@ -43,6 +44,7 @@ def told(run: DryRun, width: int) -> Iterator[str]:
         The answer, what it would take, the joints.
     """
     yield from _answer(run)
+    yield from _remarks(run)
     yield (
         f"{run.kind} in the twin of {run.robot} in {run.world}, {run.duration_s:g} s; nothing was "
         "sent, and no bus opened"
@@ -105,6 +107,14 @@ def _clamps(run: DryRun) -> str:
     more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
     cut = f"cut to the joint limits: {', '.join(run.cut)}" if run.cut else ""
     return "; ".join(part for part in (", ".join(named[:_NAMED]) + more, cut) if part)
+
+
+def _remarks(run: DryRun) -> Iterator[str]:
+    """What the gate would change, and why."""
+    found = [remark.text for remark in run.remarks if remark.level == "warn"]
+    yield from (f"  {text}" for text in found[:_REMARKS])
+    if len(found) > _REMARKS:
+        yield f"  and {len(found) - _REMARKS} more of this kind; --json has all"
 
 
 def _approach(run: DryRun) -> str:
@@ -189,6 +199,7 @@ def reported(run: DryRun) -> dict[str, Any]:
         "power_net_w": net / seconds,
         "power_el_w": electrical / seconds,
         "cut": list(run.cut),
+        "remarks": [{"level": one.level, "text": one.text} for one in run.remarks],
         "joints": [_joint(joint) for joint in run.joints],
         "path": None if run.path is None else str(run.path),
     }

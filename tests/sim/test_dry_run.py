@@ -1,0 +1,254 @@
+"""The dry run: its numbers against closed forms and against the session of the same run."""
+
+import dataclasses
+import json
+import math
+import socket
+
+import numpy as np
+import pytest
+
+import undulog as front
+from capture import Session, SessionWriter
+from capture.robot import Safety
+from capture.robot.description import parse_robot
+from sim.drive.driven import find_driven
+from sim.gate.dry_run import Verdict, dry_run, nominal_world
+from sim.gate.dry_run_text import reported, told
+
+EPOCH_NS = 1_735_689_600_000_000_000
+RATE_HZ = 100
+WIDE = 10_000
+STEP = 1e-9
+
+
+ROBOT = """
+name = "short"
+clock = "device"
+joints = [
+  { name = "joint01", plane = "horizontal" },
+  { name = "joint02", plane = "vertical" },
+  { name = "joint03", plane = "horizontal" },
+  { name = "joint04", plane = "vertical" },
+]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+[safety]
+max_rate = 4.0
+ramp_rate = 0.5
+max_tracking_error = 0.35
+max_current = 1.4
+reply_timeout_s = 0.25
+max_late_s = 0.2
+"""
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return parse_robot(ROBOT, "short.toml", {})
+
+
+def write(path, robot, commands):
+    """A session of commands, rows at 100 Hz."""
+    with SessionWriter(
+        path, session_id="made", epoch_ns=EPOCH_NS, robot=robot, clock={"computer": "host"}
+    ) as writer:
+        channel = writer.joint_state("/joint_commands", robot.joint_names, unit="rad")
+        for k, row in enumerate(commands):
+            channel.write(EPOCH_NS + k * (10**9 // RATE_HZ), row)
+        writer.set_verdict("good")
+    return path
+
+
+def wave(robot, seconds, amplitude=0.2, frequency_hz=1.0, phase=0.5):
+    t = np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
+    place = np.arange(len(robot.joints))
+    return amplitude * np.sin(2 * np.pi * frequency_hz * t[:, None] - 0.4 * place + phase)
+
+
+@pytest.fixture(scope="module")
+def waved(robot, tmp_path_factory):
+    """A wave of 1.5 s, run dry, and the twin's session of it."""
+    folder = tmp_path_factory.mktemp("dry")
+    commands = wave(robot, 1.5)
+    driven = find_driven(str(write(folder / "wave.mcap", robot, commands)))
+    path = folder / "twin.mcap"
+    return commands, dry_run(driven, output=path), path
+
+
+def test_ranges_rates_and_accelerations_are_those_of_the_commands(waved, robot):
+    commands, run, _ = waved
+    # What is commanded before is the first pose.
+    steps = np.diff(np.vstack([commands[:1], commands[:1], commands]), axis=0)
+    for i, joint in enumerate(run.joints):
+        assert joint.name == robot.joint_names[i]
+        assert joint.least == pytest.approx(commands[:, i].min(), abs=STEP)
+        assert joint.greatest == pytest.approx(commands[:, i].max(), abs=STEP)
+        room = robot.joints[i].upper - np.abs(commands[:, i]).max()
+        assert joint.margin == pytest.approx(room, abs=STEP)
+        assert joint.rate == pytest.approx(RATE_HZ * np.abs(steps[:, i]).max(), rel=1e-9)
+        bends = RATE_HZ**2 * np.abs(np.diff(steps[:, i]))
+        assert joint.acceleration == pytest.approx(bends.max(), rel=1e-6)
+        # 1 Hz of 0.2 rad: 2 pi A, less what the chord of 10 ms is shorter than the tangent.
+        assert joint.rate == pytest.approx(0.4 * np.pi, rel=2e-3)
+
+
+def test_it_would_run_and_the_first_line_says_so(waved):
+    _, run, _ = waved
+    assert run.verdict is Verdict.RUNS
+    assert run.verdict.fit
+    assert (run.duration_s, run.planned_s, run.missing, run.fault) == (1.5, 1.5, (), None)
+    lines = list(told(run, WIDE))
+    assert lines[0].startswith("wave.mcap on short would run as it is; closest to a limit")
+    joint, demand = run.closest
+    assert demand.share == max(
+        one.share for each in run.joints for one in each.demands if math.isfinite(one.share)
+    )
+    assert f"{joint}, {demand.name}" in lines[0]
+    assert f"({demand.share:.0%})" in lines[0]
+    head = next(k for k, line in enumerate(lines) if line.startswith("joint "))
+    assert [line.split()[0] for line in lines[head + 1 :]] == [one.name for one in run.joints]
+    assert len({len(line) for line in lines[head:]}) == 1  # aligned: numbers end at one column
+
+
+def test_the_ramp_to_the_first_pose_is_as_long_as_its_peak_rate_allows(waved, robot):
+    commands, run, _ = waved
+    np.testing.assert_allclose(run.first_pose, commands[0], atol=STEP)
+    # 3 x^2 - 2 x^3 is steepest in its middle, with a slope of 1.5.
+    expected_s = 1.5 * np.abs(commands[0]).max() / robot.safety.ramp_rate
+    assert run.approach_s == pytest.approx(expected_s)
+
+
+def test_torque_current_and_energy_are_those_of_the_session_of_that_run(waved):
+    _, run, path = waved
+    with Session.open(path) as session:
+        assert session.verdict == "good"
+        assert session.warnings == []
+        modes = [(t_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
+        said = [m.msg for _, m in session.messages("/rosout")]
+        effort = session.joints("/joint_states", "effort")
+        current = session.joints("/joint_current")
+        ledger = session.joints("/energy_ledger")
+        commands = session.joints("/joint_commands")
+    assert [mode for _, mode in modes] == ["reading the pose", "approach", "replay"]
+    assert "gate: run" in said
+    begin_ns = modes[-1][0]
+    end_ns = begin_ns + round(1.5e9)
+    rows = np.array(commands.values)[:, commands.t_ns[0] >= begin_ns]
+    for joint, given, torques, currents in zip(
+        run.joints, rows, effort.values, current.values, strict=True
+    ):
+        assert given.max() == pytest.approx(joint.greatest, abs=STEP)
+        # What the servos tell comes two ticks late: those of the last two are not in it.
+        heard = (effort.t_ns[0] >= begin_ns - 10_000_000) & (effort.t_ns[0] <= end_ns - 20_000_000)
+        assert np.abs(torques[heard]).max() == pytest.approx(joint.torque_peak, rel=1e-12)
+        assert np.sqrt(np.mean(torques[heard] ** 2)) == pytest.approx(joint.torque_rms, rel=1e-12)
+        assert np.abs(currents[heard]).max() == pytest.approx(joint.current_peak, rel=1e-12)
+    window = (ledger.t_ns[0] >= begin_ns) & (ledger.t_ns[0] <= end_ns)
+    names = ("mechanical_net", "mechanical_abs", "electrical_net")
+    for name, value in zip(names, run.energy_j, strict=True):
+        taken = ledger.signal(name).values[window]
+        assert taken[-1] - taken[0] == pytest.approx(value, rel=1e-9)
+        assert value > 0.0
+
+
+def test_json_has_si_units_and_nothing_that_is_no_number(waved):
+    _, run, path = waved
+    found = json.loads(json.dumps(reported(run), allow_nan=False))
+    assert (found["verdict"], found["would_run"], found["armed"]) == ("would run", True, False)
+    assert found["path"] == str(path)
+    assert found["joints"][0]["greatest"] == run.joints[0].greatest
+    assert found["joints"][0]["share"]["rate"] == run.joints[0].rate / 4.0
+    assert found["energy_net_j"] == pytest.approx(1.5 * found["power_net_w"])
+    assert found["stop"] is None
+
+
+def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
+    commands = np.zeros((60, len(robot.joints)))
+    commands[20:, 2] = 0.3
+    driven = find_driven(str(write(tmp_path / "step.mcap", robot, commands)))
+    path = tmp_path / "twin.mcap"
+    run = dry_run(driven, output=path)
+    assert run.verdict is Verdict.CLAMPED
+    assert run.verdict.fit
+    assert run.joints[2].rate == pytest.approx(30.0)
+    with Session.open(path) as session:
+        given = session.joints("/joint_commands").signal("joint03").values
+    steps = np.diff(given)
+    assert steps.max() == pytest.approx(4.0 / RATE_HZ)  # of [safety] max_rate
+    assert (steps > STEP).sum() == 8  # 0.3 rad by 0.04 rad a tick
+    # Where it holds back: in seven of sixty ticks, the eighth step is there.
+    assert run.joints[2].clamped == pytest.approx(7 / 60)
+    assert [joint.name for joint in run.joints if joint.clamped] == ["joint03"]
+    first, second = list(told(run, WIDE))[:2]
+    assert first.startswith("step.mcap on short would run, clamped: joint03 12% of the ")
+    assert second == "  gate: joint03: command held back to 4 rad/s"
+
+
+def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
+    driven = find_driven(str(write(tmp_path / "wave.mcap", robot, wave(robot, 3.0, 0.5))))
+    world = nominal_world(robot)
+    joints = list(robot.joints)
+    weak = dataclasses.replace(joints[2].servo, stall_torque=0.01)
+    joints[2] = dataclasses.replace(joints[2], servo=weak)
+    world = dataclasses.replace(world, robot=dataclasses.replace(robot, joints=tuple(joints)))
+    run = dry_run(driven, world=world)
+    assert run.verdict is Verdict.STOPS
+    assert not run.verdict.fit
+    assert (run.fault.kind, run.fault.joint) == ("tracking", "joint03")
+    assert run.fault.limit == 0.35
+    assert 0.0 <= run.duration_s < 3.0
+    first = next(told(run, WIDE))
+    assert "wave.mcap on short would stop " in first
+    assert "joint03: tracking error 0." in first
+    stop = reported(run)["stop"]
+    assert (stop["joint"], stop["kind"]) == ("joint03", "tracking")
+
+
+def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_same(robot, tmp_path):
+    bare = dataclasses.replace(robot, safety=Safety(max_rate=4.0))
+    driven = find_driven(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
+    run = dry_run(driven, robot=bare)
+    assert run.verdict is Verdict.REFUSED
+    assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
+    assert math.isnan(run.approach_s)
+    assert run.joints[0].rate == pytest.approx(0.4 * np.pi, rel=2e-3)
+    lines = list(told(run, WIDE))
+    assert "would not start: short lacks the limits ramp_rate, max_track" in lines[0]
+    assert "  [safety]" in lines
+    assert reported(run)["approach_s"] is None
+
+
+def test_on_the_command_line_nothing_is_opened(tmp_path, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        on = f"can:socketcand:can0?host=127.0.0.1&port={server.getsockname()[1]}"
+        words = ["drive", "snake13-horizontal-pi3", "--on", on, "--duration", "0.3"]
+        assert front.run(words) == 0
+        text = capsys.readouterr().out
+        assert text.startswith("snake13-horizontal-pi3 on snake13 would run as it is; closest")
+        assert "nothing was sent, and no bus opened" in text
+        path = tmp_path / "dry.mcap"
+        assert front.run([*words, "--json", "-o", str(path)]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert (found["on"], found["would_run"], found["path"]) == (on, True, str(path))
+        with pytest.raises(BlockingIOError):
+            server.accept()
+    with Session.open(path) as session:
+        assert session.metadata["undulog"]["dry_run"] == "yes"
+    assert front.run([*words, "-o", str(path)]) == 2  # it is there
+
+
+def test_the_exit_code_says_that_it_would_not_run(tmp_path, capsys):
+    scenario = tmp_path / "weak.toml"
+    scenario.write_text(
+        'description = "weak"\nrobot = "snake13"\nduration_s = 2.0\n'
+        "[servo]\nstall_torque = 0.02\n"
+        "[gait.horizontal]\namplitude = 0.5\nfrequency_hz = 0.5\nlag = 0.5\n"
+    )
+    assert front.run(["drive", str(scenario), "--on", "can:socketcand:can0"]) == 1
+    assert capsys.readouterr().out.startswith("weak on snake13 would stop ")
+    assert front.run(["drive", str(scenario), "--on", "can"]) == 2
