@@ -135,7 +135,7 @@ def solve(
         unknowns=wanted,
         x=x,
         covariance=_covariance(
-            score_covariance(columns, residuals, sigma),
+            score_covariance(columns, residuals, sigma, precision),
             normal,
             precision,
         ),

@@ -5,9 +5,11 @@ import math
 import signal
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import undulog as front
 from capture import Session, SessionWriter, load_robot
@@ -17,6 +19,7 @@ from replay.calibrate.determined import ridges
 from replay.calibrate.misfit import misfit
 from replay.calibrate.noise import memory, score_covariance
 from replay.calibrate.parameters import Unknown
+from replay.calibrate.solve import solve
 from sim.scenario_file import load_scenario
 
 TRACE = Path(__file__).parents[2].parent / "shared/data/arcsnake/linear_trajectory.candump.log"
@@ -303,15 +306,58 @@ def test_the_memory_of_noise_is_that_of_its_closed_form():
     assert memory(list(noise)) == pytest.approx((1 + rho) / (1 - rho), rel=0.1)
 
 
-def test_scores_of_coloured_noise_vary_as_its_spectrum_says():
-    """J = 1: the sum of n samples varies by n times the spectrum at zero."""
-    random = np.random.default_rng(4)
-    rho, n = 0.6, 40000
-    noise = random.standard_normal(n)
-    for k in range(1, n):
-        noise[k] += rho * noise[k - 1]
-    got = score_covariance([np.ones((n, 1))], [noise], np.ones(1))
-    assert got[0, 0] == pytest.approx(n / (1 - rho) ** 2, rel=0.2)
+def colored(random, rho, shape):
+    """AR(1) noise of variance one, shape (..., n)."""
+    white = random.standard_normal((*shape[:-1], shape[-1] + 500))
+    return math.sqrt(1 - rho**2) * lfilter([1.0], [1.0, -rho], white)[..., 500:]
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
+    """J = cos(w t): the sum of n samples varies by n/2 times the spectrum at w."""
+    n, w = 40000, 2 * np.pi * 0.01
+    noise = colored(np.random.default_rng(4), rho, (n,))
+    column = np.cos(w * np.arange(n))[:, None]
+    got = score_covariance([column], [noise], np.ones(1), np.ones(1))
+    spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
+    assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
+
+
+@pytest.mark.parametrize(("n", "rho"), [(300, 0.0), (300, 0.8), (1000, 0.9)])
+def test_intervals_of_a_linear_model_cover(n, rho):
+    """Three joints, four parameters whose columns are two harmonics of three or ten cycles."""
+    random = np.random.default_rng(5)
+    t, joints, count, runs = np.arange(n) * 0.01, np.arange(3.0), 4, 600
+    prior, inside = np.full(count, 4.0), 0
+    for _ in range(runs):
+        waves = [2 * np.pi * k * t[:, None] - k * joints for k in (1, 3)]
+        base = np.stack([f(wave) for wave in waves for f in (np.cos, np.sin)], axis=-1)
+        mixed = random.standard_normal((4, count)) * np.array([1.0, 1.0, 0.1, 0.1])[:, None]
+        columns = list(np.moveaxis(0.02 * base @ mixed, 1, 0))
+        columns = [column - column.mean(axis=0) for column in columns]
+        truth = 0.5 * random.standard_normal(count)
+        noise = 0.005 * colored(random, rho, (3, n))
+        measured = [c @ truth + e - e.mean() for c, e in zip(columns, noise, strict=True)]
+        solution = solve_linear(columns, measured, prior)
+        half = 1.96 * np.sqrt(np.diag(solution[1]))
+        inside += int((np.abs(solution[0] - truth) <= half).sum())
+    assert inside / (runs * count) == pytest.approx(0.95, abs=0.02)
+
+
+def solve_linear(columns, measured, prior):
+    """The fit's own iteration, of a model whose derivatives never change."""
+
+    class Model:
+        def __init__(self):
+            self.measured = SimpleNamespace(angles=tuple(measured))
+
+        def at(self, _wanted, x):
+            return tuple(column @ x for column in columns)
+
+    wanted = [Unknown(f"p{k}", "1", 1.0, p**-0.5) for k, p in enumerate(prior.tolist())]
+    found = solve(Model(), wanted)
+    assert found.converged
+    return found.x, found.covariance
 
 
 def test_a_ridge_is_the_direction_that_keeps_what_is_told():
