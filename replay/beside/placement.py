@@ -1,9 +1,9 @@
 """Bodies of several sessions in one world.
 
 Where a robot's world has its origin is the choice of whoever tracked it, so by default the other
-bodies are laid on the first one: turned about the vertical and moved on the ground, so that middle
-and direction of the bodies are the same at the first moment that both sessions share. A body's
-direction is the mean of its links' directions, which doesn't swing with the head.
+bodies are laid on the first one: turned about the vertical and moved on the ground, so that at the
+first moment that both sessions share the heads are at one point and the bodies point one way. A
+body's direction is the mean of its links' directions, which doesn't swing with the head.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
     shared = known & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1])
     shared &= np.isfinite(_poses(one)).all(axis=1)
     rows = np.flatnonzero(shared)[:_LOOK_AT]
-    here = _middle(a.side, one, one.t_ns[rows])
-    there = _middle(b.side, other, at_ns[rows])
+    here = _stance(a.side, one, one.t_ns[rows])
+    there = _stance(b.side, other, at_ns[rows])
     both = np.flatnonzero(np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1))
     if not both.size:
         return None
@@ -142,8 +142,8 @@ def _poses(head: HeadPath) -> FloatArray:
     return np.concatenate([head.position, head.quaternion], axis=1)
 
 
-def _middle(side: Side, head: HeadPath, t_ns: IntArray) -> FloatArray:
-    """Middle of the body on the ground [m] and its direction [rad], shape (n, 3)."""
+def _stance(side: Side, head: HeadPath, t_ns: IntArray) -> FloatArray:
+    """Where the head is on the ground [m] and which way the body points [rad], shape (n, 3)."""
     robot = side.robot
     assert robot is not None  # noqa: S101 - a head is read of a robot
     pose = interpolate(head.t_ns, _poses(head), t_ns)
@@ -153,7 +153,7 @@ def _middle(side: Side, head: HeadPath, t_ns: IntArray) -> FloatArray:
     names = robot.joint_names
     angles = resampled(side.measured, names, t_ns, interpolate)
     known = {track.name for track in side.measured}
-    angles[:, [name not in known for name in names]] = 0.0  # drawn up to there, but it has a middle
-    centre, rotation = link_poses(robot, pose[:, :3], rotation_from_quaternion(quaternion), angles)
-    middle, forward = centre.mean(axis=1), rotation[..., 0].mean(axis=1)
-    return np.column_stack([middle[:, :2], np.arctan2(forward[:, 1], forward[:, 0])])
+    angles[:, [name not in known for name in names]] = 0.0  # as good a guess as any
+    _, rotation = link_poses(robot, pose[:, :3], rotation_from_quaternion(quaternion), angles)
+    forward = rotation[..., 0].mean(axis=1)
+    return np.column_stack([pose[:, :2], np.arctan2(forward[:, 1], forward[:, 0])])

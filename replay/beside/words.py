@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 from analysis.compare.changes import changes
 from analysis.compare.result import Change, Comparison
-from analysis.formats import utc
+from analysis.formats import short, utc
 
 from .alignment import Align
 from .side import COMPARED, Side
 
 FACTS = f"{COMPARED}/facts"
 
-_CHANGES = 12
+_CHANGES, _SENTENCE = 12, 200
 
 _ALIGNED = {
     Align.TIME: "Aligned by the time since each session's first sample.",
@@ -36,6 +36,15 @@ class Found:
     comparison: Comparison | None
     why_not: str | None
     changed: tuple[Change, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the comparison leaves out and what its intervals don't know."""
+        if self.comparison is None:
+            return ()
+        partial = self.comparison.partial
+        left_out = () if partial is None else (short(partial, _SENTENCE),)
+        return (*left_out, *self.comparison.warnings)
 
 
 def answer(first: Side, other: Side, found: Found) -> str:

@@ -104,6 +104,7 @@ def write_beside(
         f"{one.aligned.side.name}: {said}" for one in sessions for said in one.recording.warnings
     ]
     found = {one.aligned.side.name: _compare(sessions[0], one) for one in sessions[1:]}
+    told += [f"{name}: {said}" for name, one in found.items() for said in one.notes]
     placements = _placements(sessions, how, place, told)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))

@@ -1,0 +1,408 @@
+"""Sessions side by side, read back with Rerun's own reader and held against closed forms."""
+
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import undulog
+from analysis.compare.compare import Choices, compare_sessions
+from capture import Session, SessionWriter, load_robot
+
+EPOCH_NS = 1_735_689_600_000_000_000
+NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
+LAG = 0.7
+
+CHAIN = """name = "{name}"
+description = "Yaw joints in a row."
+clock = "simulated"
+assumed = ["links", "servo"]
+[chain]
+joints = {joints}
+planes = ["horizontal"]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+"""
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A travelling wave that is known at every instant."""
+
+    amplitude: float = 0.4
+    frequency_hz: float = 1.0
+    phase: float = 0.0
+    delay: float = 0.1
+    seconds: float = 6.0
+    rate_hz: float = 100.0
+    epoch_ns: int = EPOCH_NS
+    turn: float = 0.0
+    step: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def t(self):
+        """Sampling times since the start [s]."""
+        return np.arange(round(self.seconds * self.rate_hz)) / self.rate_hz
+
+    def cycles(self, t):
+        """Phase of the gait in cycles."""
+        return self.frequency_hz * t + self.phase
+
+    def angle(self, joint, cycles):
+        """What a joint does at a phase [rad]."""
+        return self.amplitude * np.sin(2 * np.pi * cycles - joint * LAG - self.delay)
+
+    def head(self, t):
+        """Where the head is in the world of this session [m], shape (n, 3)."""
+        x, y = 0.2 * t, 0.03 * np.sin(2 * np.pi * self.frequency_hz * t)
+        cos, sin = math.cos(self.turn), math.sin(self.turn)
+        return np.stack(
+            [cos * x - sin * y + self.step[0], sin * x + cos * y + self.step[1], 0.025 + 0 * t],
+            axis=-1,
+        )
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    """Makes robots of some joints."""
+    folder = tmp_path_factory.mktemp("robots")
+
+    def make(joints, name="chain"):
+        path = folder / f"{name}{joints}.toml"
+        path.write_text(CHAIN.format(name=f"{name}{joints}", joints=joints))
+        return load_robot(path)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def make(chain):
+    """Writes a session of a wave."""
+
+    def write(path, wave, *, robot=True, gait=True, names=NAMES, noise=1e-4):
+        described = chain(len(names), "chain") if robot else None
+        rng = np.random.default_rng(sum(path.name.encode()))
+        with SessionWriter(
+            path,
+            session_id=path.stem,
+            epoch_ns=wave.epoch_ns,
+            robot=described,
+            clock={"robot": "simulated"},
+        ) as w:
+            commands = w.joint_state("/joint_commands", names, unit="rad")
+            states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
+            odometry = w.odometry("/odom", frame="world", child="link01")
+            phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
+            joints, zero = np.arange(len(names)), np.zeros(3)
+            turned = np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)])
+            for t in wave.t.tolist():
+                t_ns, cycles = wave.epoch_ns + round(t * 1e9), wave.cycles(t)
+                commands.write(t_ns, 0.4 * np.sin(2 * np.pi * cycles - joints * LAG))
+                angle = wave.angle(joints, cycles)
+                speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, cycles + 0.25)
+                states.write(
+                    t_ns, angle + noise * rng.standard_normal(angle.shape), speed, 0.1 * speed
+                )
+                odometry.write(t_ns, wave.head(t), turned, zero, zero)
+                if gait:
+                    wrapped = math.remainder(2 * np.pi * cycles, 2 * np.pi)
+                    phase.write(t_ns, np.array([0.4, wrapped]))
+        return path
+
+    return write
+
+
+def view(capsys, *words, code=0):
+    """Runs the verb; returns its standard output, or its complaint."""
+    got = undulog.run(["view", *map(str, words)])
+    told = capsys.readouterr()
+    assert got == code, told.err
+    return told.out if code == 0 else told.err
+
+
+def degrees(found, entity):
+    """Rows of an angle's entity [degrees]."""
+    return np.array(found.column(entity, "Angle:degrees"), dtype=float)
+
+
+ROBOT = Wave()
+TWIN = Wave(
+    amplitude=0.35,
+    frequency_hz=0.8,
+    phase=5.3,
+    delay=0.25,
+    seconds=8.0,
+    rate_hz=90.0,
+    epoch_ns=EPOCH_NS + 86_400_000_000_000,
+    turn=math.radians(140.0),
+    step=(3.0, -2.0),
+)
+
+
+@pytest.fixture(scope="module")
+def files(make, tmp_path_factory):
+    """A robot and its twin, which walks at another frequency, place and heading."""
+    folder = tmp_path_factory.mktemp("pair")
+    return make(folder / "a.mcap", ROBOT, noise=0.0), make(folder / "b.mcap", TWIN, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def beside(files, read_back, tmp_path_factory):
+    """Both recordings: aligned by time and by phase."""
+    folder = tmp_path_factory.mktemp("beside")
+    found = {}
+    for how in ("time", "phase"):
+        path = folder / f"{how}.rrd"
+        words = ["view", *map(str, files), "--names", "robot,twin", "--align", how]
+        assert undulog.run([*words, "--save", str(path)]) == 0
+        found[how] = read_back(path)
+    return found
+
+
+def test_every_session_keeps_its_entities_under_its_own_name(files, beside, read_back, tmp_path):
+    for name, file in zip(("robot", "twin"), files, strict=True):
+        assert undulog.run(["view", str(file), "--save", str(tmp_path / f"{name}.rrd")]) == 0
+        alone = {e for e in read_back(tmp_path / f"{name}.rrd").entities if "__" not in e}
+        assert {f"/{name}{entity}" for entity in alone} <= beside["time"].entities
+    assert len(beside["time"].stores) == 1
+    others = {e.split("/")[1] for e in beside["time"].entities} - {"", "__properties"}
+    assert others == {"robot", "twin", "compared"}
+
+
+def test_sessions_lie_at_their_own_time_and_at_their_own_phase(beside):
+    for name, wave in (("robot", ROBOT), ("twin", TWIN)):
+        entity = f"/{name}/joints/measured"
+        for found in beside.values():
+            np.testing.assert_array_equal(found.times(entity), np.round(wave.t * 1e9))
+            cycles = wave.cycles(wave.t) - math.floor(wave.phase)
+            np.testing.assert_allclose(found.times(entity, "gait_cycle") * 1e-9, cycles, atol=2e-9)
+
+
+def chord(wave, step_s):
+    """How far a straight line between samples may be from the wave [degrees]."""
+    fastest = wave.amplitude * (2 * np.pi * wave.frequency_hz) ** 2
+    return np.rad2deg(fastest * step_s**2 / 8) + 2e-5  # and 32 bits
+
+
+def test_differences_by_time_are_those_of_the_waves(beside):
+    found = beside["time"]
+    entity = "/compared/twin/angles"
+    shared = ROBOT.t <= TWIN.t[-1]
+    np.testing.assert_array_equal(found.times(entity), np.round(ROBOT.t * 1e9))
+    joints = np.arange(len(NAMES))
+    truth = np.rad2deg(
+        TWIN.angle(joints, TWIN.cycles(ROBOT.t)[:, None])
+        - ROBOT.angle(joints, ROBOT.cycles(ROBOT.t)[:, None])
+    )
+    rows = degrees(found, entity)
+    assert shared.all()
+    assert np.abs(rows - truth).max() < chord(TWIN, 1 / TWIN.rate_hz)
+    assert found.static(entity, "SeriesLines:names") == list(NAMES)
+
+
+def test_differences_by_phase_are_those_of_the_waves_at_equal_phase(beside):
+    found = beside["phase"]
+    entity = "/compared/twin/angles"
+    at = found.times(entity, "gait_cycle") * 1e-9
+    np.testing.assert_allclose(at, ROBOT.cycles(ROBOT.t), atol=2e-9)
+    joints = np.arange(len(NAMES))
+    truth = np.rad2deg(TWIN.angle(joints, at[:, None]) - ROBOT.angle(joints, at[:, None]))
+    rows = degrees(found, entity)
+    common = (at >= 0.3) & (at <= TWIN.cycles(TWIN.t[-1]) - 5.0)
+    assert 0.7 * at.size < np.count_nonzero(common)
+    assert np.isnan(rows[~common]).all()
+    assert np.abs(rows[common] - truth[common]).max() < chord(TWIN, 1 / TWIN.rate_hz)
+
+
+def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
+    """Both go the same way in worlds of their own, so by time the heads part as one slows down."""
+    found = beside["time"]
+    x, y, z, w = found.static("/twin/world", "Transform3D:quaternion")[0]
+    turn = 2 * math.atan2(z, w)
+    # The bodies' directions: the mean of the links', which the joints turn one after the other.
+    lean = {
+        wave: np.angle(
+            np.mean(np.exp(1j * np.cumsum([0, *wave.angle(np.arange(5), wave.cycles(0.0))])))
+        )
+        for wave in (ROBOT, TWIN)
+    }
+    expected = lean[ROBOT] - lean[TWIN] - TWIN.turn
+    assert (x, y) == (0.0, 0.0)
+    assert abs(math.remainder(turn - expected, 2 * math.pi)) < 1e-6
+    moved = np.array(found.static("/twin/world", "Transform3D:translation")[0])
+    cos, sin = math.cos(turn), math.sin(turn)
+    there = TWIN.head(np.zeros(1))[0]
+    back = np.array([cos * there[0] - sin * there[1], sin * there[0] + cos * there[1]]) + moved[:2]
+    np.testing.assert_allclose(back, ROBOT.head(np.zeros(1))[0, :2], atol=1e-6)
+    assert moved[2] == 0.0
+    apart = np.array(found.column("/compared/twin/head_distance", "Scalars:scalars"))[:, 0]
+    assert apart[0] < 1e-6
+    at = found.times("/compared/twin/head_distance") * 1e-9
+    own = TWIN.head(at)[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + moved[:2]
+    np.testing.assert_allclose(
+        apart, np.linalg.norm(own - ROBOT.head(at)[:, :2], axis=1), atol=1e-4
+    )
+
+
+def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path, capsys):
+    path = tmp_path / "w.rrd"
+    told = json.loads(view(capsys, *files, "--place", "world", "--save", path, "--json"))
+    assert told["sessions"][1]["placed"] is None
+    assert "every body is drawn where its own session says that it was" in told["warnings"]
+    with pytest.raises(KeyError):
+        read_back(path).static("/b/world", "Transform3D:translation")
+
+
+def test_the_second_body_is_a_wireframe_with_its_name_at_the_head(beside):
+    found = beside["time"]
+    solid, wires = 3, 1
+    assert found.static("/robot/world/snake/measured", "Capsules3D:fill_mode") == [solid]
+    assert wires in [
+        batch.column("Capsules3D:fill_mode").to_pylist()[0][0]
+        for chunk in found._chunks
+        if chunk.entity_path == "/twin/world/snake/measured" and chunk.is_static
+        for batch in [chunk.to_record_batch()]
+        if "Capsules3D:fill_mode" in batch.schema.names
+    ]
+    for name in ("robot", "twin"):
+        labels = found.column(f"/{name}/world/snake/name", "Points3D:labels")
+        assert {label for row in labels for label in row} == {name}
+
+
+def test_a_body_leaves_when_its_session_ends_before_the_others(beside):
+    cleared = "/robot/world/snake"
+    end = round(ROBOT.t[-1] * 1e9)
+    assert beside["time"].times(cleared).tolist() == [end + 1]
+    assert beside["time"].times("/twin/world/snake").size == 0
+    assert beside["time"].times(cleared, "gait_cycle").tolist() == [end + 1]  # at 1 Hz
+
+
+def test_bars_and_their_differences_are_those_of_compare(make, read_back, tmp_path, capsys):
+    slow = Wave(amplitude=0.36, delay=0.2)
+    files = make(tmp_path / "a.mcap", ROBOT), make(tmp_path / "b.mcap", slow)
+    view(capsys, *files, "--save", tmp_path / "ab.rrd")
+    found = read_back(tmp_path / "ab.rrd")
+
+    def bar(entity, joint):
+        (drawn,) = found.static(f"{entity}/{joint}", "BarChart:values")
+        (height,) = drawn["buffer"]
+        return height
+
+    with Session.open(files[0]) as a, Session.open(files[1]) as b:
+        comparison = compare_sessions(a, b, Choices(any_gait=True))
+    said = {(one.quantity, one.place): one for one in comparison.differences}
+    for joint in NAMES:
+        gain = bar("/compared/b/segments/gain/estimate", joint)
+        lag = bar("/compared/b/segments/lag/estimate", joint)
+        assert abs(gain - 100 * (0.36 / 0.4 - 1)) < 0.05
+        assert abs(lag - math.degrees(0.1)) < 0.05
+        assert gain == pytest.approx(100 * said["gain", joint].difference.value)
+        assert lag == pytest.approx(math.degrees(said["lag", joint].difference.value))
+        own = bar("/compared/segments/gain/b/estimate", joint)
+        assert abs(own - 100 * (0.36 / 0.4 - 1)) < 0.05
+    facts = found.static("/compared/facts", "TextDocument:text")[0]
+    assert facts.startswith(f"**b (B) against a (A): {comparison.answer}.**")
+
+
+@pytest.fixture(scope="module")
+def still(make, tmp_path_factory):
+    """A session without a gait's phase."""
+    return make(tmp_path_factory.mktemp("still") / "still.mcap", Wave(seconds=2.0), gait=False)
+
+
+def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, tmp_path, capsys):
+    for how in ("phase", "gait"):
+        said = view(capsys, files[0], still, "--align", how, "--save", tmp_path / "x.rrd", code=2)
+        assert "no phase of a gait was logged (/gait) in still; align by --align time" in said
+    assert not (tmp_path / "x.rrd").exists()
+    view(capsys, files[0], still, "--save", tmp_path / "x.rrd")
+
+
+def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp_path, capsys):
+    bare = make(tmp_path / "bare.mcap", Wave(seconds=2.0), robot=False)
+    for pair in ((files[0], bare), (bare, files[0])):
+        told = view(capsys, *pair, "--save", tmp_path / "x.rrd", "--force", "--json")
+        bodies = {one["name"]: one["body"] for one in json.loads(told)["sessions"]}
+        assert bodies == {"a": True, "bare": False}
+        found = read_back(tmp_path / "x.rrd")
+        assert degrees(found, f"/compared/{pair[1].stem}/angles").shape[1] == len(NAMES)
+        assert not [e for e in found.entities if e.startswith("/bare/world")]
+
+
+def test_of_different_robots_the_joints_in_common_are_compared(make, read_back, tmp_path, capsys):
+    long = make(tmp_path / "long.mcap", ROBOT)
+    short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
+    view(capsys, long, short, "--save", tmp_path / "x.rrd")
+    found = read_back(tmp_path / "x.rrd")
+    assert found.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
+    facts = found.static("/compared/facts", "TextDocument:text")[0]
+    assert "robot: chain5 → chain3" in facts
+
+
+def test_without_a_joint_in_common_there_is_no_difference(make, read_back, tmp_path, capsys):
+    one = make(tmp_path / "one.mcap", ROBOT, robot=False)
+    other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
+    out = view(capsys, one, other, "--save", tmp_path / "x.rrd")
+    assert out.startswith("other (B) against one (A): not compared: no joint")
+    assert "/compared/other/angles" not in read_back(tmp_path / "x.rrd").entities
+
+
+def test_three_sessions_are_each_held_against_the_first(files, still, read_back, tmp_path, capsys):
+    path = tmp_path / "three.rrd"
+    out = view(capsys, *files, still, "--names", "robot,twin,no gait", "--save", path)
+    assert [line.split(" (B)")[0] for line in out.splitlines()[:2]] == ["twin", "no gait"]
+    found = read_back(path)
+    assert {"/compared/twin/angles", "/compared/no\\ gait/angles"} <= found.entities
+    assert found.times("/no\\ gait/joints/measured", "gait_cycle").size == 0
+
+
+def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
+    files, chain, read_back, tmp_path, capsys
+):
+    late = tmp_path / "late.mcap"
+    with SessionWriter(late, session_id="late", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
+        states = w.joint_state("/joint_states", NAMES, unit="rad")
+        phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
+        for i in range(300):
+            t_ns = EPOCH_NS + i * 10_000_000
+            states.write(t_ns, np.full(5, i * 1e-3))
+            if i >= 100:
+                phase.write(t_ns, np.array([0.4, 2 * np.pi * (i - 100) / 100]))
+    view(capsys, files[0], late, "--align", "gait", "--save", tmp_path / "x.rrd")
+    found = read_back(tmp_path / "x.rrd")
+    times = found.times("/late/joints/measured")
+    np.testing.assert_array_equal(times, (np.arange(300) - 100) * 10_000_000)
+    rows = degrees(found, "/compared/late/angles")
+    at = ROBOT.t[ROBOT.t < 2.0]
+    truth = (0.1 + 0.1 * at)[:, None] - ROBOT.angle(np.arange(5), ROBOT.cycles(at)[:, None])
+    assert np.abs(rows[: at.size] - np.rad2deg(truth)).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--names", "robot"], "1 names for 2 sessions"),
+        (["--names", "x,x"], "a name of its own"),
+        (["--names", "x,compared"], "where the differences go"),
+        (["--clip", "x.mp4"], "one session's file"),
+        (["--json"], "--save"),
+    ],
+)
+def test_wrong_usage_is_explained(files, capsys, words, complaint):
+    assert complaint in view(capsys, *files, *words, code=2)
+
+
+def test_one_session_has_nothing_to_be_aligned_with(files, tmp_path, capsys):
+    said = view(capsys, files[0], "--align", "phase", "--save", tmp_path / "x.rrd", code=2)
+    assert "--align: needs two sessions or more" in said
+
+
+def test_files_of_one_name_are_told_apart(files, tmp_path, capsys):
+    told = json.loads(view(capsys, files[0], files[0], "--save", tmp_path / "x.rrd", "--json"))
+    assert [one["name"] for one in told["sessions"]] == ["a 1", "a 2"]
+    assert any("same content" in warning for warning in told["warnings"])
