@@ -24,7 +24,7 @@ import numpy as np
 
 from .arrays import ComplexArray, FloatArray, frozen
 from .errors import Fault, NullModelError, UsageError
-from .part_file import part_file
+from .part_file import write_text
 from .strict_table import Faults, Table
 
 FORMAT = "undulog null model 1"
@@ -139,8 +139,7 @@ def write_null_model(path: Path, model: NullModel) -> None:
         "error": model.error,
         "made_by": model.made_by,
     }
-    with part_file(path) as part:
-        part.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(values, indent=1, allow_nan=False) + "\n")
 
 
 def read_null_model(path: Path) -> NullModel:

@@ -37,6 +37,20 @@ def part_file(output: Path) -> Generator[Path]:
             part.unlink(missing_ok=True)
 
 
+def write_text(output: Path, text: str) -> None:
+    """Write a text file, which appears only when it is whole.
+
+    Args:
+        output: The file wanted; one of that name is replaced, as by :func:`part_file`.
+        text: Its content, for UTF-8.
+
+    Raises:
+        LogWriteError: If it can't be written; nothing is left behind then.
+    """
+    with part_file(output) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def check_stop(output: Path, stop: StopRequest | None) -> None:
     """End the writing of a part file if an end was asked for.
 

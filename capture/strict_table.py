@@ -229,7 +229,7 @@ class Table:
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
-        number = _finite(value)
+        number = finite_number(value)
         fits = (
             number is not None
             and (above is None or number > above)
@@ -328,7 +328,7 @@ class Table:
         """An array of finite numbers; NaN after a fault."""
         value = self.look(key)[1]
         entries = cast("list[object]", value) if isinstance(value, list) else []
-        numbers = [number for number in map(_finite, entries) if number is not None]
+        numbers = [number for number in map(finite_number, entries) if number is not None]
         bad = above is not None and any(number <= above for number in numbers)
         if len(entries) != count or len(numbers) != count or bad:
             bound = f", each > {above:g}" if above is not None else ""
@@ -414,8 +414,15 @@ class Table:
                 self._faults.add(self.key(key), "an unknown key", near)
 
 
-def _finite(value: object) -> float | None:
-    """A finite TOML number, else None; booleans are not numbers."""
+def finite_number(value: object) -> float | None:
+    """A finite number, else None; booleans are not numbers.
+
+    Args:
+        value: From TOML or JSON.
+
+    Returns:
+        The number.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

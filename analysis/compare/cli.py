@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from capture.console import emit_json, progress
 from capture.errors import UsageError
-from capture.part_file import part_file
+from capture.part_file import write_text
 
 from ..command_line import PAGES, check_output, chosen, opened, show
 
@@ -97,8 +97,7 @@ def _write(result: Comparison, output: Path) -> None:
         return
     from ..report import render
 
-    with part_file(output) as part:
-        part.write_text(render(result), encoding="utf-8")
+    write_text(output, render(result))
 
 
 def _sides(

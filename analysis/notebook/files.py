@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
 from capture.console import refuse_existing
-from capture.errors import DataError, LogError, MissingExtraError, UsageError
-from capture.part_file import part_file
+from capture.errors import DataError, LogError, MissingExtraError
+from capture.part_file import part_file, write_text
 
 from .. import result_energy, result_over_time, result_sweep
+from ..command_line import check_output
 from ..compare.result import Comparison
 from ..oscillators import result as oscillators
 from ..result import Analysis, Coupling, Estimate, interval_key
@@ -53,12 +54,8 @@ def save(result: Shown, path: Path, *, force: bool) -> Path:
         OutputExistsError: If it is there and ``force`` is not given.
         LogWriteError: If it can't be written.
     """
-    if path.suffix.lower() != ".json":
-        raise UsageError(f"{path}: the result file is JSON; end its name in .json")
-    refuse_existing(path, force=force)
-    text = json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n"
-    with part_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    check_output(path, (".json",), "the result file is JSON; end its name in .json", force=force)
+    write_text(path, json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     return path
 
 

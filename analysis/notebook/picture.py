@@ -10,9 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.console import refuse_existing
-from capture.errors import UsageError
-from capture.part_file import part_file
+from capture.part_file import write_text
+
+from ..command_line import check_output
 
 if TYPE_CHECKING:
     from ..report.drawn import Drawing
@@ -78,11 +78,8 @@ class Picture:
             LogWriteError: If it can't be written.
         """
         path = Path(path)
-        if path.suffix.lower() != ".svg":
-            raise UsageError(f"{path}: pictures are SVG; end the name in .svg")
-        refuse_existing(path, force=force)
-        with part_file(path) as part:
-            part.write_text(self.to_svg(), encoding="utf-8")
+        check_output(path, (".svg",), "pictures are SVG; end the name in .svg", force=force)
+        write_text(path, self.to_svg())
         return path
 
 

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from capture.console import emit_json, progress
 from capture.errors import UsageError
-from capture.part_file import part_file
+from capture.part_file import write_text
 
 from ..command_line import PAGES, check_output, chosen
 
@@ -54,8 +54,7 @@ def report(
     why = "the report is an HTML page; end its name in .html"
     check_output(output, PAGES, why, force=force)
     page, told, warnings = _one(files[0], options) if len(files) == 1 else _several(files, options)
-    with part_file(output) as part:
-        part.write_text(page, encoding="utf-8")
+    write_text(output, page)
     size = output.stat().st_size
     if json:
         emit_json({"page": str(output), "bytes": size, **told})

@@ -24,7 +24,7 @@ from typing import Any, Protocol, cast
 from ..errors import ControlError
 from ..log.channels import JointStateChannel, StringChannel
 from ..log.writer import SessionWriter
-from ..strict_table import listed, shown
+from ..strict_table import finite_number, listed, shown
 from .control import LATER, Handler
 
 OPERATOR = "operator"
@@ -266,7 +266,7 @@ def _gait_values(request: Mapping[str, Any]) -> dict[str, float]:
         if not _is_gait_name(name):
             others = "others as NAME.VALUE, e.g. joint03.A"
             raise _invalid("values", name, f"{listed(GAIT_NAMES, name)}; {others}")
-        number = math.nan if value is None else _finite(value)
+        number = math.nan if value is None else finite_number(value)
         if number is None:
             raise _invalid(f"values.{name}", value, "a finite number, or null for none")
         checked[name] = number
@@ -277,16 +277,6 @@ def _is_gait_name(name: str) -> bool:
     if name.partition(".")[0] in _PLANES:
         return name in GAIT_NAMES
     return _FURTHER.fullmatch(name) is not None
-
-
-def _finite(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:  # an integer beyond the range of a double
-        return None
-    return number if math.isfinite(number) else None
 
 
 def _invalid(key: str, found: object, valid: str) -> ControlError:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from capture.errors import DataError
-from capture.part_file import part_file
+from capture.part_file import part_file, write_text
 from capture.robot import Robot
 from capture.robot.description import parse_robot
 from sim.modules import Modules
@@ -106,8 +106,7 @@ def write_calibration(
     if scenario_file is not None:
         texts[scenario_file] = scenario_text(calibration, robot_file, scenario_file)
     for path, text in texts.items():
-        with part_file(path) as part:
-            part.write_text(text, encoding="utf-8")
+        write_text(path, text)
     _write_listed(calibration.scenario.robot, robot_file.parent)
 
 
