@@ -1,9 +1,9 @@
 """Joint angles: commanded, measured and the error between them.
 
-``/joints/commanded``, ``/joints/measured`` and ``/joints/error`` hold one ``Scalars`` of all
-joints each, in rad, row for row as logged; beside it the component ``Angle:degrees`` holds the same
-in degrees, which is what the plots show. Joints that were sampled at times of their own get an
-entity each below these, named after the first joint of those sampled together.
+``/joints/commanded``, ``/joints/measured`` and ``/joints/error`` hold the angles of all joints in a
+row, in degrees, as the component ``Angle:degrees``. Joints that were sampled at times of their own
+get an entity each below these, named after the first joint of those sampled together. All values
+are 32-bit: the recording is for looking at, and the session keeps what was logged.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import numpy as np
 import rerun as rr
 from rerun.encodings import Float32Batch
 
+from capture.arrays import FloatArray, IntArray
 from capture.palette import COMMANDED_RGB, joint_colors
 from capture.robot import Plane, Robot
 
+from .rounding import rounded
 from .sampling import hold, mark_gaps
 from .timeline import Clock
 from .tracks import Table, Track, tables
@@ -27,8 +29,15 @@ MEASURED = "/joints/measured"
 ERROR = "/joints/error"
 PLACES = "/joints/places"
 DEGREES = "Angle:degrees"
+SCALARS = "Scalars:scalars"
+PLACES_WIDTHS = {"commanded": 1.0, "measured": 2.0}
+"""Of the lines of head, middle and tail [points]."""
 
-_DEGREES = rr.ComponentDescriptor(DEGREES, archetype="Angle")
+_DESCRIPTORS = {
+    DEGREES: rr.ComponentDescriptor(DEGREES, archetype="Angle"),
+    # Without a type, which would have to be 64-bit: the viewer plots either.
+    SCALARS: rr.ComponentDescriptor(SCALARS, archetype="rerun.archetypes.Scalars"),
+}
 
 Color = tuple[int, int, int, int]
 
@@ -48,7 +57,7 @@ class Series:
 
     entity: str
     names: tuple[str, ...]
-    component: str = "Scalars:scalars"
+    component: str = SCALARS
 
 
 @dataclass(frozen=True)
@@ -183,44 +192,22 @@ def log_scalars(
     )
 
 
-def log_places(
-    rec: rr.RecordingStream,
-    clock: Clock,
-    places: Places,
-    *,
-    measured: Sequence[Track],
-    commanded: Sequence[Track],
-    palette: Mapping[str, Color],
-) -> None:
-    """Write head, middle and tail once more in degrees, for a plot that can be read at a glance.
+def places_titles(places: Places, kind: str) -> dict[str, str]:
+    """Names of the lines of head, middle and tail.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         places: The joints.
-        measured: Measured angles [rad].
-        commanded: Commanded angles [rad].
-        palette: Colour by joint name.
+        kind: ``measured`` or ``commanded``.
+
+    Returns:
+        Line's name by joint name.
     """
-    for kind, tracks, width in (("commanded", commanded, 1.0), ("measured", measured, 2.0)):
-        by_name = {track.name: track for track in tracks}
-        for name, label in zip(places.names, places.labels, strict=True):
-            if name not in by_name:
-                continue
-            track = by_name[name]
-            entity = f"{PLACES}/{rr.escape_entity_path_part(label)}/{kind}"
-            color = palette[name] if kind == "measured" else GREY
-            title = label if kind == "measured" else "command"
-            look = rr.SeriesLines(
-                names=f"{name} {title}" if title != name else name,
-                colors=color,
-                widths=width,
-            )
-            rec.log(entity, look, static=True)
-            t_ns, values = mark_gaps(track.t_ns, track.values[:, None])
-            for rows, times in clock.rows(t_ns):
-                degrees = np.rad2deg(values[rows, 0])
-                rec.send_columns(entity, times, rr.Scalars.columns(scalars=degrees))
+    return {
+        name: name
+        if (title := label if kind == "measured" else "command") == name
+        else f"{name} {title}"
+        for name, label in zip(places.names, places.labels, strict=True)
+    }
 
 
 def _placed(entity: str, parts: Sequence[Table]) -> list[tuple[str, Table]]:
@@ -264,14 +251,69 @@ def log_table(
     Returns:
         What was written.
     """
-    colors = [GREY if palette is None else palette.get(name, GREY) for name in table.names]
-    rec.log(entity, rr.SeriesLines(names=list(table.names), colors=colors), static=True)
+    component = DEGREES if degrees else SCALARS
+    log_look(rec, entity, table.names, palette)
     t_ns, values = mark_gaps(table.t_ns, table.values)
+    log_rows(rec, clock, entity, t_ns, values, degrees=degrees, component=component)
+    return Series(entity, table.names, component)
+
+
+def log_look(
+    rec: rr.RecordingStream,
+    entity: str,
+    names: Sequence[str],
+    palette: Mapping[str, Color] | None,
+    *,
+    titles: Mapping[str, str] | None = None,
+    width: float | None = None,
+) -> None:
+    """Say how the lines of an entity are drawn.
+
+    Args:
+        rec: The recording.
+        entity: Which.
+        names: Joints, a line each.
+        palette: Colour by joint name; None for grey.
+        titles: Lines' names by joint name; None for the joints' own.
+        width: Of the lines [points]; None for the viewer's own.
+    """
+    look = rr.SeriesLines(
+        names=[name if titles is None else titles.get(name, name) for name in names],
+        colors=[GREY if palette is None else palette.get(name, GREY) for name in names],
+        widths=None if width is None else [width] * len(names),
+    )
+    rec.log(entity, look, static=True)
+
+
+def log_rows(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    entity: str,
+    t_ns: IntArray,
+    values: FloatArray,
+    *,
+    degrees: bool = False,
+    component: str = SCALARS,
+    steps: FloatArray | None = None,
+) -> None:
+    """Write rows of lines.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        entity: Where to.
+        t_ns: Their times [ns], shape (n,).
+        values: Shape (n, k); NaN ends a line.
+        degrees: Whether they are angles [rad], to be plotted in degrees.
+        component: ``Scalars:scalars``, or ``Angle:degrees`` for all joints' angles.
+        steps: What each line is rounded to, as it is plotted, shape (k,); None for nothing.
+    """
+    shown = np.rad2deg(values) if degrees else values
+    if steps is not None:
+        shown = rounded(shown, steps)
+    packed = shown.astype(np.float32)
     for rows, times in clock.rows(t_ns):
-        size = np.full(rows.stop - rows.start, len(table.names))
-        columns = [*rr.Scalars.columns(scalars=values[rows].ravel()).partition(size)]
-        if degrees:
-            shown = np.rad2deg(values[rows].ravel()).astype(np.float32)
-            columns.append(rr.ComponentColumn(_DEGREES, Float32Batch(shown)).partition(size))
-        rec.send_columns(entity, times, columns)
-    return Series(entity, table.names, DEGREES if degrees else "Scalars:scalars")
+        batch = Float32Batch(packed[rows].ravel())
+        column = rr.ComponentColumn(_DESCRIPTORS[component], batch)
+        size = np.full(rows.stop - rows.start, values.shape[1])
+        rec.send_columns(entity, times, [column.partition(size)])

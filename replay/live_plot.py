@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from .joints import DEGREES, Color, Series, log_table, part_entity
-from .sampling import GAP_STEPS, typical_step_ns
+from .joints import DEGREES, SCALARS, Color, Series, log_look, log_rows, part_entity
+from .sampling import GAP_STEPS, mark_gaps, typical_step_ns
 from .timeline import Clock
 from .tracks import Table, Track, tables
 
@@ -67,22 +67,34 @@ class LivePlot:
     at first, so the parts only get smaller: joints that part once stay apart.
     """
 
-    def __init__(self, entity: str, *, degrees: bool = False) -> None:
+    def __init__(
+        self,
+        entity: str,
+        *,
+        degrees: bool = False,
+        component: str | None = None,
+        titles: Mapping[str, str] | None = None,
+        width: float | None = None,
+    ) -> None:
         """Start without joints.
 
         Args:
             entity: E.g. ``/joints/measured``.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
+            component: What is written; None for ``Angle:degrees`` or ``Scalars:scalars``.
+            titles: Lines' names by joint name; None for the joints' own.
+            width: Of the lines [points]; None for the viewer's own.
         """
         self._entity, self._degrees = entity, degrees
+        self._component = component or (DEGREES if degrees else SCALARS)
+        self._titles, self._width = titles, width
         self._parts: list[tuple[str, ...]] = []
         self._last: dict[str, tuple[int, int]] = {}
 
     @property
     def series(self) -> tuple[Series, ...]:
         """What has been written."""
-        component = DEGREES if self._degrees else "Scalars:scalars"
-        return tuple(Series(self._path(part), part, component) for part in self._parts)
+        return tuple(Series(self._path(part), part, self._component) for part in self._parts)
 
     def write(
         self,
@@ -113,7 +125,17 @@ class LivePlot:
                 (table,) = tables([by_name[name] for name in part])
                 path = self._path(part)
                 table = self._with_gap(path, table)
-                log_table(rec, clock, path, table, palette, degrees=self._degrees)
+                log_look(rec, path, part, palette, titles=self._titles, width=self._width)
+                t_ns, values = mark_gaps(table.t_ns, table.values)
+                log_rows(
+                    rec,
+                    clock,
+                    path,
+                    t_ns,
+                    values,
+                    degrees=self._degrees,
+                    component=self._component,
+                )
 
     def _path(self, part: tuple[str, ...]) -> str:
         return self._entity if len(self._parts) == 1 else part_entity(self._entity, part[0])

@@ -24,11 +24,12 @@ from .facts import log_facts
 from .live_decode import Batch, LiveLog
 from .live_plot import LivePlot
 from .live_window import Fresh, Window
-from .motion import BODY_RATE_HZ, HeadPath, Motion, still_head
-from .rrd import DRAWN, palette_of, start_of
-from .sampling import hold, interpolate
+from .motion import BODY_RATE_HZ, SPARSE_RATE_HZ, HeadPath, Motion, assemble, still_head
+from .quantities import DRAWN, SIGNALS
+from .rrd import palette_of, start_of
+from .sampling import hold
 from .timeline import Clock
-from .tracks import Track, resampled
+from .tracks import Track
 from .views import body_title
 
 _LAYOUT_EVERY_S = 1.0
@@ -62,6 +63,7 @@ class LiveScene:
         self._signals: dict[str, LivePlot] = {}
         self._of_joints: dict[str, bool] = {}
         self._places: joints.Places | None = None
+        self._place_plots: dict[tuple[str, tuple[str, ...]], LivePlot] = {}
         self._start: Start | None = None
         self._origin_ns: int | None = None
         self._limit_w: float | None = None
@@ -142,10 +144,33 @@ class LiveScene:
         new = self._fresh.tracks("error", window[0])
         self._errors.write(rec, clock, joints.tracking_errors(new, window[1]), palette)
         self._choose_places(window[1] or window[0])
-        if self._places is not None and (measured or commanded):
-            joints.log_places(
-                rec, clock, self._places, measured=measured, commanded=commanded, palette=palette
+        if self._places is not None:
+            self._draw_places(self._places, measured, commanded, palette)
+
+    def _draw_places(
+        self,
+        places: joints.Places,
+        measured: tuple[Track, ...],
+        commanded: tuple[Track, ...],
+        palette: dict[str, joints.Color],
+    ) -> None:
+        """Head, middle and tail once more, for a plot that can be read at a glance."""
+        for kind, tracks, colors in (
+            ("measured", measured, palette),
+            ("commanded", commanded, None),
+        ):
+            plot = self._place_plots.setdefault(
+                (kind, places.names),
+                LivePlot(
+                    f"{joints.PLACES}/{kind}",
+                    degrees=True,
+                    component=joints.SCALARS,
+                    titles=joints.places_titles(places, kind),
+                    width=joints.PLACES_WIDTHS[kind],
+                ),
             )
+            own = [track for track in tracks if track.name in places.names]
+            plot.write(self._rec, self._clock, own, colors)
 
     def _choose_places(self, moving: tuple[Track, ...]) -> None:
         """Head, middle and tail of the plane that moves, once it is clear which does."""
@@ -183,7 +208,7 @@ class LiveScene:
             names = [track.name for track in self._window.tracks(topic)]
             self._of_joints[topic] = bool(set(names) & set(palette))
             colors = palette if self._of_joints[topic] else joints.joint_palette(names)
-            plot = self._signals.setdefault(topic, LivePlot(f"/signals{topic}"))
+            plot = self._signals.setdefault(topic, LivePlot(f"{SIGNALS}{topic}"))
             plot.write(self._rec, self._clock, tracks, colors)
 
     def _draw_words(self, batch: Batch) -> None:
@@ -212,20 +237,14 @@ class LiveScene:
 
         def motion_of(rows: IntArray) -> Motion:
             rows = rows[(rows >= fresh.start) & (rows < fresh.stop)]
-            names, t_ns = robot.joint_names, head.t_ns[rows]
-            return Motion(
-                robot=robot,
-                t_ns=t_ns,
-                head_position=head.position[rows],
-                head_quaternion=head.quaternion[rows],
-                angles=resampled(positions, names, t_ns, interpolate),
-                commands=resampled(commands, names, t_ns, hold) if commands else None,
-                power_w=resampled(drive, names, t_ns, interpolate) if drive else None,
+            place = HeadPath(
+                head.t_ns[rows], head.position[rows], head.quaternion[rows], head.tracked
             )
+            return assemble(robot, place, positions=positions, commands=commands, power=drive)
 
         chosen = self._slots(head.t_ns, BODY_RATE_HZ)
         motion = motion_of(chosen)
-        ghost = motion_of(chosen[self._slots(head.t_ns[chosen], body.COMMANDED_RATE_HZ)])
+        ghost = motion_of(chosen[self._slots(head.t_ns[chosen], SPARSE_RATE_HZ)])
         if not motion.t_ns.size:
             return
         if self._start is None:
@@ -235,10 +254,11 @@ class LiveScene:
             self._rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._scale(drive)
         body.log_body(self._rec, self._clock, motion, limit_w=self._limit_w)
-        body.log_ghost(self._rec, self._clock, ghost)
+        sparse = np.flatnonzero(np.isin(motion.t_ns, ghost.t_ns))
+        body.log_ghost(self._rec, self._clock, motion, sparse)
         self._draw_ranges(ghost)
         if self._places is not None:
-            markers.log_markers(self._rec, self._clock, motion, self._places, palette)
+            markers.log_markers(self._rec, self._clock, motion, self._places, palette, named=sparse)
         if head.tracked:
             self._draw_trail(motion)
 

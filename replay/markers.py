@@ -6,10 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from capture.arrays import FloatArray
+from capture.arrays import FloatArray, IntArray
 from capture.robot import Robot
 
+from .body import ROUNDING, rounded_to
 from .joints import Color, Places
 from .motion import Motion
 from .timeline import Clock
@@ -48,6 +50,8 @@ def log_markers(
     motion: Motion,
     places: Places,
     palette: Mapping[str, Color],
+    *,
+    named: IntArray,
 ) -> None:
     """Mark the joints that stand for the body.
 
@@ -57,6 +61,7 @@ def log_markers(
         motion: What moved.
         places: The joints.
         palette: Colour by joint name.
+        named: At which of the motion's times the names are moved, shape (n,).
     """
     robot = motion.robot
     labels = {
@@ -75,15 +80,20 @@ def log_markers(
     )
     rec.log(LABELS, look, static=True)
     for rows, times in clock.rows(motion.t_ns):
-        point = above_joints(robot, names, *motion.links(rows)).astype(np.float32)
-        known = np.isfinite(point).all(axis=-1)
-        count = np.count_nonzero(known, axis=1)
-        which = np.nonzero(known)[1]
-        balls = rr.Points3D.columns(
-            positions=point[known], radii=radius[which], colors=color[which]
-        )
+        point, count, which = _known_points(motion, names, rows)
+        balls = rr.Points3D.columns(positions=point, radii=radius[which], colors=color[which])
         rec.send_columns(MARKERS, times, balls.partition(count))
-        text = rr.Points3D.columns(
-            positions=point[known], labels=[labels[names[i]] for i in which.tolist()]
-        )
+    for part, times in clock.rows(motion.t_ns[named]):
+        point, count, which = _known_points(motion, names, named[part])
+        titles = [labels[names[i]] for i in which.tolist()]
+        text = rr.Points3D.columns(positions=point, labels=titles)
         rec.send_columns(LABELS, times, text.partition(count))
+
+
+def _known_points(
+    motion: Motion, names: tuple[str, ...], rows: slice | IntArray
+) -> tuple[NDArray[np.float32], IntArray, IntArray]:
+    """Points above joints whose pose is known: where, how many a row, and of which joint."""
+    point = above_joints(motion.robot, names, *motion.links(rows))
+    known = np.isfinite(point).all(axis=-1)
+    return rounded_to(point[known], ROUNDING), np.count_nonzero(known, axis=1), np.nonzero(known)[1]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from capture import Session
-from capture.arrays import FloatArray, IntArray
+from capture.arrays import BoolArray, FloatArray, IntArray
 from capture.robot import Robot
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
@@ -15,6 +16,8 @@ from .sampling import decimate, hold, interpolate, mark_gaps, ordered
 from .tracks import Track, resampled
 
 BODY_RATE_HZ = 50.0
+SPARSE_RATE_HZ = 25.0
+"""Of what moves beside the body: commanded shape, distance sensors, names."""
 
 POSE = [
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
@@ -83,8 +86,56 @@ class HeadPath:
     tracked: bool
 
 
+@dataclass(frozen=True)
+class Frames:
+    """When the body is drawn, and where its head was then.
+
+    Attributes:
+        head: The head's path at most 50 times a second, on its own sampling times; a row of NaN
+            in each gap.
+        sparse: Which of these rows, no more than 25 a second, are drawn of what moves beside the
+            body, shape (n,).
+    """
+
+    head: HeadPath
+    sparse: BoolArray
+
+    def between(self, rows: slice) -> Frames:
+        """Some of them.
+
+        Args:
+            rows: Which.
+
+        Returns:
+            These only.
+        """
+        head = self.head
+        part = HeadPath(head.t_ns[rows], head.position[rows], head.quaternion[rows], head.tracked)
+        return Frames(part, self.sparse[rows])
+
+
+def frames_of(head: HeadPath, end_ns: int) -> Frames:
+    """Choose when the body is drawn.
+
+    Args:
+        head: The head's path.
+        end_ns: The session's end [ns].
+
+    Returns:
+        The frames.
+    """
+    chosen = decimate(head.t_ns, BODY_RATE_HZ)
+    pose = np.concatenate([head.position, head.quaternion], axis=1)[chosen]
+    t_ns, pose = mark_gaps(head.t_ns[chosen], pose, end_ns)
+    sparse = np.zeros(t_ns.size, dtype=np.bool_)
+    sparse[decimate(t_ns, SPARSE_RATE_HZ)] = True
+    # A gap ends whatever is drawn.
+    sparse |= np.isnan(pose).any(axis=1)
+    return Frames(HeadPath(t_ns, pose[:, :3], pose[:, 3:], head.tracked), sparse)
+
+
 def read_head(
-    session: Session, robot: Robot, positions: tuple[Track, ...], warnings: list[str]
+    session: Session, robot: Robot, positions: Sequence[Track], warnings: list[str]
 ) -> HeadPath:
     """The head's pose from ``/odom``, or held at the origin.
 
@@ -101,12 +152,12 @@ def read_head(
     if odometry is None or not odometry.count:
         warnings.append("no /odom in the session: the head is held at the origin")
         return still_head(positions[0].t_ns)
-    table = session.table("/odom")
-    child, head = str(table["child_frame_id"].iloc[0]), robot.links[0].name
-    if child != head:
-        warnings.append(f"/odom is of {child or 'no frame'}; it is taken as the head link {head}")
-    pose = table[POSE].to_numpy(dtype=np.float64)
-    return tracked_head(table.index.to_numpy(dtype=np.int64), pose)
+    _, first = next(session.messages("/odom"))
+    child, link = str(first.child_frame_id), robot.links[0].name
+    if child != link:
+        warnings.append(f"/odom is of {child or 'no frame'}; it is taken as the head link {link}")
+    (table,) = session.columns({}, {"/odom": POSE})[1].values()
+    return tracked_head(table.index.to_numpy(dtype=np.int64), table[POSE].to_numpy(np.float64))
 
 
 def still_head(t_ns: IntArray) -> HeadPath:
@@ -143,33 +194,28 @@ def assemble(
     robot: Robot,
     head: HeadPath,
     *,
-    positions: tuple[Track, ...],
-    commands: tuple[Track, ...],
-    power: tuple[Track, ...],
-    end_ns: int,
+    positions: Sequence[Track],
+    commands: Sequence[Track],
+    power: Sequence[Track],
 ) -> Motion:
-    """Bring head, joints and power to common drawing times.
+    """Bring joints and power to the times at which the body is drawn.
 
     Args:
         robot: The robot, m joints.
-        head: The head's path.
+        head: Where its head was at these times.
         positions: Measured angles [rad].
         commands: Commanded angles [rad]; none where none were logged.
         power: Mechanical power of the joints [W]; none where it isn't known.
-        end_ns: The session's end [ns].
 
     Returns:
-        The body at most 50 times a second, on the head's own sampling times; NaN in gaps.
+        What moved; NaN in gaps.
     """
-    chosen = decimate(head.t_ns, BODY_RATE_HZ)
-    pose = np.concatenate([head.position, head.quaternion], axis=1)[chosen]
-    t_ns, pose = mark_gaps(head.t_ns[chosen], pose, end_ns)
-    names = robot.joint_names
+    names, t_ns = robot.joint_names, head.t_ns
     return Motion(
         robot=robot,
         t_ns=t_ns,
-        head_position=pose[:, :3],
-        head_quaternion=pose[:, 3:],
+        head_position=head.position,
+        head_quaternion=head.quaternion,
         angles=resampled(positions, names, t_ns, interpolate),
         commands=resampled(commands, names, t_ns, hold) if commands else None,
         power_w=resampled(power, names, t_ns, interpolate) if power else None,

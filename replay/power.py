@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
+from .joints import log_rows
 from .sampling import interpolate, mark_gaps
 from .timeline import Clock
 from .tracks import Columns, Track
@@ -86,29 +87,15 @@ def total(tracks: Sequence[Track]) -> Track | None:
     return Track("total", t_ns, np.sum(parts, axis=0))
 
 
-def log_total(
-    rec: rr.RecordingStream,
-    clock: Clock,
-    *,
-    mechanical: Sequence[Track],
-    electrical: Sequence[Track],
-) -> bool:
-    """Write the whole body's mechanical and electrical power.
+def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
+    """Say how the line of one kind of the body's power is drawn.
 
     Args:
         rec: The recording.
-        clock: Its timelines.
-        mechanical: Power at the joints [W]; may be empty.
-        electrical: Power of the motors [W]; may be empty.
-
-    Returns:
-        Whether there was any.
+        kind: ``mechanical`` or ``electrical``.
     """
-    for kind, tracks in (("electrical", electrical), ("mechanical", mechanical)):
-        whole = total(tracks)
-        if whole is not None:
-            log_sum(rec, clock, kind, whole)
-    return bool(mechanical or electrical)
+    look = rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5)
+    rec.log(f"{TOTAL}/{kind}", look, static=True)
 
 
 def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> None:
@@ -120,8 +107,6 @@ def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> N
         kind: ``mechanical`` or ``electrical``.
         whole: The body's power [W].
     """
-    entity = f"{TOTAL}/{kind}"
-    rec.log(entity, rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5), static=True)
+    log_total_look(rec, kind)
     t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
-    for rows, times in clock.rows(t_ns):
-        rec.send_columns(entity, times, rr.Scalars.columns(scalars=values[rows, 0]))
+    log_rows(rec, clock, f"{TOTAL}/{kind}", t_ns, values)

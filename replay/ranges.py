@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from capture import Session
 from capture.arrays import FloatArray, IntArray
 from capture.robot import Robot, Sensor, SensorKind
 
+from .body import ROUNDING, rounded_to
 from .motion import Motion
-from .sampling import decimate, hold, ordered
+from .sampling import hold, ordered
 from .timeline import Clock
 
 RANGES = "/world/snake/ranges"
-RANGES_RATE_HZ = 25.0
 
+_AT_ONCE = 4
+"""Sensors that are read in one pass over the file: an hour of each takes memory."""
 _COLOR = (232, 214, 130, 255)
 
 
@@ -24,7 +29,7 @@ def rays(
     sensors: tuple[Sensor, ...],
     centre: FloatArray,
     rotation: FloatArray,
-    reading: FloatArray,
+    reading: FloatArray | NDArray[np.float32],
 ) -> tuple[FloatArray, FloatArray]:
     """From each range sensor to what it sees.
 
@@ -52,24 +57,41 @@ def rays(
     return origin, seen[..., None] * np.einsum("nkij,kj->nki", turn, axis)
 
 
-def log_ranges(rec: rr.RecordingStream, clock: Clock, session: Session, motion: Motion) -> None:
-    """Draw what the distance sensors see, the last reading held until the next.
+@dataclass(frozen=True)
+class Readings:
+    """What the distance sensors said at the times at which they are drawn.
+
+    Attributes:
+        sensors: The sensors, k of them.
+        distance: The last reading at each time, held until the next [m], shape (n, k).
+    """
+
+    sensors: tuple[Sensor, ...]
+    distance: NDArray[np.float32]
+
+
+def read_ranges(session: Session, robot: Robot, at_ns: IntArray) -> Readings:
+    """Read all distance sensors.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         session: The session.
-        motion: What moved.
+        robot: The robot.
+        at_ns: When they are drawn [ns], shape (n,).
+
+    Returns:
+        The readings; without sensors where none was logged.
     """
-    sensors = tuple(
-        sensor for sensor in range_sensors(motion.robot) if sensor.topic in session.channels
-    )
-    if not sensors:
-        return
-    chosen = decimate(motion.t_ns, RANGES_RATE_HZ)
-    t_ns = motion.t_ns[chosen]
-    reading = np.stack([_readings(session, sensor, t_ns) for sensor in sensors], axis=1)
-    log_rays(rec, clock, motion, chosen, sensors=sensors, reading=reading)
+    sensors = tuple(one for one in range_sensors(robot) if one.topic in session.channels)
+    distance = np.full((at_ns.size, len(sensors)), np.nan, dtype=np.float32)
+    for first in range(0, len(sensors), _AT_ONCE):
+        some = sensors[first : first + _AT_ONCE]
+        tables = session.columns({}, {sensor.topic: ["range"] for sensor in some})[1]
+        for i, sensor in enumerate(some, start=first):
+            table = tables.pop(sensor.topic)
+            t_ns, values = table.index.to_numpy(dtype=np.int64), table["range"].to_numpy(np.float64)
+            distance[:, i] = hold(*ordered(t_ns, values), at_ns)
+        session.forget()
+    return Readings(sensors, distance)
 
 
 def range_sensors(robot: Robot) -> tuple[Sensor, ...]:
@@ -92,7 +114,7 @@ def log_rays(
     chosen: IntArray,
     *,
     sensors: tuple[Sensor, ...],
-    reading: FloatArray,
+    reading: FloatArray | NDArray[np.float32],
 ) -> None:
     """Draw what distance sensors see.
 
@@ -111,14 +133,7 @@ def log_rays(
         origin, vector = rays(motion.robot, sensors, *motion.links(chosen[part]), reading[part])
         known = np.isfinite(origin).all(axis=-1) & np.isfinite(vector).all(axis=-1)
         columns = rr.Arrows3D.columns(
-            origins=origin[known].astype(np.float32), vectors=vector[known].astype(np.float32)
+            origins=rounded_to(origin[known], ROUNDING),
+            vectors=rounded_to(vector[known], ROUNDING),
         ).partition(np.count_nonzero(known, axis=1))
         rec.send_columns(RANGES, times, columns)
-
-
-def _readings(session: Session, sensor: Sensor, at_ns: IntArray) -> FloatArray:
-    table = session.table(sensor.topic)
-    t_ns, distance = ordered(
-        table.index.to_numpy(dtype=np.int64), table["range"].to_numpy(dtype=np.float64)
-    )
-    return hold(t_ns, distance, at_ns)

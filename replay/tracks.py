@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from capture.arrays import FloatArray, IntArray
 from capture.errors import DataError, MissingChannelError
 from capture.log.signals import JointSignals
 
-from .sampling import ordered
+from .sampling import interpolate, ordered
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
@@ -56,29 +56,52 @@ class Table:
     values: FloatArray
 
 
-def read_columns(session: Session) -> Columns:
-    """All JointState topics of a session.
+def wanted_fields(session: Session) -> dict[str, list[str]]:
+    """What a picture needs of a session's JointState topics.
 
     Args:
         session: The session.
 
     Returns:
-        (topic, field) to a track for each joint that has at least one sample, in the session's
-        order: the position of every topic, velocity and effort of ``/joint_states``.
+        Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
     """
-    wanted = {
+    return {
         topic: ["position", *(["velocity", "effort"] if topic == "/joint_states" else [])]
         for topic, channel in session.channels.items()
         if channel.type_name == JOINT_STATE and channel.count and topic not in OFFSETS
     }
+
+
+def read_columns(
+    session: Session,
+    wanted: Mapping[str, Sequence[str]] | None = None,
+    *,
+    start_ns: int | None = None,
+    stop_ns: int | None = None,
+) -> Columns:
+    """JointState topics of a session.
+
+    Args:
+        session: The session.
+        wanted: Topic to fields; None for all of :func:`wanted_fields`.
+        start_ns: First sampling time wanted [Unix ns]; None for the session's start.
+        stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
+
+    Returns:
+        (topic, field) to a track for each joint that has at least one sample, in the session's
+        order; without what never comes.
+    """
+    fields = wanted_fields(session) if wanted is None else wanted
+    window = {"start_ns": start_ns, "stop_ns": stop_ns}
     try:
-        columns = session.joint_columns(wanted)
+        columns = session.joint_columns(fields, **window)
     except (MissingChannelError, DataError):  # a field that never comes: take the others singly
         columns: dict[tuple[str, str], JointSignals] = {}
-        for topic, field in [(one, field) for one in wanted for field in wanted[one]]:
+        for topic, field in [(one, field) for one in fields for field in fields[one]]:
             with contextlib.suppress(MissingChannelError, DataError):
-                columns[topic, field] = session.joints(topic, field)
-    return {key: _tracks(signals) for key, signals in columns.items()}
+                columns[topic, field] = session.joints(topic, field, **window)
+    found = {key: _tracks(signals) for key, signals in columns.items()}
+    return {key: tracks for key, tracks in found.items() if tracks}
 
 
 def _tracks(signals: JointSignals) -> tuple[Track, ...]:
@@ -128,6 +151,36 @@ def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
         )
         for group in together.values()
     )
+
+
+def in_turn(first: IntArray, other: IntArray) -> bool:
+    """Whether two joints were sampled in turn: one of the other between any two of the first.
+
+    Args:
+        first: Sampling times of one joint [ns], ascending, shape (n,).
+        other: Those of the other, shape (m,).
+
+    Returns:
+        Whether they take turns throughout.
+    """
+    place = np.searchsorted(first, other, side="right")
+    inner = place[(place > 0) & (place < first.size)]
+    return inner.size >= max(first.size - 2, 1) and bool(np.all(np.diff(inner) == 1))
+
+
+def brought_together(tracks: Sequence[Track]) -> Table:
+    """Joints at the times of the first of them.
+
+    Args:
+        tracks: Joints that were sampled together or in turn, at least one.
+
+    Returns:
+        One table; the values of the others lie on the straight lines between their samples, which
+        is what a plot draws of them.
+    """
+    first = tracks[0]
+    values = [interpolate(track.t_ns, track.values, first.t_ns) for track in tracks]
+    return Table(tuple(track.name for track in tracks), first.t_ns, np.stack(values, axis=1))
 
 
 def resampled(

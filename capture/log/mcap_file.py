@@ -111,6 +111,12 @@ class McapFile:
         self._buffer.close()
         self._close_descriptor()
 
+    def forget(self) -> None:
+        """Let go of the file's pages and of what was decompressed; it is read again when needed."""
+        self._cache.clear()
+        if hasattr(mmap, "MADV_DONTNEED"):  # what is mapped counts as this process's memory
+            self._buffer.madvise(mmap.MADV_DONTNEED)
+
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """See :meth:`BlockSource.payload`."""
         if not block.compression:

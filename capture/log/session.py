@@ -87,6 +87,14 @@ class Session:
         """Release the file."""
         self._file.close()
 
+    def forget(self) -> None:
+        """Let go of the memory of what was read so far.
+
+        For who goes through a long session stretch by stretch: the pages of a mapped file count as
+        this process's memory as long as they are. What is read next is the same.
+        """
+        self._file.forget()
+
     def __enter__(self) -> Self:
         """Nothing to do: the file is open."""
         return self

@@ -86,6 +86,11 @@ class LogFile:
         self.scratch.clear()
         self.parts.close()
 
+    def forget(self) -> None:
+        """Let go of what was read; it is read again when needed."""
+        for file in self.files:
+            file.forget()
+
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """See :meth:`BlockSource.payload`."""
         return self._sources[block.part].payload(block)

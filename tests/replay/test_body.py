@@ -5,9 +5,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.robot.kinematics import link_poses
-from replay.body import ROUNDING, capsule_columns, capsule_poses, capsule_shape, segment_power
+from replay.body import (
+    ROUNDING,
+    TURN_ROUNDING,
+    capsule_columns,
+    capsule_poses,
+    capsule_shape,
+    segment_power,
+)
 from replay.markers import above_joints
-from replay.motion import HeadPath, assemble
+from replay.motion import HeadPath, assemble, frames_of
 from replay.tracks import Track
 
 
@@ -27,17 +34,28 @@ def test_capsules_run_from_behind_the_centre_to_before_it(snake25, postures):
     length, _ = capsule_shape(snake25)
     drawn = Rotation.from_quat(quaternion.reshape(-1, 4).astype(float))
     along = drawn.apply([0.0, 0.0, 1.0]).reshape(origin.shape)
-    # An error of half a rounding step in each of three or four components.
-    np.testing.assert_allclose(along, rotation[..., 0], atol=2 * ROUNDING)
+    # An error of half a rounding step in each of three components.
+    np.testing.assert_allclose(along, rotation[..., 0], atol=2 * TURN_ROUNDING)
     np.testing.assert_allclose(
-        origin + 0.5 * length[:, None] * along, centre, atol=ROUNDING / 2 + length[0] * ROUNDING
+        origin + 0.5 * length[:, None] * along,
+        centre,
+        atol=ROUNDING / 2 + length[0] * TURN_ROUNDING,
     )
 
 
+def test_capsules_point_straight_up_and_straight_down(snake25):
+    turn = Rotation.from_rotvec([[0.0, -np.pi / 2, 0.0], [0.0, np.pi / 2, 0.0]]).as_matrix()
+    rotation = np.repeat(turn[:, None], 26, axis=1)
+    _, quaternion = capsule_poses(snake25, np.zeros((2, 26, 3)), rotation)
+    along = Rotation.from_quat(quaternion[:, 0].astype(float)).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(along, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], atol=1e-12)
+
+
 def test_poses_are_multiples_of_the_rounding(snake25, postures):
-    for values in capsule_poses(snake25, *postures[3]):
+    steps = (ROUNDING, TURN_ROUNDING)
+    for values, step in zip(capsule_poses(snake25, *postures[3]), steps, strict=True):
         assert values.dtype == np.float32
-        np.testing.assert_array_equal(values / ROUNDING, np.round(values / ROUNDING))
+        np.testing.assert_array_equal(values / step, np.round(values / step))
 
 
 def test_a_straight_snake_lies_behind_its_head(snake25):
@@ -81,12 +99,12 @@ def test_the_body_is_drawn_on_the_heads_own_times(snake25):
     head = HeadPath(t_ns, np.zeros((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1)), tracked=True)
     slow = t_ns[::4] + 1_000_000
     positions = tuple(Track(n, slow, 1e-9 * slow) for n in snake25.joint_names)
-    motion = assemble(
-        snake25, head, positions=positions, commands=(), power=(), end_ns=int(t_ns[-1])
-    )
+    frames = frames_of(head, int(t_ns[-1]))
+    motion = assemble(snake25, frames.head, positions=positions, commands=(), power=())
     np.testing.assert_array_equal(motion.t_ns, t_ns[::2])
     inside = (motion.t_ns >= slow[0]) & (motion.t_ns <= slow[-1])
     np.testing.assert_allclose(motion.angles[inside, 7], 1e-9 * motion.t_ns[inside])
     assert np.isnan(motion.angles[~inside]).all()
     assert motion.commands is None
     assert motion.power_w is None
+    np.testing.assert_array_equal(motion.t_ns[frames.sparse], t_ns[::4])

@@ -48,9 +48,9 @@ def rows(recorded, entity, component):
     return dict(sorted((t, v) for t, v in found if v is not None))
 
 
-def same(first, second):
+def same(first, second, atol=1e-12):
     return np.allclose(
-        np.asarray(first, dtype=float), np.asarray(second, dtype=float), atol=1e-12, equal_nan=True
+        np.asarray(first, dtype=float), np.asarray(second, dtype=float), atol=atol, equal_nan=True
     )
 
 
@@ -71,20 +71,19 @@ def test_angles_are_those_that_were_measured(live, truth):
         ("/joints/commanded", truth.command),
         ("/joints/error", truth.position - truth.command),
     ):
-        found = rows(drawn, entity, "Scalars:scalars")
+        found = rows(drawn, entity, "Angle:degrees")
         assert list(found) == t_ns.tolist()
-        np.testing.assert_allclose(list(found.values()), values, atol=1e-12)
-    degrees = rows(drawn, "/joints/measured", "Angle:degrees")
-    np.testing.assert_allclose(list(degrees.values()), np.degrees(truth.position), rtol=1e-5)
+        np.testing.assert_allclose(list(found.values()), np.degrees(values), atol=2e-6)
 
 
 def test_power_is_torque_times_velocity(live, truth):
     _, drawn = live
     found = rows(drawn, "/power/mechanical", "Scalars:scalars")
     assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
-    np.testing.assert_allclose(list(found.values()), truth.effort * truth.velocity, atol=1e-12)
+    np.testing.assert_allclose(list(found.values()), truth.effort * truth.velocity, atol=1e-8)
     total = rows(drawn, "/power/total/electrical", "Scalars:scalars")
-    np.testing.assert_allclose(np.ravel(list(total.values())), 6.0 * truth.effort.sum(axis=1))
+    shown = np.ravel(list(total.values()))
+    np.testing.assert_allclose(shown, 6.0 * truth.effort.sum(axis=1), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -94,8 +93,8 @@ def test_power_is_torque_times_velocity(live, truth):
         ("/world/snake/measured", "Capsules3D:quaternions"),
         ("/world/snake/commanded", "Capsules3D:translations"),
         ("/world/snake/places", "Points3D:positions"),
-        ("/joints/places/head/measured", "Scalars:scalars"),
-        ("/joints/error", "Scalars:scalars"),
+        ("/joints/places/measured", "Scalars:scalars"),
+        ("/joints/error", "Angle:degrees"),
         ("/signals/joint_current", "Scalars:scalars"),
         ("/gait/mode", "StateChange:state"),
         ("/events", "TextLog:text"),
@@ -106,11 +105,15 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
     seen, expected = rows(drawn, entity, component), rows(replay, entity, component)
     common = [t for t in expected if t in seen]
     assert len(common) >= 0.9 * len(expected)
+    # A replay rounds its lines by no more than a thousandth of their range.
+    atol = 1e-12
+    if component in {"Scalars:scalars", "Angle:degrees"}:
+        atol = 1e-3 * np.ptp(np.array(list(expected.values())), axis=0) + 1e-7
     for t in common:
         if isinstance(expected[t][0], str):
             assert seen[t] == expected[t]
         else:
-            assert same(seen[t], expected[t])
+            assert same(seen[t], expected[t], atol)
 
 
 def test_names_and_colours_are_the_replays(live, replay):

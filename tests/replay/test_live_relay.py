@@ -42,9 +42,10 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     report = relay.finish()
     assert report["dropped"] == 0
     drawn = read_back(relay.output)
-    found = rows(drawn, "/joints/measured", "Scalars:scalars")
+    found = rows(drawn, "/joints/measured", "Angle:degrees")
     assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
-    np.testing.assert_allclose(list(found.values()), truth.position[150:], atol=1e-12)
+    expected = np.degrees(truth.position[150:])
+    np.testing.assert_allclose(list(found.values()), expected, atol=2e-6)
     # The mode was said before, and still holds.
     assert rows(drawn, "/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
@@ -59,8 +60,12 @@ def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back
     recorder.feed.close()
     assert relay.finish()["dropped"] == 0
     drawn = read_back(relay.output)
-    for entity in ("/joints/measured", "/joints/error", "/power/mechanical"):
-        found = rows(drawn, entity, "Scalars:scalars")
+    for entity, component in (
+        ("/joints/measured", "Angle:degrees"),
+        ("/joints/error", "Angle:degrees"),
+        ("/power/mechanical", "Scalars:scalars"),
+    ):
+        found = rows(drawn, entity, component)
         assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
 
 
@@ -80,7 +85,7 @@ def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch
     report = relay.finish()
     assert report["dropped"] == recorder.feed.counts.dropped
     assert report["shown"] == recorder.feed.counts.sent
-    found = list(rows(read_back(relay.output), "/joints/measured", "Scalars:scalars"))
+    found = list(rows(read_back(relay.output), "/joints/measured", "Angle:degrees"))
     assert found[:50] == [10_000_000 * i for i in range(50)]
     assert found[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
 
@@ -99,7 +104,7 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     recorder.send(1.5)
     recorder.feed.close()
     second.finish()
-    found = list(rows(read_back(second.output), "/joints/measured", "Scalars:scalars"))
+    found = list(rows(read_back(second.output), "/joints/measured", "Angle:degrees"))
     assert found == [1_500_000_000 + 10_000_000 * i for i in range(150)]
 
 
@@ -121,10 +126,11 @@ def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     relay.finish()
     drawn = read_back(relay.output)
     for j in (0, 12, 24):
-        found = rows(drawn, f"/joints/measured/{snake25.joint_names[j]}", "Scalars:scalars")
+        found = rows(drawn, f"/joints/measured/{snake25.joint_names[j]}", "Angle:degrees")
         expected = truth.t_ns - EPOCH_NS + round(offset[j] * 1e9)
         assert np.abs(np.array(list(found)) - expected).max() <= 1
-        np.testing.assert_allclose(np.ravel(list(found.values())), truth.position[:, j])
+        shown = np.ravel(list(found.values()))
+        np.testing.assert_allclose(shown, np.degrees(truth.position[:, j]), atol=2e-6)
     centres = rows(drawn, "/world/snake/measured", "Capsules3D:translations")
     assert len(centres) > 100  # at the origin, without odometry
 

@@ -24,6 +24,15 @@ def rows(column):
     return np.array(column, dtype=float)
 
 
+def assert_drawn(shown, truth):
+    """Lines are rounded by at most a thousandth of their range, and to 32 bits."""
+    assert shown.shape == truth.shape
+    np.testing.assert_array_equal(np.isnan(shown), np.isnan(truth))
+    room = np.nanmax(truth, axis=0) - np.nanmin(truth, axis=0)
+    apart = np.nanmax(np.abs(shown - truth), axis=0)
+    assert (apart <= 1e-3 * room + 1e-7 * np.nanmax(np.abs(truth))).all()
+
+
 def test_the_file_passes_reruns_own_verification(recording, rerun_command):
     rerun_command("rrd", "verify", recording[0].path)
 
@@ -37,8 +46,8 @@ def test_all_entities_are_there_by_name(recording):
         "/joints/commanded",
         "/joints/measured",
         "/joints/error",
-        "/joints/places/head/measured",
-        "/joints/places/tail/commanded",
+        "/joints/places/measured",
+        "/joints/places/commanded",
         "/power/mechanical",
         "/power/total/mechanical",
         "/power/total/electrical",
@@ -50,40 +59,38 @@ def test_all_entities_are_there_by_name(recording):
     }
 
 
-@pytest.mark.parametrize(
-    ("entity", "field"),
-    [
-        ("/joints/measured", "position"),
-        ("/joints/commanded", "command"),
-        ("/signals/joint_current", "effort"),
-    ],
-)
-def test_scalars_equal_the_sessions_columns(recording, truth, entity, field):
+def test_angles_are_shown_in_degrees(recording, truth):
     _, found = recording
-    np.testing.assert_array_equal(
-        rows(found.column(entity, "Scalars:scalars")), getattr(truth, field)
-    )
-    np.testing.assert_array_equal(found.times(entity), truth.t_ns - START)
+    for entity, angles in (("measured", truth.position), ("commanded", truth.command)):
+        shown = rows(found.column(f"/joints/{entity}", "Angle:degrees"))
+        assert_drawn(shown, np.degrees(angles))
+        np.testing.assert_array_equal(found.times(f"/joints/{entity}"), truth.t_ns - START)
 
 
-def test_plots_show_degrees(recording, truth):
-    shown = rows(recording[1].column("/joints/measured", "Angle:degrees"))
-    np.testing.assert_allclose(shown, np.degrees(truth.position), rtol=1e-6, atol=1e-6)
-    tail = rows(recording[1].column("/joints/places/tail/measured", "Scalars:scalars"))
-    np.testing.assert_allclose(tail[:, 0], np.degrees(truth.position[:, 24]), rtol=1e-12)
+def test_other_topics_are_shown_in_their_unit(recording, truth):
+    shown = rows(recording[1].column("/signals/joint_current", "Scalars:scalars"))
+    assert_drawn(shown, truth.effort)
+
+
+def test_head_middle_and_tail_have_a_plot_of_their_own(recording, truth):
+    _, found = recording
+    shown = rows(found.column("/joints/places/measured", "Scalars:scalars"))
+    assert_drawn(shown, np.degrees(truth.position[:, [0, 12, 24]]))
+    names = ["joint01 head", "joint13 middle", "joint25 tail"]
+    assert found.static("/joints/places/measured", "SeriesLines:names") == names
+    assert found.static("/joints/places/measured", "SeriesLines:widths") == [2.0, 2.0, 2.0]
 
 
 def test_error_and_power_follow_from_the_columns(recording, truth):
     _, found = recording
-    np.testing.assert_allclose(
-        rows(found.column("/joints/error", "Scalars:scalars")), truth.position - truth.command
-    )
+    error = rows(found.column("/joints/error", "Angle:degrees"))
+    assert_drawn(error, np.degrees(truth.position - truth.command))
     power = truth.effort * truth.velocity
-    np.testing.assert_allclose(rows(found.column("/power/mechanical", "Scalars:scalars")), power)
+    assert_drawn(rows(found.column("/power/mechanical", "Scalars:scalars")), power)
     total = rows(found.column("/power/total/mechanical", "Scalars:scalars"))
-    np.testing.assert_allclose(total[:, 0], power.sum(axis=1), atol=1e-15)
+    assert_drawn(total, power.sum(axis=1, keepdims=True))
     electrical = rows(found.column("/power/total/electrical", "Scalars:scalars"))
-    np.testing.assert_allclose(electrical[:, 0], 6.0 * truth.effort.sum(axis=1), atol=1e-12)
+    assert_drawn(electrical, 6.0 * truth.effort.sum(axis=1, keepdims=True))
 
 
 def test_joints_are_named_and_keep_their_colours(recording, snake25):
@@ -175,9 +182,7 @@ def test_lost_samples_stay_holes(write, truth, read_back, tmp_path):
     position[100:110, 6] = np.nan
     written = converted(write(tmp_path / "a.mcap", position=position), tmp_path / "a.rrd")
     found = read_back(written.path)
-    np.testing.assert_array_equal(
-        rows(found.column("/joints/measured", "Scalars:scalars")), position
-    )
+    assert_drawn(rows(found.column("/joints/measured", "Angle:degrees")), np.degrees(position))
     links = [len(row) for row in found.column("/world/snake/measured", "Capsules3D:translations")]
     assert links == [7 if 50 <= i < 55 else 26 for i in range(150)]
 
@@ -186,10 +191,10 @@ def test_a_pause_is_not_bridged(write, truth, read_back, tmp_path):
     keep = (truth.t < 1.0) | (truth.t >= 2.0)
     written = converted(write(tmp_path / "a.mcap", keep=keep), tmp_path / "a.rrd")
     found = read_back(written.path)
-    measured = rows(found.column("/joints/measured", "Scalars:scalars"))
+    measured = rows(found.column("/joints/measured", "Angle:degrees"))
     assert measured.shape == (201, 25)
     assert np.isnan(measured[100]).all()
-    np.testing.assert_array_equal(np.delete(measured, 100, axis=0), truth.position[keep])
+    assert_drawn(np.delete(measured, 100, axis=0), np.degrees(truth.position[keep]))
     assert found.times("/joints/measured")[100] == 1_000_000_000
     body = found.column("/world/snake/measured", "Capsules3D:translations")
     assert [i for i, row in enumerate(body) if not row] == [50]
@@ -211,9 +216,8 @@ def test_without_a_robot_there_are_plots_but_no_body(write, truth, read_back, tm
     assert any("no robot description" in warning for warning in written.warnings)
     found = read_back(written.path)
     assert not [entity for entity in found.entities if entity.startswith("/world")]
-    np.testing.assert_array_equal(
-        rows(found.column("/joints/measured", "Scalars:scalars")), truth.position
-    )
+    shown = rows(found.column("/joints/measured", "Angle:degrees"))
+    assert_drawn(shown, np.degrees(truth.position))
 
 
 def test_without_torques_the_body_wears_the_colours_of_its_joints(write, read_back, tmp_path):
@@ -232,9 +236,11 @@ def test_without_a_gait_there_is_one_timeline(write, read_back, tmp_path):
     assert "/events" not in found.entities
 
 
-def test_servos_polled_in_turn_keep_their_own_times(snake25, read_back, tmp_path):
+def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times(
+    snake25, read_back, tmp_path
+):
     names = snake25.joint_names
-    offset = 1e-4 * np.arange(25)
+    offset = 2.5e-4 * np.arange(25)
     t = START + np.arange(50, dtype=np.int64) * 10_000_000
     with SessionWriter(
         tmp_path / "a.mcap", session_id="polled", epoch_ns=START, robot=snake25
@@ -245,11 +251,11 @@ def test_servos_polled_in_turn_keep_their_own_times(snake25, read_back, tmp_path
             states.write(t_ns, np.full(25, (t_ns - START) * 1e-9) + offset)
             offsets.write(t_ns, offset)
     found = read_back(converted(tmp_path / "a.mcap", tmp_path / "a.rrd").path)
-    for i in (0, 7, 24):
-        entity = f"/joints/measured/{names[i]}"
-        values = rows(found.column(entity, "Scalars:scalars"))[:, 0]
-        np.testing.assert_allclose(values, found.times(entity) * 1e-9, atol=2e-9)
-        np.testing.assert_array_equal(found.times(entity), t - START + round(offset[i] * 1e9))
+    np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
+    shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
+    assert np.isnan(shown[0, 1:]).all()  # none of them was sampled before
+    line = np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25))
+    assert_drawn(shown[1:], line)
 
 
 def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_path):
@@ -264,8 +270,8 @@ def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_p
             other.write(t_ns, np.array([0.01]))
     written = converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
     found = read_back(written.path)
-    right = rows(found.column("/joints/measured/right", "Scalars:scalars"))
-    np.testing.assert_array_equal(right[:, 0], np.arange(1, 60, 2))
+    right = rows(found.column("/joints/measured/right", "Angle:degrees"))
+    assert_drawn(np.radians(right), np.arange(1.0, 60.0, 2.0)[:, None])
     assert len(found.column("/signals/gripper/state", "Scalars:scalars")) == 60
     assert [signal.title for signal in written.content.signals] == ["gripper/state [m]"]
 
