@@ -9,6 +9,7 @@ the socket refuses and what is sent more than 20 ms late counts as lost.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import signal
@@ -236,7 +237,11 @@ def frozen_viewer(folder: Path, seconds: float) -> Outcome:
 
 def main() -> None:
     """Run everything and judge it."""
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("seconds", type=float, nargs="?", default=60.0, help="of each run")
+    seconds = parser.parse_args().seconds
     print(f"two buses of {RATE:.0f} frames/s, {seconds:.0f} s\n{HEAD}", flush=True)
     runs = [
         lambda folder: over_unix(folder, seconds),
