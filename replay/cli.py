@@ -10,15 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from capture.console import emit_json, progress, refuse_existing
-from capture.errors import UndulogError, UsageError
+from capture.errors import UsageError
 
 from .beside.options import BesideOptions
 from .clip_cli import ClipOptions, view_clip
 
 if TYPE_CHECKING:
-    from analysis.result import Analysis
-    from capture import Session
-
     from .rrd import Recording
 
 
@@ -28,6 +25,7 @@ def view(
     save: Path | None = None,
     web: bool = False,
     connect: str | None = None,
+    result: list[Path] | None = None,
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
     beside: Annotated[BesideOptions | None, Parameter(name="*")] = None,
@@ -57,6 +55,9 @@ def view(
         web: Serve the viewer to a browser on this machine (127.0.0.1 only) until interrupted.
         connect: With `--live`: send to a Rerun viewer that runs already, by its address, e.g.
             `rerun+http://127.0.0.1:9876/proxy`.
+        result: Show what was found before instead of analysing now: `.json` of `undulog analyse`.
+            Results of an experiment or a comparison that the session is part of mark the modules
+            they name. May be given several times.
         clip: Write a moving picture of the body to this `.gif` or `.mp4` file instead of opening
             the viewer; it is drawn off screen.
         shot: How the clip is filmed.
@@ -68,6 +69,8 @@ def view(
     _check_usage(files, live, save=save, web=web, connect=connect, clip=clip, json=json)
     if beside is not None and len(files) < 2:
         raise UsageError(f"{', '.join(beside.given)}: needs two sessions or more, side by side")
+    if result and (len(files) != 1 or clip is not None):
+        raise UsageError("--result is shown over one session; give one file, without --clip")
     if shot is not None and clip is None:
         raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
     if clip is not None:
@@ -82,7 +85,7 @@ def view(
 
         view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1:
-        _view_file(files[0], save=save, web=web, json=json)
+        _view_file(files[0], result or [], save=save, web=web, json=json)
     else:
         from .beside.cli import view_beside
 
@@ -115,9 +118,11 @@ def _check_usage(
         )
 
 
-def _view_file(file: Path, *, save: Path | None, web: bool, json: bool) -> None:
+def _view_file(
+    file: Path, results: Sequence[Path], *, save: Path | None, web: bool, json: bool
+) -> None:
     if save is not None:
-        recording, duration_s = _convert(file, save)
+        recording, duration_s = _convert(file, save, results)
         _report(recording, duration_s, json=json)
         return
 
@@ -126,7 +131,7 @@ def _view_file(file: Path, *, save: Path | None, web: bool, json: bool) -> None:
     if not web:
         viewer.require_display()
     with tempfile.TemporaryDirectory(prefix="undulog-view-") as folder:
-        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd")
+        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd", results)
         for warning in recording.warnings:
             print(f"note: {warning}")
         if web:
@@ -135,28 +140,25 @@ def _view_file(file: Path, *, save: Path | None, web: bool, json: bool) -> None:
             viewer.show(recording.path)
 
 
-def _convert(file: Path, output: Path) -> tuple[Recording, float]:
+def _convert(file: Path, output: Path, results: Sequence[Path]) -> tuple[Recording, float]:
     from capture import Session
 
+    from .results import computed, saved
     from .rrd import write_recording
 
     with Session.open(file) as session, progress("view", total=2) as bar:
-        bar.update(0, note="analysis")
-        analysis, why_not = _analysis(session)
+        bar.update(0, note="results" if results else "analysis")
+        layer = saved(session, results) if results else computed(session)
         bar.update(1, note="recording")
-        notes = () if why_not is None else (why_not,)
-        recording = write_recording(session, output, analysis=analysis, notes=notes)
+        recording = write_recording(
+            session,
+            output,
+            analysis=layer.analysis,
+            steady=layer.steady,
+            named=layer.named,
+            notes=layer.notes,
+        )
         return recording, session.duration_s
-
-
-def _analysis(session: Session) -> tuple[Analysis | None, str | None]:
-    """The session's analysis, or why there is none; a session without a gait can be seen too."""
-    from analysis.analyse import analyse_session
-
-    try:
-        return analyse_session(session), None
-    except UndulogError as error:
-        return None, f"no response bars: {error}"
 
 
 def _report(recording: Recording, duration_s: float, *, json: bool) -> None:

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from capture.arrays import FloatArray
 
+NAMED = (255, 95, 190, 255)
+"""Pink of a module that a test names: on none of the maps."""
+
 _DRIVEN = np.array([0, 205, 220])
 _IDLE = np.array([112, 112, 120])
 _DRIVES = np.array([255, 84, 48])

@@ -12,6 +12,10 @@ from analysis.formats import utc
 from analysis.result import Analysis
 from capture import Session
 
+from .content import Content
+from .layer import Named
+from .mean_cycle import ENSEMBLE_CYCLE
+
 FACTS = "/session"
 
 
@@ -21,6 +25,8 @@ def markdown(
     *,
     notes: Sequence[str],
     colors: str,
+    content: Content,
+    named: Sequence[Named] = (),
     has_cycles: bool,
 ) -> str:
     """What a reader needs beside the picture.
@@ -30,6 +36,8 @@ def markdown(
         analysis: Its analysis, or None where there is none.
         notes: What is missing or was assumed, a sentence each.
         colors: What the body's colours mean.
+        content: What the recording holds.
+        named: Modules that tests name.
         has_cycles: Whether there is a timeline of gait cycles.
 
     Returns:
@@ -45,15 +53,34 @@ def markdown(
         *_versions(session.metadata),
     )
     told_first = "Not analysed." if analysis is None else answer(analysis).sentence
-    parts = [f"**{told_first}**", " · ".join(facts)]
+    parts = [f"**{told_first}**"]
+    if named:
+        told = ", ".join(f"{one.joint} ({one.why})" for one in named)
+        parts.append(f"**Named, pink in the pictures:** {told}")
+    parts.append(" · ".join(facts))
     told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
     if told:
         parts.append("\n".join(f"- {note}" for note in told))
-    legend = f"{colors}. Grey is commanded."
-    if has_cycles:
-        legend += " On `gait_cycle` one second is one cycle of the gait."
-    parts.append(legend)
+    parts.append(_legend(colors, content, has_cycles=has_cycles))
     return "\n\n".join(parts) + "\n"
+
+
+def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
+    """What lines, bars and timelines mean."""
+    words = [f"{colors}. Grey is commanded."]
+    if content.charts:
+        words.append(
+            "Coloured bars: the analysed stretch, a whisker to the far end of the 95 % interval."
+        )
+    if content.charts and content.cycles:
+        words.append("White bars: the cycle at the cursor; energies are of one cycle.")
+    if has_cycles:
+        words.append("On `gait_cycle` one second is one cycle of the gait.")
+    if content.mean is not None:
+        words.append(
+            f"`{ENSEMBLE_CYCLE}` plays the mean cycle by degrees of phase (tab *Mean cycle*)."
+        )
+    return " ".join(words)
 
 
 def log_facts(rec: rr.RecordingStream, text: str) -> None:

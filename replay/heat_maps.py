@@ -9,7 +9,7 @@ A frame marks the cycle at the time cursor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,9 @@ from analysis.result import Analysis
 from capture.arrays import FloatArray
 from capture.palette import joint_colors
 
-from .colors import power_colors
+from .colors import NAMED, power_colors
 from .cycles import ENERGY, GAIN, LAG, CycleTable, Quantity, cycle_times_ns, mean_power, together
+from .joints import Color
 from .timeline import Clock
 
 MAPS = "/maps"
@@ -136,13 +137,19 @@ def cell_colors(shown: HeatMap) -> NDArray[np.uint8]:
     return np.where(known[..., None], colors, np.array(_NOTHING, dtype=np.uint8))
 
 
-def log_maps(rec: rr.RecordingStream, clock: Clock, maps: Sequence[HeatMap]) -> None:
+def log_maps(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    maps: Sequence[HeatMap],
+    named: Collection[str] = (),
+) -> None:
     """Write the maps.
 
     Args:
         rec: The recording.
         clock: Its timelines.
         maps: What to draw.
+        named: Joints whose numbers below the maps carry a mark.
     """
     for shown in maps:
         _, width, height = _cells(shown)
@@ -156,7 +163,7 @@ def log_maps(rec: rr.RecordingStream, clock: Clock, maps: Sequence[HeatMap]) -> 
             strokes = np.stack([corner, corner + side], axis=1)
             drawn = rr.LineStrips2D(strokes, colors=_STROKE, radii=rr.Radius.ui_points(0.5))
             rec.log(f"{shown.entity}/missing", drawn, static=True)
-        _log_axes(rec, shown)
+        _log_axes(rec, shown, named)
         _log_bar(rec, shown)
         if shown.table.value.size <= _MOST_TOLD:
             _log_told(rec, shown)
@@ -195,19 +202,23 @@ def _limits(table: CycleTable, settled: FloatArray, *, signed: bool) -> tuple[fl
     return low - short_by, high + short_by
 
 
-def _log_axes(rec: rr.RecordingStream, shown: HeatMap) -> None:
+def _log_axes(rec: rr.RecordingStream, shown: HeatMap, named: Collection[str]) -> None:
     count, width, height = _cells(shown)
     m = len(shown.places)
-    column = range(0, m, -(-m // _COLUMN_LABELS))
+    marked = [i for i, name in enumerate(shown.table.names) if name in named]
+    column = [i for i in range(0, m, -(-m // _COLUMN_LABELS)) if i not in marked]
     row = range(0, count, -(-count // _ROW_LABELS))
-    digits = decimals_for_values(np.diff(shown.table.start_s[list(row)]).tolist(), 2)
     points = [((i + 0.5) * width, SIZE[1] + 2.0) for i in column]
     texts = [str(shown.places[i]) for i in column]
     points += [(-22.0, k * height) for k in row]
-    texts += [f"{number(float(shown.table.start_s[k]), min(digits, 1))} s" for k in row]
+    texts += [f"{number(float(shown.table.start_s[k]), 1)} s" for k in row]
     points.append((SIZE[0] / 2, SIZE[1] + 21.0))
     texts.append("joint, head to tail; a row is one cycle")
     _log_text(rec, f"{shown.entity}/axes", points, texts)
+    if marked:
+        points = [((i + 0.5) * width, SIZE[1] + 2.0) for i in marked]
+        texts = [str(shown.places[i]) for i in marked]
+        _log_text(rec, f"{shown.entity}/named", points, texts, NAMED)
 
 
 def _log_bar(rec: rr.RecordingStream, shown: HeatMap) -> None:
@@ -231,9 +242,13 @@ def _log_bar(rec: rr.RecordingStream, shown: HeatMap) -> None:
 
 
 def _log_text(
-    rec: rr.RecordingStream, entity: str, points: Sequence[tuple[float, float]], texts: list[str]
+    rec: rr.RecordingStream,
+    entity: str,
+    points: Sequence[tuple[float, float]],
+    texts: list[str],
+    color: Color = _TEXT,
 ) -> None:
-    drawn = rr.Points2D(points, labels=texts, show_labels=True, radii=_DOT, colors=_TEXT)
+    drawn = rr.Points2D(points, labels=texts, show_labels=True, radii=_DOT, colors=color)
     rec.log(entity, drawn, static=True)
 
 

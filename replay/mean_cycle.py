@@ -251,7 +251,7 @@ def _log_places(
     for name, label in pairs:
         path = f"{PLACES}/{rr.escape_entity_path_part(label)}"
         if asked is not None and name in asked.names:
-            line = rr.SeriesLines(names=f"{name} command", colors=GREY, widths=1.0)
+            line = rr.SeriesLines(names="command", colors=GREY, widths=1.0)
             _log_line(rec, f"{path}/commanded", line, asked.of(name)[0])
         if name not in moved.names:
             continue
@@ -259,7 +259,7 @@ def _log_places(
         mean, half = moved.of(name)
         color = look.palette[name]
         if np.isfinite(half).any():
-            line = rr.SeriesLines(names=f"{name} 95 %", colors=(*color[:3], _FAINT), widths=1.0)
+            line = rr.SeriesLines(names="95 % interval", colors=(*color[:3], _FAINT), widths=1.0)
             _log_line(rec, f"{path}/low", line, mean - half)
             _log_line(rec, f"{path}/high", line, mean + half)
         title = name if label == name else f"{name} {label}"

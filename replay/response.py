@@ -9,7 +9,7 @@ joint's colour and name.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ import rerun as rr
 
 from analysis.result import Analysis, Estimate
 
+from .colors import NAMED
 from .cycles import ENERGY, GAIN, LAG, CycleTable, cycle_times_ns, together
 from .joints import GREY, Color
 from .timeline import Clock
@@ -30,6 +31,7 @@ CURRENT: Color = (235, 235, 240, 255)
 _LEFT, _WIDTH = -0.42, 0.54
 _WHISKER = 0.14
 _CURRENT_LEFT, _CURRENT_WIDTH = 0.16, 0.26
+_MARK_LEFT, _MARK_WIDTH = -0.56, 0.12
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,10 @@ def charts(analysis: Analysis) -> tuple[Chart, ...]:
 
 
 def log_charts(
-    rec: rr.RecordingStream, found: tuple[Chart, ...], palette: Mapping[str, Color]
+    rec: rr.RecordingStream,
+    found: tuple[Chart, ...],
+    palette: Mapping[str, Color],
+    named: Collection[str] = (),
 ) -> None:
     """Write the bars, valid for the whole session.
 
@@ -96,8 +101,17 @@ def log_charts(
         rec: The recording.
         found: The charts.
         palette: Colour by joint name.
+        named: Joints whose bars carry a mark, a thin line on their left.
     """
     for chart in found:
+        tallest = max((bar.value for bar in chart.bars), key=abs, default=0.0)
+        marked = [bar.place + _MARK_LEFT for bar in chart.bars if bar.joint in named]
+        if marked:
+            many = len(marked)
+            drawn = rr.BarChart(
+                [tallest] * many, abscissa=marked, widths=[_MARK_WIDTH] * many, color=NAMED
+            )
+            rec.log(f"{SEGMENTS}/{chart.key}/named", drawn, static=True)
         for bar in chart.bars:
             name = rr.escape_entity_path_part(bar.joint)
             left = bar.place + _LEFT

@@ -17,6 +17,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
+from analysis.cycles import CycleMaps
 from analysis.result import Analysis
 from capture import Session
 from capture.errors import DataError, LogWriteError
@@ -24,20 +25,26 @@ from capture.part_file import part_file
 from capture.robot import Robot
 from capture.robot.kinematics import rotation_from_quaternion
 
-from . import body, facts, gait, joints, markers, power, ranges, trail
+from . import facts, gait, joints, power
 from .blueprint import build_blueprint
 from .content import Content, Signal, Start
-from .motion import HeadPath, assemble, read_head
-from .response import charts, log_charts
-from .surroundings import log_surroundings, world_of
+from .cycles import cycle_tables, log_cycles
+from .heat_maps import heat_maps, log_maps
+from .layer import Layer, Named
+from .mean_cycle import Channels, Look, averaged_ns, log_mean_cycle
+from .motion import BODY_RATE_HZ, HeadPath, read_head
+from .plots import Plots
+from .quantities import DRAWN, quantities
+from .response import charts, log_charts, log_current
+from .scene import Scene
+from .stretches import stretches
+from .survey import GAIT, Survey, survey
 from .timeline import Clock
-from .tracks import Columns, Track, read_columns
+from .tracks import Track, read_columns
 from .views import body_title
 
 APPLICATION = "undulog"
 
-DRAWN = {"/joint_states", "/joint_commands", "/gait"}
-"""JointState topics that have views of their own."""
 _NAMESPACE = uuid.UUID("8f4b6f0e-6f0a-5d3f-9a53-5d1f7a3f2c11")
 
 
@@ -60,15 +67,21 @@ class Recording:
 
 @dataclass
 class _Sources:
-    """What is read from the session before anything is drawn."""
+    """What is known of the session before anything is drawn."""
 
     session: Session
-    columns: Columns
-    measured: tuple[Track, ...]
-    commanded: tuple[Track, ...]
-    mechanical: tuple[Track, ...]
-    electrical: tuple[Track, ...]
+    found: Survey
     warnings: list[str]
+
+    @property
+    def measured(self) -> tuple[Track, ...]:
+        """Some samples of each measured angle [rad]."""
+        return self.found.samples.get(joints.MEASURED, ())
+
+    @property
+    def commanded(self) -> tuple[Track, ...]:
+        """Some samples of each commanded angle [rad]."""
+        return self.found.samples.get(joints.COMMANDED, ())
 
 
 def recording_id(session_id: str) -> str:
@@ -88,6 +101,8 @@ def write_recording(
     path: Path,
     *,
     analysis: Analysis | None = None,
+    steady: CycleMaps | None = None,
+    named: Sequence[Named] = (),
     notes: Sequence[str] = (),
     layout: Callable[[Content], rrb.Blueprint] = build_blueprint,
 ) -> Recording:
@@ -96,7 +111,10 @@ def write_recording(
     Args:
         session: The session, open.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
-        analysis: The session's analysis, for the response bars; None leaves them out.
+        analysis: The session's analysis, for the response bars and the cycles; None leaves them
+            out.
+        steady: The cycles of its steady gait, for a session whose phase was not logged.
+        named: Modules that tests name, to be marked.
         notes: What the caller has to say about the session, a sentence each.
         layout: Makes the blueprint from what the recording holds.
 
@@ -108,8 +126,9 @@ def write_recording(
         LogWriteError: If the file can't be written.
     """
     rr.set_strict_mode(True)
+    layer = Layer(analysis, steady, tuple(named))
     sources = _read(session)
-    rhythm = gait.rhythm_of(sources.columns.get(("/gait", "position"), ()))
+    rhythm = gait.rhythm_of(_gait_tracks(session))
     clock = Clock(session.start_ns, rhythm)
     identity = recording_id(session.session_id)
     with part_file(path) as draft:
@@ -120,13 +139,15 @@ def write_recording(
             _save(rec, draft, path)
             rec.send_recording_name(session.session_id)
             rec.send_recording_start_time_nanos(session.start_ns)
-            content = _log(rec, clock, sources, analysis)
+            content = _log(rec, clock, sources, layer)
             told = tuple(dict.fromkeys([*notes, *sources.warnings, *session.warnings]))
             text = facts.markdown(
                 session,
                 analysis,
                 notes=told,
                 colors=body_title(content),
+                content=content,
+                named=layer.named,
                 has_cycles=rhythm is not None,
             )
             facts.log_facts(rec, text)
@@ -140,116 +161,130 @@ def write_recording(
 def _read(session: Session) -> _Sources:
     if not any(channel.count for channel in session.channels.values()):
         raise DataError(f"{session.path}: the session holds no messages; nothing can be drawn")
-    columns = read_columns(session)
-    measured = columns.get(("/joint_states", "position"), ())
+    found = survey(session, BODY_RATE_HZ)
     missing: list[str] = []
     if session.robot is None:
         missing.append("no robot description in the session: the body can't be drawn")
-    if not measured:
+    if joints.MEASURED not in found.samples:
         missing.append("no measured joint angles on /joint_states")
-    return _Sources(
-        session,
-        columns,
-        measured=measured,
-        commanded=columns.get(("/joint_commands", "position"), ()),
-        mechanical=power.mechanical_power(columns),
-        electrical=power.electrical_power(columns),
-        warnings=missing,
-    )
+    return _Sources(session, found, warnings=missing)
+
+
+def _gait_tracks(session: Session) -> tuple[Track, ...]:
+    if GAIT not in session.channels:
+        return ()
+    return read_columns(session, {GAIT: ["position"]}).get((GAIT, "position"), ())
 
 
 def _log(
-    rec: rr.RecordingStream, clock: Clock, sources: _Sources, analysis: Analysis | None
+    rec: rr.RecordingStream,
+    clock: Clock,
+    sources: _Sources,
+    layer: Layer,
 ) -> Content:
     """Write everything but the facts."""
+    analysis, named = layer.analysis, [one.joint for one in layer.named]
     session, robot = sources.session, sources.session.robot
     moving = sources.measured or sources.commanded
     palette = palette_of(robot, [track.name for track in moving])
     places = joints.head_middle_tail(robot, sources.commanded or sources.measured)
-    head, limit = _log_world(rec, clock, sources, places, palette)
-    if places is not None:
-        joints.log_places(
-            rec,
-            clock,
-            places,
-            measured=sources.measured,
-            commanded=sources.commanded,
-            palette=palette,
-        )
-    errors = joints.tracking_errors(sources.measured, sources.commanded)
+    plots = Plots(rec, clock, sources.found, places, palette)
+    head, scene = _open_scene(rec, clock, sources, places, palette)
+    if scene is not None:
+        scene.named = named
+    limit = None if head is None else sources.found.power_limit_w
+    for stretch in stretches(session, sources.found.wanted, sources.found.context_ns):
+        plots.write(stretch)
+        if scene is not None:
+            scene.write(stretch)
+        rec.flush()  # what is drawn is written before more is read
     found = charts(analysis) if analysis is not None else ()
-    log_charts(rec, found, palette)
+    tables = cycle_tables(analysis, layer.steady) if analysis is not None else ()
+    maps = heat_maps(analysis, tables, tuple(palette)) if analysis is not None else ()
+    log_charts(rec, found, palette, named)
+    log_current(rec, clock, found, tables)
+    log_maps(rec, clock, maps, named)
     return Content(
         robot=robot,
         start=None if head is None else start_of(head),
         power_limit_w=limit,
         places=places,
-        commanded=joints.log_angles(rec, clock, joints.COMMANDED, sources.commanded),
-        measured=joints.log_angles(rec, clock, joints.MEASURED, sources.measured, palette),
-        errors=joints.log_angles(rec, clock, joints.ERROR, errors, palette),
-        has_power=power.log_total(
-            rec, clock, mechanical=sources.mechanical, electrical=sources.electrical
-        ),
-        joint_power=joints.log_scalars(rec, clock, power.MECHANICAL, sources.mechanical, palette),
+        commanded=plots.series(joints.COMMANDED),
+        measured=plots.series(joints.MEASURED),
+        errors=plots.series(joints.ERROR),
+        has_power=any(entity.startswith(power.TOTAL) for entity in sources.found.samples),
+        joint_power=plots.series(power.MECHANICAL),
         charts=found,
         modes=gait.log_mode(rec, clock, session, sources.warnings),
         has_events=gait.log_events(rec, clock, session, sources.warnings),
-        signals=_log_signals(rec, clock, sources, palette),
+        signals=_signals(session, plots, palette),
+        cycles=log_cycles(rec, clock, tables, palette),
+        maps=maps,
+        mean=log_mean_cycle(
+            rec,
+            clock,
+            _channels(sources, averaged_ns(clock, analysis)),
+            Look(robot, places, palette, limit),
+            analysis=analysis,
+            warnings=sources.warnings,
+        ),
     )
 
 
-def _log_world(
+def _channels(sources: _Sources, part_ns: tuple[int, int]) -> Channels:
+    """What the mean cycle is taken of."""
+    tracks = quantities(
+        read_columns(
+            sources.session,
+            {topic: fields for topic, fields in sources.found.wanted.items() if topic in DRAWN},
+            start_ns=part_ns[0],
+            stop_ns=part_ns[1],
+        )
+    )
+    kinds = (joints.MEASURED, joints.COMMANDED, power.MECHANICAL)
+    return Channels(*(tracks.get(kind, ()) for kind in kinds))
+
+
+def _open_scene(
     rec: rr.RecordingStream,
     clock: Clock,
     sources: _Sources,
     places: joints.Places | None,
     palette: dict[str, joints.Color],
-) -> tuple[HeadPath | None, float | None]:
+) -> tuple[HeadPath | None, Scene | None]:
     """The 3D scene, where there is a robot whose joints were measured."""
-    robot = sources.session.robot
-    if robot is None or not sources.measured:
+    robot, measured = sources.session.robot, sources.measured
+    if robot is None or not measured:
         return None, None
-    head = read_head(sources.session, robot, sources.measured, sources.warnings)
-    motion = assemble(
-        robot,
-        head,
-        positions=sources.measured,
-        commands=sources.commanded,
-        power=sources.mechanical,
-        end_ns=sources.session.end_ns,
-    )
-    missing = [n for n in robot.joint_names if n not in {track.name for track in sources.measured}]
+    times = Track(measured[0].name, sources.found.drawing_ns, np.zeros(0))
+    head = read_head(sources.session, robot, [times], sources.warnings)
+    missing = [name for name in robot.joint_names if name not in {one.name for one in measured}]
     if missing:
         sources.warnings.append(
             f"no angles of {', '.join(missing)}: the body is drawn up to the first of these"
         )
-    rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    world = world_of(sources.session, sources.warnings)
-    if world is not None:
-        log_surroundings(rec, world)
-    limit = body.log_body(rec, clock, motion)
-    body.log_ghost(rec, clock, motion)
-    ranges.log_ranges(rec, clock, sources.session, motion)
-    if places is not None:
-        markers.log_markers(rec, clock, motion, places, palette)
-    if head.tracked:
-        trail.log_trail(rec, clock, head)
-    return head, limit
+    scene = Scene(
+        rec,
+        clock,
+        sources.session,
+        robot,
+        head,
+        places=places,
+        palette=palette,
+        limit_w=sources.found.power_limit_w,
+        warnings=sources.warnings,
+    )
+    return head, scene
 
 
-def _log_signals(
-    rec: rr.RecordingStream, clock: Clock, sources: _Sources, palette: dict[str, joints.Color]
+def _signals(
+    session: Session, plots: Plots, palette: dict[str, joints.Color]
 ) -> tuple[Signal, ...]:
     """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
     found: list[Signal] = []
-    for (topic, field), tracks in sources.columns.items():
-        if topic in DRAWN or field != "position" or not tracks:
-            continue
-        names = [track.name for track in tracks]
-        of_joints = bool(set(names) & set(palette))
-        colors = palette if of_joints else joints.joint_palette(names)
-        series = joints.log_scalars(rec, clock, f"/signals{topic}", tracks, colors)
-        unit = sources.session.channels[topic].metadata.get("unit", "rad")
+    for topic, series in plots.signals.items():
+        unit = session.channels[topic].metadata.get("unit", "rad")
+        of_joints = any(name in palette for one in series for name in one.names)
         found.append(Signal(f"{topic.lstrip('/')} [{unit}]", series, of_joints))
     return tuple(found)
 

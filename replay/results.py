@@ -1,0 +1,133 @@
+"""Results as a layer over a session: computed now, or those that were saved.
+
+``undulog analyse``, with one session or several, and ``undulog compare`` save what they found; a
+session that they speak of can be seen with it. Modules that a test names carry a mark on the body,
+at their bars and below the maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from analysis.analyse import measure_session
+from analysis.compare.result import Comparison
+from analysis.cycles import cycle_maps
+from analysis.formats import p_value
+from analysis.notebook.files import load
+from analysis.null_model_result import ModelledAnalysis
+from analysis.result import Analysis
+from analysis.result_experiment import Experiment
+from capture import Session
+from capture.errors import DataError, UndulogError
+
+from .layer import Layer, Named
+
+
+def computed(session: Session) -> Layer:
+    """Analyse a session now; one without a gait can be seen too.
+
+    Args:
+        session: The session, open.
+
+    Returns:
+        The layer, with a note where there are no numbers.
+    """
+    try:
+        measured = measure_session(session)
+    except UndulogError as error:
+        return Layer(None, notes=(f"no response bars: {error}",))
+    analysis = measured.analysis
+    return Layer(analysis, cycle_maps(measured) if analysis.over_time is None else None)
+
+
+def saved(session: Session, paths: Sequence[Path]) -> Layer:
+    """Read what was found of a session before.
+
+    Args:
+        session: The session, open.
+        paths: Results, JSON: of the session, of an experiment or a comparison that it is part of.
+
+    Returns:
+        The layer; its numbers are computed now where no result holds them.
+
+    Raises:
+        LogError: If a file can't be read.
+        DataError: If one holds no result, one that names no session, one of other sessions, or a
+            second one with numbers of this session.
+    """
+    analysis: Analysis | None = None
+    named: dict[str, list[str]] = {}
+    notes: list[str] = []
+    for path in paths:
+        result = load(path)
+        if not isinstance(result, (Analysis, Experiment, Comparison)):
+            kind = type(result).__name__
+            raise DataError(
+                f"{path}: a {kind} names no session; give the result that it is part of"
+            )
+        own = _own(result, session, path)
+        if own is not None and analysis is not None:
+            raise DataError(f"{path}: the second result with numbers of this session; give one")
+        analysis = own or analysis
+        if own is not None:
+            notes.append(f"gain, lag and energy are those of {path.name}")
+        for one in (
+            *_named(result),
+            *(_named(own) if own is not None and own is not result else ()),
+        ):
+            named.setdefault(one.joint, []).append(f"{one.why} ({path.name})")
+    found = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
+    if analysis is not None:
+        return Layer(analysis, named=found, notes=tuple(notes))
+    now = computed(session)
+    return Layer(now.analysis, now.steady, found, (*notes, *now.notes))
+
+
+def _own(
+    result: Analysis | Experiment | Comparison, session: Session, path: Path
+) -> Analysis | None:
+    """The session's own numbers in a result, or None where it only compares."""
+    if isinstance(result, Analysis):
+        known = [result.session.id]
+    elif isinstance(result, Experiment):
+        known = [one.session.id for one in result.sessions]
+    else:
+        known = [one.id for one in (*result.a, *result.b)]
+    if session.session_id not in known:
+        raise DataError(
+            f"{path}: a result of {_listed(known)}; the session is {session.session_id}, so give "
+            "the result of that one"
+        )
+    if isinstance(result, Analysis):
+        return result
+    if isinstance(result, Experiment):
+        return result.sessions[known.index(session.session_id)]
+    return None
+
+
+def _listed(ids: Sequence[str]) -> str:
+    few = ", ".join(ids[:3])
+    return f"session{'s' * (len(ids) > 1)} {few}{' and others' * (len(ids) > 3)}"
+
+
+def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
+    if isinstance(result, Experiment) and result.reversal is not None:
+        for weak in result.reversal.weak:
+            how = "less gain" if weak.by == "gain" else "more lag"
+            why = f"{how} than its mirror joint {weak.mirror}, p {_p(weak.p)}"
+            yield Named(weak.name, why)
+    elif isinstance(result, Comparison):
+        for joint in result.named:
+            if joint.size >= 1.0:  # in margins: what differs by less is there, but small
+                yield Named(joint.name, f"answers differently in A and B, p {_p(joint.p_holm)}")
+    elif isinstance(result, ModelledAnalysis):
+        test = result.null_model
+        for module in test.modules:
+            if module.name in test.named:
+                yield Named(module.name, f"deviates from the others' model, p {_p(module.p)}")
+
+
+def _p(value: float) -> str:
+    text = p_value(value)
+    return text if text.startswith("<") else f"= {text}"
