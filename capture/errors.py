@@ -6,7 +6,8 @@
     |- UsageError (ValueError)              wrong options or arguments; exit code 2
     |  |- MissingExtraError (ImportError)   a verb whose extra is not installed
     |  |- OutputExistsError (FileExistsError)
-    |  `- SettingsError                    settings of a recording, all faults listed
+    |  |- SettingsError                    settings of a recording, all faults listed
+   |  `- JointSetError (DataError)        commands of another joint set than the robot's
     |- RobotFileError (ValueError)          a robot description with faults, all listed
     |- ScenarioError (ValueError)           a scenario file with faults, all listed
     |- PlanError (ValueError)               a drive plan with faults, all listed
@@ -159,6 +160,10 @@ class SimulationError(UndulogError, ArithmeticError):
 
 class DataError(UndulogError, ValueError):
     """Samples that are unfit for what was asked of them."""
+
+
+class JointSetError(UsageError, DataError):
+    """Commands of another joint set than that of the robot that is to take them."""
 
 
 class LogError(UndulogError):

@@ -82,6 +82,21 @@ class BusRecorder:
         """
         self._fresh.append(frames)
 
+    def keep(self, frames: FrameArray, now_ns: Callable[[], int]) -> None:
+        """Write classic frames that are not to be decoded, after those taken before.
+
+        Args:
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,), e.g. commands
+                that the session has anyway.
+            now_ns: The session's clock.
+
+        Raises:
+            LogWriteError: If they can't be written.
+        """
+        self.write_raw(now_ns)
+        for batch in _batches([frames]):
+            self._raw.write(now_ns(), batch)
+
     def write_raw(self, now_ns: Callable[[], int]) -> None:
         """Write the frames taken since the last call.
 

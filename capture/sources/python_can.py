@@ -210,34 +210,23 @@ def failure(error: Exception) -> OSError:
     return OSError(code if isinstance(code, int) else 0, text)
 
 
-def open_bus(
-    text: str,
-    bus: type[can.BusABC],
-    options: Mapping[str, object],
-    tally: Tally,
-    *,
-    device_time: bool,
-    detail: str,
-) -> PythonCanLink:
+def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) -> can.BusABC:
     """Open a bus.
 
     Args:
         text: The address, for messages.
         bus: Its class.
         options: What to give it, the channel among them.
-        tally: Where to count.
-        device_time: Whether the messages' times are the device's.
-        detail: What is worth telling of it.
 
     Returns:
-        The open link.
+        The open bus.
 
     Raises:
         OSError: If it can't be opened now.
         SourceError: If it never can: a driver missing, an option that it doesn't know.
     """
     try:
-        opened = bus(**options)  # type: ignore[arg-type]
+        return bus(**options)  # type: ignore[arg-type]
     except (can.CanInterfaceNotImplementedError, ImportError, NotImplementedError) as error:
         raise SourceError(text, str(error)) from error
     except can.CanInitializationError as error:
@@ -249,7 +238,6 @@ def open_bus(
     except Exception as error:  # python-can's own fault, e.g. a name that its driver should bring
         kind = type(error).__name__
         raise SourceError(text, f"python-can can't open it: {kind}: {error}") from error
-    return PythonCanLink(opened, tally, device_time=device_time, detail=detail)
 
 
 def python_can_source(
@@ -280,8 +268,8 @@ def python_can_source(
     bus = bus_class(address.text, interface)
     return LinkedSource(
         address,
-        lambda tally: open_bus(
-            address.text, bus, options, tally, device_time=device_time, detail=detail
+        lambda tally: PythonCanLink(
+            open_bus(address.text, bus, options), tally, device_time=device_time, detail=detail
         ),
         place=f"{interface} {options['channel']}",
         clock=ClockDomain.DEVICE if device_time else ClockDomain.HOST,

@@ -1,32 +1,32 @@
-"""The verb ``drive`` over a bus."""
+"""Armed driving over a bus, for the verbs that offer it."""
 
 from __future__ import annotations
 
 import os
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from capture.console import emit_json, progress
 from capture.daemon.control_socket import find_sockets
 from capture.errors import UsageError
 from capture.interruption import interruptible
+from capture.robot import Robot
 
+from ..gate.outcome import How
+from .bus_report import BusReport, report_facts, report_lines
+from .console_watch import ConsoleWatch
 from .driven import Driven
 from .loop import BusTick
-from .over_bus import BusPlan, BusReport, bus_plan, drive_bus
-
-_SHOWN = 3
+from .over_bus import BusPlan, bus_plan, drive_bus
 
 
-def on_bus(
+def drive_armed(
     driven: Driven,
     on: str,
     *,
+    robot: Robot | None,
     duration_s: float | None,
-    armed: bool,
     output: Path | None,
     recorder: Path | None,
     force: bool,
@@ -37,46 +37,46 @@ def on_bus(
     Args:
         driven: What to drive.
         on: The bus.
+        robot: On which robot; the one that it was made for if None.
         duration_s: How long [s]; its own length if None.
-        armed: Whether commands are sent.
-        output: The session to write, or None.
+        output: The session to write.
         recorder: Control socket of a recorder; the only one that runs if None.
         force: Replace an existing session.
         as_json: Report as one JSON object.
 
     Returns:
-        The exit code.
+        The exit code: 0 if it ran to its planned end, 1 if not.
 
     Raises:
         UsageError: If something of it can't be.
-        SourceError: If nobody is there, or the robot is lost.
+        SourceError: If nobody is there, or the robot is no robot to start with.
     """
-    if armed and recorder is None:
-        recorder = _only_recorder()
+    if output is None:
+        raise UsageError(
+            "an armed drive is recorded, with every action of the gate: name the session with -o, "
+            "e.g. -o drive.mcap"
+        )
     plan = bus_plan(
         driven,
         on,
+        robot=robot,
         duration_s=duration_s,
-        armed=armed,
         output=output,
-        recorder=recorder if armed else None,
+        recorder=recorder or _only_recorder(),
         force=force,
     )
-    if armed and recorder is None and output is None:
-        sys.stderr.write("note: no recorder runs and there is no -o: /gait is not recorded\n")
+    console = ConsoleWatch()
     start = time.monotonic()
-    with interruptible() as stop, progress(driven.name, plan.duration_s) as bar:
+    with interruptible(twice=True) as stop, progress(driven.name, plan.duration_s) as bar:
 
         def show(tick: BusTick) -> None:
             elapsed_s = max(time.monotonic() - start, 1e-3)
-            bar.update(tick.time_s, f"{tick.time_s / elapsed_s:.1f} x real time")
+            pace = f"{tick.time_s / elapsed_s:.1f} x real time"
+            bar.update(min(tick.time_s, plan.duration_s), f"{tick.step.phase}, {pace}")
 
-        report = drive_bus(plan, stop=stop, on_tick=show)
-    if as_json:
-        emit_json(_reported(plan, report))
-    else:
-        print("\n".join(_told(plan, report)))
-    return 0
+        report = drive_bus(plan, stop=stop, on_tick=show, console=console)
+        console.gone()  # what is said from here on goes nowhere then
+    return _tell(plan, report, as_json=as_json)
 
 
 def _only_recorder() -> Path | None:
@@ -88,45 +88,37 @@ def _only_recorder() -> Path | None:
     return found[0] if found else None
 
 
-def _reported(plan: BusPlan, report: BusReport) -> dict[str, Any]:
-    return {
-        "driven": plan.driven.name,
-        "kind": plan.driven.kind,
-        "on": plan.address.text,
-        "robot": plan.driven.robot.name,
-        "armed": plan.armed,
-        "pace": "lockstep" if report.lockstep else "real time",
-        "path": str(plan.output) if plan.output is not None else None,
-        "planned_duration_s": plan.duration_s,
-        **asdict(report.tally),
-        "real_time_factor": report.tally.duration_s / max(report.wall_s, 1e-3),
-        "first_frames": report.first_frames,
-        "recorder": str(plan.recorder) if plan.recorder is not None else None,
-        "gait_told": report.told,
-        "gait_not_told": report.not_told,
-    }
+def _tell(plan: BusPlan, report: BusReport, *, as_json: bool) -> int:
+    outcome = report.outcome
+    if as_json:
+        facts = {
+            "driven": plan.driven.name,
+            "kind": plan.driven.kind,
+            "on": plan.address.text,
+            "robot": plan.robot.name,
+            "path": str(plan.output),
+            "planned_duration_s": plan.duration_s,
+            "recorder": str(plan.recorder) if plan.recorder is not None else None,
+        }
+        emit_json({**facts, **report_facts(report)})
+    else:
+        print("\n".join(_told(plan, report)))
+    if outcome.how is How.COMPLETE:
+        return 0
+    sys.stderr.write(f"error: {outcome.why}; {outcome.ended}\n")
+    return 1
 
 
 def _told(plan: BusPlan, report: BusReport) -> list[str]:
-    tally, driven = report.tally, plan.driven
-    how = "drove" if plan.armed else "dry run of"
-    if tally.complete:
-        lines = [f"{plan.address.text}: {how} {driven.name} for {tally.duration_s:g} s"]
+    driven, outcome = plan.driven, report.outcome
+    if outcome.how is How.COMPLETE:
+        lines = [f"{plan.address.text}: drove {driven.name} for {report.gait_s:g} s"]
     else:
-        planned = f"{plan.duration_s:g} s"
-        lines = [f"stopped at rest at {tally.duration_s:g} s of {planned}: {plan.address.text}"]
-    pace = "in lockstep with the robot" if report.lockstep else "in real time"
-    lines.append(
-        f"{driven.kind} for {driven.robot.name}, {tally.ticks} ticks {pace}, "
-        f"{tally.overruns} left out as the one before took too long"
-    )
-    heard = f"{tally.received} received, {tally.decoded} of them with readings"
-    lines.append(f"{tally.sent} frames sent, {heard}")
-    if not plan.armed and report.first_frames:
-        shown = " ".join(report.first_frames[:_SHOWN])
-        lines.append(f"nothing was sent; the first tick would have been {shown} ...")
-    if plan.output is not None:
-        lines.append(f"session: {plan.output}")
+        at = f"at {report.gait_s:g} s of {plan.duration_s:g} s"
+        lines = [f"{plan.address.text}: stopped {at}: {outcome.why}"]
+    lines.append(f"{driven.kind} for {plan.robot.name}, {report_lines(report)[0]}")
+    lines += report_lines(report)[1:]
+    lines.append(f"session: {plan.output}")
     if plan.recorder is not None:
         lines.append(f"the recorder at {plan.recorder} was told {report.told} samples of the gait")
     if report.not_told is not None:

@@ -1,65 +1,49 @@
-"""The session of a drive over a bus: commands and gait as they were meant, frames as they came."""
+"""The session of a drive over a bus: what was wanted, what was sent, and what came."""
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Metadata
 
 from capture.daemon.bus_recorder import BusRecorder
 from capture.daemon.source_clock import SourceClock
-from capture.log.sink import Description
+from capture.log.channels import StringChannel
+from capture.log.frames import FrameArray
 from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain, Robot
 
+from ..gait import GaitTick
+from ..gate.gate import Remark
+from ..gate.outcome import How, Outcome
 from ..session_log import GAIT_UNIT
-from .loop import BusTick, LoopTally
+from .loop import BusTick
 
 _EVENTS_OF = "drive"
 _DECODE_TICKS = 10  # many frames at once cost little more than a few
 
 
-class NowhereSink:
-    """A session that isn't kept."""
-
-    def define(self, record: Description) -> None:
-        """Keep nothing."""
-
-    def write(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,
-        sequence: int,
-        payload: bytes,
-    ) -> None:
-        """Keep nothing."""
-
-    def close(self, last: tuple[Metadata, ...]) -> None:
-        """Nothing to finalise."""
-
-
 class BusSession:
-    """Writes one drive; without a path nothing is kept.
+    """Writes one drive.
 
-    ``/joint_commands`` holds what was commanded, before the bus rounds it, at the tick's own time.
-    A dry run commands nothing: what it would have is on ``/dry_run/joint_commands``.
+    ``/joint_commands`` holds what was sent, before the bus rounds it, at the tick's own time;
+    ``/gate/wanted`` what was to be sent, before the gate changed anything; ``/gate/phase`` what the
+    gate was about. All frames are in it, both ways.
     """
 
     def __init__(
         self,
-        path: Path | None,
+        path: Path,
         *,
         robot: Robot,
         bus: str,
         clock: ClockDomain,
         epoch_ns: int,
         gait_names: tuple[str, ...],
-        armed: bool,
         facts: Mapping[str, str],
+        settle_s: float | None,
         attachments: Mapping[str, bytes],
         records: Mapping[str, Mapping[str, str]],
         force: bool = False,
@@ -67,14 +51,15 @@ class BusSession:
         """Open the session.
 
         Args:
-            path: The file to create, or None.
+            path: The file to create.
             robot: Whose bus it is.
             bus: The bus's name.
             clock: Whose clock the frames' device times are on.
             epoch_ns: Unix time of its start [ns].
             gait_names: Names of the gait's values.
-            armed: Whether commands are sent.
             facts: For the metadata.
+            settle_s: The first part of the gait that is not fit for steady-state analysis [s],
+                None where it isn't known.
             attachments: File name to TOML text that explains what is driven.
             records: Other metadata records that explain it, by name.
             force: Replace an existing file.
@@ -85,27 +70,30 @@ class BusSession:
             DataError: If the robot has no bus.
         """
         self.writer = SessionWriter(
-            path or Path("nowhere.mcap"),
+            path,
             session_id=uuid.uuid4().hex,
             epoch_ns=epoch_ns,
             robot=robot,
             clock={bus: clock},
-            metadata={**facts, "armed": "yes" if armed else "no"},
+            metadata=facts,
             force=force,
-            sink=None if path is not None else NowhereSink(),
         )
         self.writer.explain(attachments, records)
-        topic = "/joint_commands" if armed else "/dry_run/joint_commands"
-        self._commands = self.writer.joint_state(topic, robot.joint_names, unit="rad")
+        names = robot.joint_names
+        self._commands = self.writer.joint_state("/joint_commands", names, unit="rad")
+        self._wanted = self.writer.joint_state("/gate/wanted", names, unit="rad")
         self._gait = (
             self.writer.joint_state("/gait", gait_names, unit=GAIT_UNIT) if gait_names else None
         )
         self._mode = self.writer.string("/gait/mode")
+        self._phase = self.writer.string("/gate/phase")
         self._events = self.writer.log("/rosout")
         self._frames = BusRecorder(bus, self.writer, SourceClock(), robot, directions=True)
-        self._last_mode = ""
+        self._settle_s = settle_s
+        self._last = {"mode": "", "phase": ""}
         self._said: set[str] = set()
-        self._t_ns = epoch_ns
+        self._epoch_ns = self._t_ns = epoch_ns
+        self._device_minus_host_ns = 0
 
     def write(self, tick: BusTick, t_ns: int) -> None:
         """Write one tick.
@@ -118,19 +106,49 @@ class BusSession:
             LogWriteError: If it can't be written.
         """
         self._t_ns = t_ns
+        step = tick.step
         for frames in tick.received:
             self._frames.add(frames)
-        self._frames.write_raw(self._now_ns)
+            newest = frames[-1]
+            self._device_minus_host_ns = int(newest["t_device_ns"]) - int(newest["t_host_ns"])
+        self._keep_sent(tick.sent, t_ns)
         if tick.tick % _DECODE_TICKS == 0:
             self._frames.decode(self._now_ns, t_ns + 1)
-        self._commands.write(t_ns, tick.gait.command)
+        self._change("phase", self._phase, step.phase)
+        for level, text in step.remarks:
+            self._events.write(t_ns, level, _EVENTS_OF, text)
+        if step.command is not None:
+            self._commands.write(t_ns, step.command)
+        if step.wanted is not None:
+            self._wanted.write(t_ns, step.wanted)
+        if step.gait is not None:
+            self._write_gait(step.gait, t_ns)
+
+    def _keep_sent(self, frames: FrameArray, t_ns: int) -> None:
+        """Keep what was sent, with the time on the device's clock as far as that is known."""
+        self._frames.write_raw(self._now_ns)
+        if len(frames):
+            kept = np.array(frames)
+            kept["t_host_ns"] = t_ns
+            kept["t_device_ns"] = max(t_ns + self._device_minus_host_ns, 0)
+            self._frames.keep(kept, self._now_ns)
+
+    def _write_gait(self, gait: GaitTick, t_ns: int) -> None:
+        if self._settle_s is not None:  # the gait begins: so much later it has settled
+            settled_s = self._settle_s + (t_ns - self._epoch_ns) * 1e-9
+            self.writer.note("undulog", {"settle_s": repr(settled_s)})
+            self._settle_s = None
         if self._gait is not None:
-            self._gait.write(t_ns, tick.gait.values)
-        if tick.gait.mode != self._last_mode:
-            self._last_mode = tick.gait.mode
-            self._mode.write(t_ns, tick.gait.mode)
-        for name in tick.gait.clamped:
+            self._gait.write(t_ns, gait.values)
+        self._change("mode", self._mode, gait.mode)
+        for name in gait.clamped:
             self.say("warn", f"{name} clamped to the joint limits")
+
+    def _change(self, what: str, channel: StringChannel, text: str) -> None:
+        """Write a text where it changed."""
+        if text != self._last[what]:
+            self._last[what] = text
+            channel.write(self._t_ns, text)
 
     def say(self, level: str, text: str) -> None:
         """Write an event, once.
@@ -143,20 +161,32 @@ class BusSession:
             self._said.add(text)
             self._events.write(self._t_ns, level, _EVENTS_OF, text)
 
-    def finish(self, tally: LoopTally) -> None:
+    def note(self, name: str, facts: Mapping[str, str]) -> None:
+        """Write a metadata record.
+
+        Args:
+            name: Its name.
+            facts: Its entries.
+        """
+        self.writer.note(name, facts)
+
+    def finish(self, outcome: Outcome, remarks: Sequence[Remark]) -> None:
         """Say how it went.
 
         Args:
-            tally: Of the loop.
+            outcome: The end.
+            remarks: What is worth a line, the warnings among them as reasons for the verdict.
         """
-        how = "end" if tally.complete else "at rest, as it was asked to stop,"
-        self.say("info", f"{how} at {tally.duration_s:g} s")
-        left_out = f"{tally.overruns} control ticks were left out, as the one before took too long"
-        if tally.overruns:
-            self.say("warn", left_out)
-        self.writer.set_verdict(
-            "degraded" if tally.overruns else "good", [left_out] if tally.overruns else []
-        )
+        level = "error" if outcome.how is How.FAULT else "info"
+        why = f": {outcome.why}" if outcome.why else ""
+        self.say(level, f"{outcome.how}{why}; {outcome.ended}")
+        for each in remarks:
+            self.say(*each)
+        reasons = [text for kind, text in remarks if kind == "warn"]
+        if outcome.how is How.FAULT:
+            self.writer.set_verdict("bad", [outcome.why, *reasons])
+        else:
+            self.writer.set_verdict("degraded" if reasons else "good", reasons)
 
     def fail(self, text: str) -> None:
         """Say why it failed.

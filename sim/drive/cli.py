@@ -28,6 +28,7 @@ def drive(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     duration: float | None = None,
     arm: bool = False,
+    robot: str | None = None,
     recorder: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -35,21 +36,22 @@ def drive(
     """Drive a gait, a plan or recorded commands on the twin or over a bus.
 
     On the twin it runs faster than real time and is recorded like `undulog sim run`. Over a bus it
-    is a control loop of 100 Hz, and a dry run: it listens, computes and sends nothing. With `--arm`
-    commands are sent, for now to the virtual robot of `undulog sim serve` only.
+    is a dry run: it runs in the twin and says what it would take. With `--arm` commands are sent,
+    100 times a second, behind a safety gate: it reads the pose, ramps to the first one, keeps to
+    the limits of the robot's file, and ends as that says on a fault, on Ctrl-C (twice: at once)
+    and when the console goes.
 
-    SIGINT and SIGTERM let the joints come to rest within a second, and then end the run.
-
-    Example: `undulog drive flat --on twin -o driven.mcap`
+    Example: `undulog drive flat --on 'can:socketcand:can0?port=29536' --arm -o driven.mcap`
 
     Args:
         what: Name of a shipped scenario, or a scenario's TOML file: its gait is driven. Or a plan,
             a TOML file of segments. Or a session, `.mcap`: its commands are given again.
         on: `twin` (the world that it was made for), `twin:SCENARIO`, or a bus,
             `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
-        output: The session file to write, `.mcap`; over a bus it may be left out.
+        output: The session file to write, `.mcap`; a dry run needs none.
         duration: How long to drive in seconds, instead of what the gait or plan says.
         arm: Send the commands.
+        robot: The robot on the bus, a name or a TOML file; by default the one that it was made for.
         recorder: Control socket of the recorder that is told the gait; by default the only one
             that runs.
         force: Replace the output if it is there.
@@ -68,23 +70,62 @@ def drive(
     if scheme == _TWIN and colon and not rest:
         raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
     if scheme != _TWIN:
-        from .bus_cli import on_bus
-
-        return on_bus(
-            find_driven(what),
+        return _on_bus(
+            what,
             on,
+            arm=arm,
+            robot=robot,
             duration_s=duration,
-            armed=arm,
             output=output,
             recorder=recorder,
             force=force,
             as_json=json,
         )
-    if arm or recorder is not None:
-        raise UsageError("--arm and --recorder are for a bus; a run of the twin records itself")
+    if arm or recorder is not None or robot is not None:
+        raise UsageError(
+            "--arm, --recorder and --robot are for a bus; a run of the twin records itself"
+        )
     world = load_scenario(rest) if rest else None
     driven = find_driven(what, world)
     return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
+
+
+def _on_bus(
+    what: str,
+    on: str,
+    *,
+    arm: bool,
+    robot: str | None,
+    duration_s: float | None,
+    output: Path | None,
+    recorder: Path | None,
+    force: bool,
+    as_json: bool,
+) -> int:
+    from capture import load_robot
+
+    from ..gate.dry_run_cli import run_dry
+    from .bus_cli import drive_armed
+    from .driven import find_driven
+    from .over_bus import bus_address
+
+    bus_address(on)
+    described = load_robot(robot) if robot is not None else None
+    driven = find_driven(what, robot=described)
+    if arm:
+        return drive_armed(
+            driven,
+            on,
+            robot=described,
+            duration_s=duration_s,
+            output=output,
+            recorder=recorder,
+            force=force,
+            as_json=as_json,
+        )
+    if recorder is not None:
+        raise UsageError("--recorder is for --arm: a dry run sends nothing")
+    return run_dry(driven, on, duration_s=duration_s, output=output, force=force, as_json=as_json)
 
 
 def _on_twin(

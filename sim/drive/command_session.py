@@ -17,7 +17,7 @@ import numpy as np
 
 from capture import Session
 from capture.arrays import FloatArray, IntArray
-from capture.errors import DataError
+from capture.errors import DataError, JointSetError
 from capture.log.signals import JointSignals
 from capture.robot import Robot
 
@@ -106,14 +106,15 @@ class CommandReplay:
             robot: Who is to do it.
 
         Raises:
-            DataError: If the robot lacks one of the joints, or there is no command.
+            JointSetError: If the robot lacks one of the joints.
+            DataError: If there is no command.
         """
         held = _Held(recorded.commands, known=True)
         strange = [name for name in held.names if name not in robot.joint_names]
         if strange:
-            raise DataError(
-                f"{COMMANDS} has joints that {robot.name} lacks: {', '.join(strange)}; it has "
-                f"{', '.join(robot.joint_names)}"
+            raise JointSetError(
+                f"{COMMANDS} has joints that {robot.name} lacks: {', '.join(strange)}; it commands "
+                f"{', '.join(held.names)}; {robot.name} has {', '.join(robot.joint_names)}"
             )
         if not held.given:
             raise DataError(f"{COMMANDS} holds no command")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from capture import Session
-from capture.errors import DataError, PlanError, UsageError
+from capture.errors import DataError, JointSetError, PlanError, UsageError
 from capture.robot import Plane, Robot
 from capture.shipped import Shelf
 
@@ -50,6 +50,7 @@ class Driven:
             does not say.
         records: Metadata records that go along, by name.
         kernels: What computed the force laws in the run that it is taken from.
+        joints: The joints that recorded commands are for; None where it is no commands.
     """
 
     kind: str
@@ -65,12 +66,35 @@ class Driven:
     settle_s: float | None = None
     records: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
     kernels: Kernels = Kernels.NUMPY
+    joints: tuple[str, ...] | None = None
 
     @property
     def session_facts(self) -> Mapping[str, str]:
         """What the metadata of a session without a scenario says of it."""
         settled = {} if self.settle_s is None else {"settle_s": repr(self.settle_s)}
         return {**self.facts, **settled}
+
+    def check_fits(self, robot: Robot) -> None:
+        """See that a robot on a bus is one that it can be driven on: the same joints, the planes.
+
+        Args:
+            robot: The robot.
+
+        Raises:
+            JointSetError: If its commands are of another joint set.
+            UsageError: If the robot lacks a plane.
+        """
+        if self.joints is not None and set(self.joints) != set(robot.joint_names):
+            raise JointSetError(
+                f"{self.name} is of another joint set than {robot.name}; nothing was sent\n"
+                f"  it commands {len(self.joints)} joints: {', '.join(self.joints)}\n"
+                f"  {robot.name} has {len(robot.joint_names)}: {', '.join(robot.joint_names)}"
+            )
+        for plane in self.planes:
+            if not len(robot.joint_indices(plane)):
+                raise UsageError(
+                    f"{self.name} moves {plane} joints, and {robot.name} has none; nothing was sent"
+                )
 
     def scenario(self, world: Scenario | None, duration_s: float | None) -> Scenario:
         """The scenario of a run on the twin.
@@ -106,7 +130,10 @@ class Driven:
 
 
 def find_driven(
-    word: str, world: Scenario | None = None, changes: Mapping[str, Any] | None = None
+    word: str,
+    world: Scenario | None = None,
+    changes: Mapping[str, Any] | None = None,
+    robot: Robot | None = None,
 ) -> Driven:
     """Find what is to be driven.
 
@@ -116,6 +143,7 @@ def find_driven(
         world: Where it will be run, if that is known: its robot takes recorded commands.
         changes: Of recorded commands: what to change of the world that they were recorded in, see
             :func:`sim.scenario_file.parse_scenario`.
+        robot: Who takes recorded commands, whatever the session or the world say.
 
     Returns:
         What it is.
@@ -129,7 +157,7 @@ def find_driven(
     path = Path(word)
     is_folder = path.is_dir() and word not in scenario_names()  # of the parts of a session
     if path.suffix == ".mcap" or is_folder:
-        return _commands(path, world, changes)
+        return _commands(path, world, changes, robot)
     found = Shelf("gait or plan", "sim", "scenarios", PlanError).read(word)
     if is_plan(found.text):
         return _plan(found.text, found.source)
@@ -170,18 +198,26 @@ def _plan(text: str, source: Path) -> Driven:
     )
 
 
-def _commands(path: Path, world: Scenario | None, changes: Mapping[str, Any] | None) -> Driven:
+def _commands(
+    path: Path, world: Scenario | None, changes: Mapping[str, Any] | None, robot: Robot | None
+) -> Driven:
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
         stored, told = session.attachments, session.metadata
         settle_s, described = session.settle_s, session.robot
-        robot = described if world is None else world.robot
+        if robot is None:
+            robot = described if world is None else world.robot
         facts["driven.session_id"] = session.session_id
     if robot is None:
-        raise DataError(f"{path}: the session has no robot; name one by its world, e.g. twin:flat")
+        raise DataError(
+            f"{path}: the session has no robot; name one by its world, e.g. twin:flat, or, on a "
+            "bus, by --robot"
+        )
     try:
         replay = CommandReplay(recorded, robot)
+    except JointSetError as error:
+        raise JointSetError(f"{path}: {error}") from error
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 
@@ -205,6 +241,7 @@ def _commands(path: Path, world: Scenario | None, changes: Mapping[str, Any] | N
         settle_s=settle_s,
         records={name: told[name] for name in _RECORDS if name in told},
         kernels=_kernels(told.get("undulog", {}).get("kernels")),
+        joints=recorded.commands.names,
     )
 
 

@@ -1,10 +1,9 @@
-"""A robot's bus as the control loop sees it; one that only listens, and the virtual robot's.
+"""A robot's bus as the control loop sees it, and that of undulog's own virtual robot.
 
-Commands go nowhere but to undulog's own virtual robot: it runs on this computer and says what it
-is. A client that sends ``< undulog >`` is answered ``< undulog virtual-robot NAME PACE >``, and
-from then on gets ``< tick N >`` after the frames of each control tick; PACE is ``paced`` (the robot
-keeps to real time) or ``lockstep`` (it waits at each tick until every servo has a command).
-Everything else is socketcand.
+The virtual robot runs on this computer and says what it is. A client that sends ``< undulog >`` is
+answered ``< undulog virtual-robot NAME PACE >``, and from then on gets ``< tick N >`` after the
+frames of each control tick; PACE is ``paced`` (the robot keeps to real time) or ``lockstep`` (it
+waits at each tick until every servo has a command). Everything else is socketcand.
 """
 
 from __future__ import annotations
@@ -12,13 +11,15 @@ from __future__ import annotations
 import ipaddress
 import re
 import select
+import socket
 import time
 from collections.abc import Sequence
 from typing import Protocol
 
-from capture.errors import SourceError, UsageError
+from capture.errors import SourceError
 from capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray
-from capture.sources.contract import Polled, Source, SourceAddress, SourceContext
+from capture.robot import ClockDomain
+from capture.sources.contract import SourceAddress
 from capture.sources.events import Tally
 from capture.sources.socketcand import connect, enter_raw_mode, read_answer, server_of
 from capture.sources.socketcand_text import SocketcandText
@@ -37,6 +38,11 @@ class Link(Protocol):
         """What it is, for messages."""
         ...
 
+    @property
+    def clock(self) -> ClockDomain:
+        """Whose clock the frames' device times are on."""
+        ...
+
     def receive(self) -> Sequence[FrameArray]:
         """Take what has come, without waiting.
 
@@ -48,111 +54,101 @@ class Link(Protocol):
         """
         ...
 
+    def send(self, frames: FrameArray) -> None:
+        """Put frames on the bus.
+
+        Args:
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+
+        Raises:
+            SourceError: If the bus doesn't take them.
+        """
+        ...
+
     def close(self) -> None:
         """Release it; safe to call twice."""
         ...
 
 
-class ListeningLink:
-    """Any bus that a recorder can read: it is opened in the same way, and nothing is sent."""
+def find_virtual_robot(address: SourceAddress, tally: Tally) -> VirtualRobotLink | None:
+    """Ask a socketcand server whether it is a virtual robot.
 
-    def __init__(self, source: Source, address: SourceAddress, context: SourceContext) -> None:
-        """Connect.
+    Args:
+        address: ``can:socketcand:CHANNEL?port=PORT``.
+        tally: Where to count what is malformed.
 
-        Args:
-            source: The bus, not started.
-            address: Its address.
-            context: Clock and writer for the source.
+    Returns:
+        Its bus, opened; None if it is another server, which has been asked nothing else.
 
-        Raises:
-            SourceError: If it can't be opened.
-        """
-        self.place = address.text
-        self._source = source
-        source.start(context)
-        if not source.connected:
-            self._lost(source.poll())
+    Raises:
+        SourceError: If nobody is there, or it has no such bus.
+    """
+    channel = address.rest.partition(":")[2]
+    try:
+        sock, rest = connect(*server_of(address))
+    except OSError as error:
+        raise SourceError(address.text, f"can't connect: {error.strerror or error}") from error
+    try:
+        found, rest = _identity(sock, rest)
+        if found is None:
+            sock.close()
+            return None
+        rest = enter_raw_mode(sock, rest, channel)
+    except OSError as error:
+        sock.close()
+        raise SourceError(address.text, f"can't open it: {error.strerror or error}") from error
+    return VirtualRobotLink(address.text, sock, rest, tally, found[1], lockstep=found[2] != "paced")
 
-    def receive(self) -> Sequence[FrameArray]:
-        """Take what has come, without waiting.
 
-        Returns:
-            Arrays of frames.
-
-        Raises:
-            SourceError: If the bus is lost.
-        """
-        polled = self._source.poll()
-        if not self._source.connected:
-            self._lost(polled)
-        return (*polled.frames, *polled.fd_frames)
-
-    def close(self) -> None:
-        """Release it; safe to call twice."""
-        self._source.stop()
-
-    def _lost(self, polled: Polled) -> None:
-        told = [event.text for event in polled.events if event.level != "info"]
-        self._source.stop()
-        raise SourceError(self.place, "; ".join(told) or "the connection is gone")
+def _identity(sock: socket.socket, rest: bytes) -> tuple[re.Match[str] | None, bytes]:
+    """What a server on this computer says that it is, and what came behind."""
+    if not ipaddress.ip_address(sock.getpeername()[0]).is_loopback:
+        return None, rest
+    try:
+        sock.sendall(b"< undulog >")
+        answer, rest = read_answer(sock, rest)
+    except OSError:  # others may end the connection at a word that they don't know
+        return None, rest
+    return _IDENTITY.fullmatch(answer), rest
 
 
 class VirtualRobotLink:
-    """The bus of a virtual robot; the only one that takes commands.
+    """The bus of a virtual robot.
 
     Attributes:
         place: What it is, for messages.
+        clock: Whose clock the frames' device times are on: the twin's.
         robot_name: Who is there.
         lockstep: Whether it waits for commands at each tick.
     """
 
-    def __init__(self, address: SourceAddress, tally: Tally) -> None:
-        """Connect, and see that a virtual robot is there.
+    def __init__(
+        self,
+        place: str,
+        sock: socket.socket,
+        rest: bytes,
+        tally: Tally,
+        robot_name: str,
+        *,
+        lockstep: bool,
+    ) -> None:
+        """Take over a connection; see :func:`find_virtual_robot`.
 
         Args:
-            address: ``can:socketcand:CHANNEL?port=PORT``.
+            place: What it is, for messages.
+            sock: In raw mode.
+            rest: What came already.
             tally: Where to count what is malformed.
-
-        Raises:
-            UsageError: If it is no virtual robot on this computer.
-            SourceError: If nobody is there.
+            robot_name: Who is there.
+            lockstep: Whether it waits for commands at each tick.
         """
-        self.place = address.text
-        interface, _, channel = address.rest.partition(":")
-        if interface != "socketcand" or not channel:
-            raise _refused(address, "is no virtual robot's bus")
-        host, port = server_of(address)
-        try:
-            self._socket, rest = connect(host, port)
-        except OSError as error:
-            raise SourceError(address.text, f"can't connect: {error.strerror or error}") from error
-        try:
-            self.robot_name, self.lockstep, rest = self._identify(address, rest)
-            self._rest = enter_raw_mode(self._socket, rest, channel)
-        except OSError as error:
-            self._socket.close()
-            raise SourceError(address.text, f"can't open it: {error.strerror or error}") from error
-        except UsageError:
-            self._socket.close()
-            raise
+        self.place, self.robot_name, self.lockstep = place, robot_name, lockstep
+        self.clock = ClockDomain.SIMULATED
+        self._socket, self._rest = sock, rest
         self._socket.settimeout(_SEND_S)
         self._text, self._tally = SocketcandText(), tally
         self._ready: list[FrameArray] = []
         self._ticks: list[tuple[int, int]] = []  # tick, and how many of the ready arrays are of it
-
-    def _identify(self, address: SourceAddress, rest: bytes) -> tuple[str, bool, bytes]:
-        peer = self._socket.getpeername()[0]
-        if not ipaddress.ip_address(peer).is_loopback:
-            raise _refused(address, f"is at {peer}, not on this computer")
-        try:
-            self._socket.sendall(b"< undulog >")
-            answer, rest = read_answer(self._socket, rest)
-        except OSError:
-            answer = ""
-        found = _IDENTITY.fullmatch(answer)
-        if found is None:
-            raise _refused(address, "does not say that it is a virtual robot")
-        return found[1], found[2] == "lockstep", rest
 
     def receive(self) -> Sequence[FrameArray]:
         """Take what has come, without waiting; tick marks are passed over.
@@ -251,10 +247,3 @@ def sent_text(frames: FrameArray) -> bytes:
         payload = data[:length].tobytes().hex(" ").upper()
         text.append(f"< send {id_flags & ID_MASK:0{digits}X} {length} {payload} >")
     return "".join(text).encode()
-
-
-def _refused(address: SourceAddress, why: str) -> UsageError:
-    return UsageError(
-        f"{address.text} {why}; commands are sent to undulog's own virtual robot only, on this "
-        "computer: start one with 'undulog sim serve', or leave --arm out to look on"
-    )

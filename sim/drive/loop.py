@@ -1,26 +1,27 @@
-"""The control loop over a bus: read, ask the gait, encode, send; once a control period."""
+"""The control loop over a bus: read, ask the gate, encode, send; once a control period."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from capture.arrays import FloatArray
 from capture.bus.encoding import BusEncoder, BusValue
 from capture.errors import SourceError
 from capture.interruption import StopRequest
-from capture.log.frames import FrameArray
+from capture.log.frames import FrameArray, empty_frames
 from capture.robot import Direction, Quantity, Robot
 
-from ..gait import GaitTick
+from ..gate.faults import GateFault
+from ..gate.gate import Gate, GateStep, Heard, Phase
+from ..gate.presence import Presence
 from ..scenario import CONTROL_RATE_HZ
-from .fading import FadingGait
-from .link import Link, VirtualRobotLink
+from .console_watch import ConsoleWatch
+from .link import Link
 from .pace import Pace
 from .readings_from_bus import BusReadings
-
-LOST_S = 0.5
-"""A robot that takes commands and is silent for so long is lost [s]."""
+from .why_stop import why_stop
 
 
 class BusTick(NamedTuple):
@@ -28,15 +29,15 @@ class BusTick(NamedTuple):
 
     Attributes:
         tick: Its number, from 0.
-        gait: What the gait commands from here on.
+        step: What the gate had done.
         received: Frames that came by then.
-        frames: The commands as frames.
+        sent: The commands as frames; none where nothing was sent.
     """
 
     tick: int
-    gait: GaitTick
+    step: GateStep
     received: Sequence[FrameArray]
-    frames: FrameArray
+    sent: FrameArray
 
     @property
     def time_s(self) -> float:
@@ -49,22 +50,20 @@ class LoopTally:
     """How a loop went.
 
     Attributes:
-        ticks: Ticks taken.
+        loop_s: Time of the last tick, from the first [s].
         overruns: Ticks left out because the one before took too long.
-        duration_s: Time of the last tick.
         sent: Frames sent.
         received: Frames that came.
         decoded: Frames of these with something that the robot's map names.
-        complete: Whether it reached its planned end.
+        late_s: How late each tick was [s], where the clock sets the pace.
     """
 
-    ticks: int = 0
+    loop_s: float = 0.0
     overruns: int = 0
-    duration_s: float = 0.0
     sent: int = 0
     received: int = 0
     decoded: int = 0
-    complete: bool = False
+    late_s: list[float] = field(default_factory=list[float])
 
 
 class CommandEncoder:
@@ -82,70 +81,95 @@ class CommandEncoder:
         self._encoder = BusEncoder(robot, Direction.TX)
         self._keys: list[BusValue] = [(name, Quantity.COMMAND, "") for name in robot.joint_names]
 
-    def frames(self, tick: GaitTick, t_ns: int = 0) -> FrameArray:
+    def frames(self, command: FloatArray) -> FrameArray:
         """The frames of one tick.
 
         Args:
-            tick: What the gait says.
-            t_ns: Time of the frames [ns].
+            command: Joint angles [rad], shape (m,).
 
         Returns:
-            Records of :data:`capture.log.frames.FRAME_DTYPE`.
+            Records of :data:`capture.log.frames.FRAME_DTYPE`, without times.
         """
-        return self._encoder.encode(dict(zip(self._keys, tick.command.tolist(), strict=True)), t_ns)
+        return self._encoder.encode(dict(zip(self._keys, command.tolist(), strict=True)))
 
 
-def control(
-    gait: FadingGait,
-    robot: Robot,
-    link: Link,
-    pace: Pace,
-    *,
-    duration_s: float,
-    stop: StopRequest,
-    on_tick: Callable[[BusTick], None],
-) -> LoopTally:
-    """Run the loop until its planned end, or until it was asked to stop and has come to rest.
+class ControlLoop:
+    """One drive: a gate between a gait and a bus."""
 
-    Args:
-        gait: Who commands.
-        robot: Whose bus it is.
-        link: The bus; commands are sent if it is a virtual robot's.
-        pace: When the ticks are.
-        duration_s: Time of the last tick.
-        stop: Looked at in each tick.
-        on_tick: Told of each tick after the commands are sent.
+    def __init__(self, gate: Gate, robot: Robot, link: Link, pace: Pace) -> None:
+        """Put it together.
 
-    Returns:
-        How it went.
+        Args:
+            gate: Who decides what is sent.
+            robot: Whose bus it is.
+            link: The bus.
+            pace: When the ticks are.
 
-    Raises:
-        DataError: If the robot has no bus.
-        SourceError: If the robot is lost, or the bus.
-    """
-    encoder, known, tally = CommandEncoder(robot), BusReadings(robot), LoopTally()
-    last = round(duration_s * CONTROL_RATE_HZ)
-    while not gait.at_rest:
-        tick, received = pace.next()
-        tick = min(tick, last)  # where ticks are left out, the last one may be among them
-        time_s = tick / CONTROL_RATE_HZ
+        Raises:
+            DataError: If the robot has no bus.
+        """
+        self.tally = LoopTally()
+        self._gate, self._link, self._pace = gate, link, pace
+        self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
+        self._presence = Presence(robot)
+
+    def run(
+        self,
+        stop: StopRequest,
+        on_tick: Callable[[BusTick], None],
+        console: ConsoleWatch | None = None,
+    ) -> None:
+        """Run until the gate is done; a bus that is lost after the first command is its fault.
+
+        Args:
+            stop: Looked at in each tick.
+            on_tick: Told of each tick after the commands are sent.
+            console: The terminal whose loss ends the drive, if it has one.
+
+        Raises:
+            SourceError: If the bus is lost, or the robot isn't there, before anything was sent.
+            UsageError: If another robot is there.
+        """
+        gone = False
+        while self._gate.phase is not Phase.DONE:
+            try:
+                tick, received = self._pace.next()
+                heard = self._hear(tick, received)
+                gone = gone or (console is not None and console.gone())
+                step = self._gate.step(
+                    tick, heard, why_stop(stop, console_gone=gone), at_once=stop.again
+                )
+                sent = self._send(step)
+            except SourceError as error:
+                if not self.tally.sent:
+                    raise
+                self._gate.lost(str(error))
+                return
+            self.tally.loop_s, self.tally.overruns = tick / CONTROL_RATE_HZ, self._pace.overruns
+            on_tick(BusTick(tick, step, received, sent))
+
+    def _hear(self, tick: int, received: Sequence[FrameArray]) -> Heard:
+        time_s, trouble = tick / CONTROL_RATE_HZ, None
         for frames in received:
-            known.add(frames, time_s)
-            tally.received += len(frames)
-        if stop.requested:
-            gait.begin()
-        said = gait.step(time_s, known.readings(time_s))
-        commands = encoder.frames(said)
-        if isinstance(link, VirtualRobotLink):
-            if min(known.silence_s(time_s), time_s) > LOST_S:
-                raise SourceError(link.place, f"the robot is lost: silent for {LOST_S:g} s")
-            link.send(commands)
-            tally.sent += len(commands)
-        tally.ticks += 1
-        tally.decoded = known.tally.decoded
-        tally.overruns, tally.duration_s = pace.overruns, time_s
-        on_tick(BusTick(tick, said, received, commands))
-        if tick >= last:
-            tally.complete = True
-            break
-    return tally
+            self._known.add(frames, time_s)
+            found: GateFault | None = self._presence.add(frames)
+            trouble = trouble or found
+            self.tally.received += len(frames)
+        self.tally.decoded = self._known.tally.decoded
+        if self._pace.by_the_clock:
+            self.tally.late_s.append(self._pace.late_s)
+        return Heard(
+            readings=self._known.readings(time_s),
+            status=self._known.status(time_s),
+            trouble=trouble,
+            another_robot=self._presence.another_robot(),
+            late_s=self._pace.late_s,
+        )
+
+    def _send(self, step: GateStep) -> FrameArray:
+        if step.command is None:
+            return empty_frames(0)
+        frames = self._encoder.frames(step.command)
+        self._link.send(frames)
+        self.tally.sent += len(frames)
+        return frames

@@ -1,15 +1,11 @@
-"""Driving over a bus: connection, session, recorder and loop put together.
-
-Without arming it is a dry run: any bus can be listened to as a recorder does, readings reach the
-gait, commands are computed and none is sent.
-"""
+"""Driving over a bus: connection, safety gate, session, recorder and loop put together."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from capture.bus.decoding import identifier_text
@@ -17,22 +13,29 @@ from capture.daemon.clock import SessionClock
 from capture.errors import UndulogError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import FrameArray
-from capture.log.writer import SessionWriter
-from capture.robot import ClockDomain
+from capture.robot import Robot
 from capture.sources.address import parse_address
-from capture.sources.contract import SourceAddress, SourceContext
+from capture.sources.contract import SourceAddress
 from capture.sources.events import Tally
-from capture.sources.registry import open_source
 
 from ..garbage import quick_collections
+from ..gate.gate import Gate
+from ..gate.lateness import jitter
+from ..gate.limits import GateLimits, gate_limits
+from ..gate.outcome import How, Outcome
 from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
-from .bus_session import BusSession, NowhereSink, stamped
+from .bus_report import BusReport, remarks_of
+from .bus_session import BusSession, stamped
+from .console_watch import ConsoleWatch
 from .driven import Driven
-from .fading import FadingGait
 from .gait_teller import GaitTeller
-from .link import Link, ListeningLink, VirtualRobotLink
-from .loop import BusTick, LoopTally, control
+from .link import Link, VirtualRobotLink
+from .loop import BusTick, ControlLoop, LoopTally
+from .open_link import open_link
 from .pace import LockstepPace, WallPace
+
+LISTEN_S = 0.5
+"""A bus whose robot doesn't say its name is listened to for so long before anything is sent [s]."""
 
 _NS = 1_000_000_000
 
@@ -43,51 +46,32 @@ class BusPlan:
 
     Attributes:
         driven: What to drive.
+        robot: On which robot.
+        limits: What that robot may do.
         address: The bus.
-        duration_s: Time of the last tick.
-        armed: Whether commands are sent.
-        output: The session to write, or None.
+        duration_s: Time of the gait's last tick.
+        output: The session to write.
         recorder: Control socket of a recorder that is told the gait, or None.
         force: Replace an existing session.
     """
 
     driven: Driven
+    robot: Robot
+    limits: GateLimits
     address: SourceAddress
     duration_s: float
-    armed: bool
-    output: Path | None = None
+    output: Path
     recorder: Path | None = None
     force: bool = False
-
-
-@dataclass
-class BusReport:
-    """How it went.
-
-    Attributes:
-        tally: Of the loop.
-        lockstep: Whether the robot set the pace.
-        wall_s: How long it took.
-        first_frames: The commands of the first tick, as candump writes frames.
-        told: Samples of the gait that the recorder took.
-        not_told: Why the recorder was not told all, or None.
-    """
-
-    tally: LoopTally
-    lockstep: bool
-    wall_s: float = 0.0
-    first_frames: list[str] = field(default_factory=list[str])
-    told: int = 0
-    not_told: str | None = None
 
 
 def bus_plan(
     driven: Driven,
     on: str,
     *,
+    robot: Robot | None = None,
     duration_s: float | None,
-    armed: bool,
-    output: Path | None,
+    output: Path,
     recorder: Path | None,
     force: bool,
 ) -> BusPlan:
@@ -96,9 +80,9 @@ def bus_plan(
     Args:
         driven: What to drive.
         on: The bus, ``can:INTERFACE:CHANNEL[...]``.
+        robot: On which robot; the one that it was made for if None.
         duration_s: How long [s]; its own length if None.
-        armed: Whether commands are sent.
-        output: The session to write, or None.
+        output: The session to write.
         recorder: Control socket of a recorder, or None.
         force: Replace an existing session.
 
@@ -106,65 +90,80 @@ def bus_plan(
         The plan.
 
     Raises:
-        UsageError: If the address is none, the robot has no bus, or the duration can't be.
+        UsageError: If the address is none, the robot has no bus or lacks limits, the commands are
+            of other joints, or the duration can't be.
     """
-    address = parse_address(on) if ":" in on else None
-    if address is None or address.scheme != "can":
-        raise UsageError(f"--on {on}: expected twin, twin:SCENARIO or can:INTERFACE:CHANNEL")
-    if driven.robot.bus is None:
-        raise UsageError(
-            f"{driven.robot.name} has no bus map: {driven.name} can't be driven on one"
-        )
+    address = bus_address(on)
+    robot = robot or driven.robot
+    if robot.bus is None:
+        raise UsageError(f"{robot.name} has no bus map: {driven.name} can't be driven on one")
+    driven.check_fits(robot)
+    limits = gate_limits(robot)
     length = driven.duration_s if duration_s is None else duration_s
     if not 1 / CONTROL_RATE_HZ <= length <= LONGEST_S:
         raise UsageError(
             f"a duration of {length:g} s; it can be {1 / CONTROL_RATE_HZ:g} to {LONGEST_S:g} s"
         )
-    return BusPlan(driven, address, length, armed, output, recorder, force)
+    return BusPlan(driven, robot, limits, address, length, output, recorder, force)
+
+
+def bus_address(on: str) -> SourceAddress:
+    """What ``--on`` names, if it is a bus.
+
+    Args:
+        on: ``can:INTERFACE:CHANNEL[...]``.
+
+    Returns:
+        The address.
+
+    Raises:
+        UsageError: If it is something else.
+    """
+    address = parse_address(on) if ":" in on else None
+    if address is None or address.scheme != "can":
+        raise UsageError(f"--on {on}: expected twin, twin:SCENARIO or can:INTERFACE:CHANNEL")
+    return address
 
 
 def drive_bus(
-    plan: BusPlan, *, stop: StopRequest, on_tick: Callable[[BusTick], None] | None = None
+    plan: BusPlan,
+    *,
+    stop: StopRequest,
+    on_tick: Callable[[BusTick], None] | None = None,
+    console: ConsoleWatch | None = None,
 ) -> BusReport:
     """Drive over a bus.
 
     Args:
         plan: What to do.
-        stop: The gait comes to rest when it is requested, and the loop ends.
+        stop: The drive ends as the robot's file says when it is requested; at once if again.
         on_tick: Told of each tick.
+        console: The terminal whose loss ends the drive likewise, if there is one.
 
     Returns:
-        How it went.
+        How it went, also where a fault ended it.
 
     Raises:
-        UsageError: If commands are to be sent and it is no virtual robot, or another one's.
-        SourceError: If nobody is there, or the robot is lost.
+        UsageError: If it is another robot's bus.
+        SourceError: If nobody is there, or the robot is no robot to start with.
         ControlError: If the recorder isn't there.
         OutputExistsError: If the session is there and ``force`` is not given.
         LogWriteError: If it can't be written.
     """
-    clock = SessionClock()
-    robot = plan.driven.robot
-    gait = FadingGait(plan.driven.make(robot, None), robot)
+    clock, robot = SessionClock(), plan.robot
+    gait = plan.driven.make(robot, None)
     with ExitStack() as opened:
-        virtual = _virtual_robot(plan, clock) if plan.armed else None
-        link: Link = virtual or _listening(plan, clock)
+        link = open_link(plan.address, Tally(clock.now_ns))
         opened.callback(link.close)
+        virtual = link if isinstance(link, VirtualRobotLink) else None
+        if virtual is not None and virtual.robot_name != robot.name:
+            raise UsageError(
+                f"{plan.address.text} is {virtual.robot_name}, and {plan.driven.name} is for "
+                f"{robot.name}; nothing was sent"
+            )
         lockstep = virtual is not None and virtual.lockstep
         epoch_ns = Scenario.epoch_s * _NS if lockstep else clock.epoch_ns
-        session = BusSession(
-            plan.output,
-            robot=robot,
-            bus=plan.address.name,
-            clock=ClockDomain.SIMULATED if virtual is not None else ClockDomain.HOST,
-            epoch_ns=epoch_ns,
-            gait_names=gait.names,
-            armed=plan.armed,
-            facts={**plan.driven.session_facts, f"source.{plan.address.name}": plan.address.text},
-            attachments=plan.driven.attachments,
-            records=plan.driven.records,
-            force=plan.force,
-        )
+        session = _session(plan, link, epoch_ns, gait.names)
         opened.callback(session.close)
         teller = None
         if plan.recorder is not None:
@@ -178,21 +177,23 @@ def drive_bus(
             simulated_ns=epoch_ns if lockstep else None,
             on_tick=on_tick,
         )
-        report = BusReport(LoopTally(), lockstep)
+        gate = Gate(
+            gait,
+            plan.limits,
+            duration_s=plan.duration_s,
+            rate_hz=CONTROL_RATE_HZ,
+            place=plan.address.text,
+            listen_s=0.0 if virtual is not None else LISTEN_S,
+        )
+        pace = LockstepPace(virtual) if virtual and lockstep else WallPace(link, CONTROL_RATE_HZ)
+        loop = ControlLoop(gate, robot, link, pace)
         opened.enter_context(quick_collections())
         begun = time.monotonic()
         try:
             tell.begin()
-            report.tally = control(
-                gait,
-                robot,
-                link,
-                LockstepPace(virtual) if virtual and lockstep else WallPace(link, CONTROL_RATE_HZ),
-                duration_s=plan.duration_s,
-                stop=stop,
-                on_tick=tell.tick,
-            )
-            tell.end(report.tally)
+            loop.run(stop, tell.tick, console)
+            report = _report(gate, loop.tally, lockstep=lockstep)
+            tell.end(report)
         except UndulogError as error:
             tell.failed(str(error))
             raise
@@ -204,6 +205,40 @@ def drive_bus(
             f"{teller.dropped} samples: the recorder was too slow" if teller.dropped else None
         )
     return report
+
+
+def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -> BusSession:
+    bus = plan.address.name
+    session = BusSession(
+        plan.output,
+        robot=plan.robot,
+        bus=bus,
+        clock=link.clock,
+        epoch_ns=epoch_ns,
+        gait_names=names,
+        facts={**plan.driven.facts, "armed": "yes", f"source.{bus}": plan.address.text},
+        settle_s=plan.driven.settle_s,
+        attachments=plan.driven.attachments,
+        records=plan.driven.records,
+        force=plan.force,
+    )
+    session.note("undulog.gate", plan.limits.facts())
+    return session
+
+
+def _report(gate: Gate, tally: LoopTally, *, lockstep: bool) -> BusReport:
+    outcome = gate.outcome or Outcome(How.STOPPED, "", "")
+    began = gate.run_from
+    return BusReport(
+        outcome=outcome,
+        tally=tally,
+        lockstep=lockstep,
+        approach_s=None if began is None else began / CONTROL_RATE_HZ,
+        gait_s=gate.run_s,
+        ticks=gate.run_ticks,
+        cuts=gate.cuts,
+        jitter=jitter(tally.late_s),
+    )
 
 
 class _Telling:
@@ -226,52 +261,42 @@ class _Telling:
 
     def begin(self) -> None:
         driven = self._plan.driven
-        how = "drives" if self._plan.armed else "would drive (dry run)"
-        text = f"{how} {driven.name} ({driven.kind}) on {self._plan.address.text}"
+        text = f"drives {driven.name} ({driven.kind}) on {self._plan.address.text}"
         self._session.say("info", text)
         if self._teller is not None:
             self._teller.note(text)
 
     def tick(self, tick: BusTick) -> None:
-        if not tick.tick:
-            self.first_frames = [_candump(frame) for frame in tick.frames]
+        if len(tick.sent) and not self.first_frames:
+            self.first_frames = [_candump(frame) for frame in tick.sent]
         if self._simulated_ns is None:
             self._session.write(tick, self._clock.now_ns())
         else:
             t_ns = self._simulated_ns + tick.tick * (_NS // CONTROL_RATE_HZ)
             self._session.write(stamped(tick, t_ns), t_ns)
         if self._teller is not None:
-            self._teller.tell(tick.gait, time.time_ns())
+            if tick.step.gait is not None:
+                self._teller.tell(tick.step.gait, time.time_ns())
+            for level, text in tick.step.remarks:
+                self._teller.note(text, level)
         if self._on_tick is not None:
             self._on_tick(tick)
 
-    def end(self, tally: LoopTally) -> None:
-        self._session.finish(tally)
+    def end(self, report: BusReport) -> None:
+        self._session.finish(report.outcome, remarks_of(report))
+        if report.jitter is not None:
+            facts = {name: str(value) for name, value in report.jitter.to_dict().items()}
+            self._session.note("undulog.gate.jitter", facts)
         if self._teller is not None:
-            self._teller.note(f"drove {self._plan.driven.name} for {tally.duration_s:g} s")
+            name, outcome = self._plan.driven.name, report.outcome
+            why = f", {outcome.why}" if outcome.why else ""
+            level = "error" if outcome.how is How.FAULT else "info"
+            self._teller.note(f"drove {name} for {report.gait_s:g} s{why}", level)
 
     def failed(self, text: str) -> None:
         self._session.fail(text)
         if self._teller is not None:
             self._teller.note(text, "error")
-
-
-def _virtual_robot(plan: BusPlan, clock: SessionClock) -> VirtualRobotLink:
-    link = VirtualRobotLink(plan.address, Tally(clock.now_ns))
-    if link.robot_name != plan.driven.robot.name:
-        link.close()
-        raise UsageError(
-            f"{plan.address.text} is {link.robot_name}, and {plan.driven.name} is for "
-            f"{plan.driven.robot.name}"
-        )
-    return link
-
-
-def _listening(plan: BusPlan, clock: SessionClock) -> ListeningLink:
-    # A bus has no channels of its own to write: its frames are handed out.
-    unused = SessionWriter("nowhere.mcap", session_id="", epoch_ns=0, sink=NowhereSink())
-    source = open_source(plan.address)
-    return ListeningLink(source, plan.address, SourceContext(clock.now_ns, unused))
 
 
 def _candump(frame: FrameArray) -> str:

@@ -18,8 +18,12 @@ LOST_S = 5.0
 class Pace(Protocol):
     """Gives one tick after the other."""
 
+    by_the_clock: bool
+    """Whether the clock sets the pace, rather than the robot."""
     overruns: int
     """Ticks that were left out because the one before took too long."""
+    late_s: float
+    """How late the newest tick is, against the first one that had not been taken [s]."""
 
     def next(self) -> tuple[int, Sequence[FrameArray]]:
         """Wait for the next tick.
@@ -36,6 +40,8 @@ class Pace(Protocol):
 class WallPace:
     """Ticks of the computer's monotonic clock, anchored at the first one."""
 
+    by_the_clock = True
+
     def __init__(self, link: Link, rate_hz: int) -> None:
         """The first tick is at once.
 
@@ -44,6 +50,7 @@ class WallPace:
             rate_hz: Ticks a second.
         """
         self.overruns = 0
+        self.late_s = 0.0
         self._link, self._period_ns = link, 1_000_000_000 // rate_hz
         self._tick = -1
         self._start_ns = 0
@@ -59,20 +66,24 @@ class WallPace:
         """
         now_ns = time.monotonic_ns()
         if self._tick < 0:
-            self._start_ns = now_ns
-        self._tick += 1
-        late = (now_ns - self._start_ns) // self._period_ns - self._tick
-        if late > 0:
-            self.overruns += late
-            self._tick += late
-        wait_ns = self._start_ns + self._tick * self._period_ns - now_ns
-        if wait_ns > 0:
-            time.sleep(wait_ns * 1e-9)
+            self._tick, self._start_ns = 0, now_ns
+            return 0, self._link.receive()
+        due_ns = self._start_ns + (self._tick + 1) * self._period_ns
+        while now_ns < due_ns:
+            time.sleep((due_ns - now_ns) * 1e-9)
+            now_ns = time.monotonic_ns()
+        # Also where the process was stopped while it slept: what is over is left out.
+        left_out = (now_ns - due_ns) // self._period_ns
+        self.overruns += left_out
+        self._tick += 1 + left_out
+        self.late_s = (now_ns - due_ns) * 1e-9
         return self._tick, self._link.receive()
 
 
 class LockstepPace:
     """The ticks of a robot that waits for the commands of each."""
+
+    by_the_clock = False
 
     def __init__(self, link: VirtualRobotLink) -> None:
         """The first tick that the robot tells is tick 0.
@@ -81,6 +92,7 @@ class LockstepPace:
             link: The robot's bus.
         """
         self.overruns = 0
+        self.late_s = 0.0
         self._link = link
         self._first: int | None = None
 

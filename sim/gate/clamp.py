@@ -32,9 +32,9 @@ class Clamped(NamedTuple):
 class Clamp:
     """Cuts commands to position limits, and their steps to the greatest rate.
 
-    It knows the command before, which the servos hold: a step is measured from there. The time
-    between two commands counts as one control period at most, so that what was late is caught up
-    step by step and never by a jump.
+    It knows the command before, which the servos hold: a step is measured from there, and is at
+    most what the greatest rate allows in one control period, also where ticks were left out. What
+    was late is caught up step by step and never by a jump.
     """
 
     def __init__(self, limits: GateLimits, pose: FloatArray, period_s: float) -> None:
@@ -50,18 +50,17 @@ class Clamp:
         """
         if not np.isfinite(pose).all():
             raise ValueError("the pose to start from has angles that are not known")
-        self._limits, self._period_s = limits, period_s
+        self._limits, self._reach = limits, limits.rate * period_s
         self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
         """What was commanded last, at first the pose [rad], shape (m,)."""
         self.cuts: dict[str, int] = {"by_position": 0, "by_rate": 0, "not_finite": 0}
         """Commands of single joints that were changed, by why."""
 
-    def apply(self, wanted: FloatArray, elapsed_s: float | None = None) -> Clamped:
+    def apply(self, wanted: FloatArray) -> Clamped:
         """Make a command fit to be sent; it counts as sent.
 
         Args:
             wanted: Joint angles [rad], shape (m,); anything.
-            elapsed_s: Time since the last command [s]; a control period if None.
 
         Returns:
             The command, and what was changed.
@@ -69,9 +68,7 @@ class Clamp:
         limits = self._limits
         finite = np.isfinite(wanted)
         within = np.clip(np.where(finite, wanted, self.last), limits.lower, limits.upper)
-        step_s = self._period_s if elapsed_s is None else min(max(elapsed_s, 0.0), self._period_s)
-        reach = limits.rate * step_s
-        command = np.clip(within, self.last - reach, self.last + reach)
+        command = np.clip(within, self.last - self._reach, self.last + self._reach)
         by_position = finite & (np.abs(within - wanted) > _ROUNDING)
         by_rate = np.abs(command - within) > _ROUNDING
         self.last = command

@@ -37,7 +37,7 @@ from .status import JointStatus
 from .watch import Watch
 from .yielding import Yielding
 
-POSE_S = 3.0
+POSE_S = 2.0
 """So long the gate waits for the pose of every joint [s]."""
 
 _SHOWN = 8
@@ -63,7 +63,6 @@ class Heard:
         trouble: What the bus itself told: bus-off, or somebody else's commands.
         another_robot: Why this can't be the robot, None if it may be.
         late_s: How late the tick is [s].
-        elapsed_s: Time since the tick before [s].
     """
 
     readings: Readings
@@ -71,7 +70,6 @@ class Heard:
     trouble: GateFault | None = None
     another_robot: str | None = None
     late_s: float = 0.0
-    elapsed_s: float = 0.0
 
 
 class Remark(NamedTuple):
@@ -120,7 +118,8 @@ class Gate:
             duration_s: Time of the gait's last tick.
             rate_hz: Control ticks a second.
             place: The bus, for messages.
-            listen_s: So long the bus is listened to at least before anything is sent [s].
+            listen_s: So long the bus is listened to at least before anything is sent, to see whose
+                it is [s]; 0: the robot has said its name.
         """
         self.phase = Phase.POSE
         self.outcome: Outcome | None = None
@@ -175,24 +174,15 @@ class Gate:
         clamp = self._clamp or self._begin(tick, heard, stop)
         if clamp is None:
             return self._quiet()
-        found = self._trouble(tick, heard, clamp)
-        if found is not None and (self.phase is not Phase.ENDING or found.kind in MUTE):
-            self._fail(found, clamp, heard.status)
-        elif at_once:
-            self._halt(stop)
-        elif stop and self.phase is not Phase.ENDING:
-            self.outcome = Outcome(How.STOPPED, stop, "")
-            self._end(clamp, heard.status)
+        self._heed(tick, heard, clamp, stop, at_once=at_once)
         if self.phase is Phase.DONE:
             return self._quiet()
         wanted, gait = self._wanted(tick, heard)
         pulled = self._yielding.apply(wanted, heard.status.angle, heard.status.current)
-        given = clamp.apply(pulled, heard.elapsed_s)
+        given = clamp.apply(pulled)
         self._tell_changes(given)
-        phase = Phase.ENDING if self.phase is Phase.DONE else self.phase
-        if self.phase is Phase.RUN and self.run_s * self._rate_hz >= self._last - 1e-6:
-            self.outcome = Outcome(How.COMPLETE, "", "the servos hold their last commands")
-            self._become(Phase.DONE)
+        phase = self.phase
+        self._end_in_time()
         return GateStep(phase, given.command, wanted, gait, tuple(self._remarks))
 
     def lost(self, why: str) -> None:
@@ -219,10 +209,12 @@ class Gate:
             self.phase = Phase.DONE
             return None
         unknown = np.isnan(heard.status.angle)
-        if waited_s < self._listen_s or (unknown.any() and waited_s < POSE_S):
+        if waited_s < self._listen_s:
             return None
-        if heard.another_robot is not None:
+        if self._listen_s and heard.another_robot is not None:
             raise UsageError(f"{self._place}: nothing was sent: {heard.another_robot}")
+        if unknown.any() and waited_s < POSE_S:
+            return None
         names = self._limits.joint_names
         if unknown.any():
             silent = _listed(tuple(names[i] for i in np.flatnonzero(unknown)), len(names))
@@ -262,14 +254,12 @@ class Gate:
     def _wanted(self, tick: int, heard: Heard) -> tuple[FloatArray, GaitTick | None]:
         """What the phase wants to be commanded."""
         if self.phase is Phase.APPROACH and self._way is not None:
-            self._progress_s += self._step_s(heard)
+            self._progress_s += 1.0 / self._rate_hz  # also where it is late: no jump
             if self._progress_s < self._way.duration_s:
                 return self._way.at(self._progress_s), None
             self._run(tick)
         if self.phase is Phase.ENDING and self._way is not None:
-            self._progress_s += self._step_s(heard)
-            if self._progress_s >= self._way.duration_s:
-                self._become(Phase.DONE)
+            self._progress_s += 1.0 / self._rate_hz  # also where it is late: no jump
             return self._way.at(self._progress_s), None
         run_tick = min(tick - (self.run_from or 0), self._last)
         self.run_s = run_tick / self._rate_hz
@@ -278,15 +268,32 @@ class Gate:
         said = said or self._gait.step(self.run_s, heard.readings)
         return said.command, said
 
-    def _step_s(self, heard: Heard) -> float:
-        """How far a ramp goes on in this tick: what was late is not made up for."""
-        return min(max(heard.elapsed_s, 0.0), 1.0 / self._rate_hz)
+    def _end_in_time(self) -> None:
+        """See whether the last command was the last one."""
+        if self.phase is Phase.RUN and self.run_s * self._rate_hz >= self._last - 1e-6:
+            self.outcome = Outcome(How.COMPLETE, "", "the servos hold their last commands")
+            self._become(Phase.DONE)
+            return
+        length_s = 0.0 if self._way is None else self._way.duration_s
+        if self.phase is Phase.ENDING and self._progress_s >= length_s:
+            self._become(Phase.DONE)
 
     def _run(self, tick: int) -> None:
         self.run_from = tick
         self._become(Phase.RUN)
 
     # -- what goes wrong -------------------------------------------------------------------
+
+    def _heed(self, tick: int, heard: Heard, clamp: Clamp, stop: str, *, at_once: bool) -> None:
+        """Change the phase where a fault, or who asks to stop, wants it."""
+        found = self._trouble(tick, heard, clamp)
+        if found is not None and (self.phase is not Phase.ENDING or found.kind in MUTE):
+            self._fail(found, clamp, heard.status)
+        elif at_once:
+            self._halt(stop)
+        elif stop and self.phase is not Phase.ENDING:
+            self.outcome = Outcome(How.STOPPED, stop, "")
+            self._end(clamp, heard.status)
 
     def _trouble(self, tick: int, heard: Heard, clamp: Clamp) -> GateFault | None:
         if heard.trouble is not None:

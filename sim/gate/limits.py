@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -45,6 +46,19 @@ class GateLimits:
     late_s: float
     fault_after_s: float
     on_fault: OnFault
+
+    def facts(self) -> dict[str, str]:
+        """For a session's metadata: each limit, as one number where all joints have the same."""
+        found: dict[str, str] = {}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, np.ndarray):
+                numbers: list[float] = value.tolist()
+                same = len({repr(number) for number in numbers}) == 1
+                found[each.name] = repr(numbers[0]) if same else json.dumps(numbers)
+            elif each.name != "joint_names":
+                found[each.name] = str(value)
+        return found
 
 
 def gate_limits(robot: Robot) -> GateLimits:

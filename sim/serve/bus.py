@@ -64,14 +64,16 @@ class VirtualBus:
         if self._server is not None:
             self._server.identity = identity
 
-    def mark(self, tick: int) -> None:
+    def mark(self, tick: int, state: FrameArray | None = None) -> None:
         """Tell clients that asked for it that all frames of a control tick are out.
 
         Args:
             tick: Its number.
+            state: The newest frames of the robot's state, for those who come later; those of
+                before if None.
         """
         if self._server is not None:
-            self._server.mark(tick)
+            self._server.mark(tick, state)
 
     def wait(self, timeout_s: float) -> None:
         """Serve the clients until something happens.

@@ -124,6 +124,24 @@ class ReplyEncoder:
             parts.append(frames)
         return np.concatenate(parts)
 
+    def at_rest(self, angle: FloatArray, t_ns: int) -> FrameArray:
+        """What the servos of a robot that has not moved yet say.
+
+        Args:
+            angle: Joint angles [rad], shape (m,).
+            t_ns: The robot's clock [ns].
+
+        Returns:
+            Their frames, in the order of the map; what the twin knows no better is 0.
+        """
+        values: dict[BusValue, float] = {}
+        for keys, quantity in zip(self._keys, _OF_JOINT, strict=True):
+            known = _numbers(angle) if quantity is Quantity.POSITION else [0.0] * len(keys)
+            values.update(zip(keys, known, strict=True))
+        frames = self._encoder.encode(values)
+        frames["t_device_ns"] = t_ns
+        return frames
+
     def _cycle(self, sample: JointSample, clock_ns: Callable[[int], int]) -> FrameArray:
         """One polling cycle of the servos."""
         fields = (sample.position, sample.velocity, sample.effort, sample.current, sample.voltage)

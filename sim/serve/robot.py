@@ -16,6 +16,7 @@ import numpy as np
 
 from capture.arrays import BoolArray
 from capture.interruption import StopRequest
+from capture.log.frames import FrameArray
 from capture.robot import Robot
 from capture.sources.records import records
 
@@ -37,6 +38,7 @@ _NS = 1_000_000_000
 PERIOD_NS = _NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
+_WAITING_NS = 40_000_000  # between two reports of a robot that waits for its first command
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
 
@@ -174,13 +176,14 @@ class VirtualRobot:
         """
         tick = self._tick
         if not tick:
-            self._bus.mark(0)  # nothing is told before it: a controller in lockstep may speak
+            # Nothing is told before it: a controller in lockstep may speak, and knows the pose.
+            self._bus.mark(0, self._at_rest())
             self._begin()
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
             (self._idle if self._lockstep else self._serve)(wait_s)
         if self._twin is not None and tick:
-            self._report(self._twin.sensed, tick)
-            self._bus.mark(tick)
+            told = self._report(self._twin.sensed, tick)
+            self._bus.mark(tick, told if self._lockstep else None)
         if self._lockstep:
             self._listen_to_all(tick)
         else:
@@ -201,8 +204,12 @@ class VirtualRobot:
                 self._idle(_PATIENCE_S)
             self._pacer.start(self._pacer.now_ns())
         elif self._wait_for_commands:
+            said_ns = 0
             while not self._latch.frames:
                 self._serve(_PATIENCE_S)
+                if (now_ns := self._pacer.now_ns()) >= said_ns:  # servos tell where they are
+                    self._bus.send(self._at_rest())
+                    said_ns = now_ns + _WAITING_NS
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS // 2)
         else:
@@ -250,12 +257,18 @@ class VirtualRobot:
             why = "commands came late" if self._lockstep else "the twin can't keep up"
             self._say("warn", f"{why}: simulated time stood still, and samples have a gap there")
 
-    def _report(self, samples: Sequence[SensorSample], tick: int) -> None:
-        """Send what the sensors have told by a tick."""
+    def _at_rest(self) -> FrameArray:
+        """What the servos say before the first command."""
+        return self._replies.at_rest(self._latch.angle, self._pacer.now_ns())
+
+    def _report(self, samples: Sequence[SensorSample], tick: int) -> FrameArray:
+        """Send what the sensors have told by a tick; gives what was sent."""
         time_s = tick / CONTROL_RATE_HZ
         frames = self._replies.frames(self._line.samples(samples, time_s), self._pacer.clock_ns)
         now_ns = self._pacer.clock_ns(tick * PERIOD_NS)
-        self._bus.send(self._line.replies(frames, now_ns, time_s))
+        shown = self._line.replies(frames, now_ns, time_s)
+        self._bus.send(shown)
+        return shown
 
     def _watch(self) -> None:
         """Say when servos get no commands any more."""

@@ -4,7 +4,7 @@ Protocol: https://github.com/linux-can/socketcand, ``doc/protocol.md``. Of its m
 raw one, in which a client gets every frame that it did not send itself; frames can be sent in the
 default mode too. One message is not socketcand's: a client that sends ``< undulog >`` is told what
 is served, ``< undulog virtual-robot NAME PACE >``, and from then on gets ``< tick N >`` after the
-frames of each control tick.
+frames of each control tick; before the first one that it gets, the newest state of the robot.
 
 What a client can't take at once waits in a queue of its own. A queue that is full ends the
 connection: on a bus nobody waits for a listener.
@@ -62,6 +62,7 @@ class SocketcandServer:
         self.dropped = 0
         self.identity = ""
         self._tick: int | None = None
+        self._state = b""
         self._bus, self._say = bus, say
         self._clients: dict[int, BusClient] = {}
         self._number = 0
@@ -134,14 +135,19 @@ class SocketcandServer:
         for client in listening:
             self._give(client, text)
 
-    def mark(self, tick: int) -> None:
+    def mark(self, tick: int, state: FrameArray | None = None) -> None:
         """Tell those who asked that all frames of a control tick are out.
 
         Args:
             tick: Its number; a client that goes to raw mode later is told of the newest.
+            state: Frames that such a client is told before it, as it has not heard them.
         """
         self._tick = tick
+        if state is not None:
+            self._state = frame_text(state)
         for client in [c for c in self._clients.values() if c.raw and c.marks]:
+            if not tick:
+                self._give(client, self._state)
             self._give(client, b"< tick %d >" % tick)
 
     def close(self) -> None:
@@ -221,7 +227,7 @@ class SocketcandServer:
             client.raw = word == "rawmode"
             client.held_until = time.monotonic() + HOLD_S
             if client.raw and client.marks and self._tick is not None:
-                self._give(client, b"< tick %d >" % self._tick)
+                self._give(client, self._state + b"< tick %d >" % self._tick)
         elif word in _UNSUPPORTED:
             self._give(client, b"< error only the raw mode is served >")
         else:

@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session, load_robot
+from capture import Session, SessionWriter, load_robot
 from capture.bus.encoding import BusEncoder
 from capture.errors import SourceError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import DIR_TX
-from capture.robot import Direction, Quantity
+from capture.robot import Direction, OnFault, Quantity
 from capture.sources.address import parse_address
 from capture.sources.events import Tally
 from sim import load_scenario
 from sim.control.build import build_gait
 from sim.drive.driven import find_driven
-from sim.drive.link import VirtualRobotLink, sent_text
+from sim.drive.link import find_virtual_robot, sent_text
 from sim.drive.loop import CommandEncoder
-from sim.drive.over_bus import bus_plan, drive_bus
+from sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
 from sim.drive.pace import WallPace
-from sim.gait import GaitTick
+from sim.gate.outcome import How
 from sim.sensing.contract import JointSample
 from sim.serve.bus import VirtualBus
 from sim.serve.pacing import Pacer
@@ -91,6 +91,13 @@ def weak(duration_s):
     return load_scenario("weak-servo-pi3").changed(duration_s=duration_s)
 
 
+TOPICS = {
+    "/joint_commands": "/joint_commands",
+    "/gate/wanted": "/joint_commands",
+    "/gait": "/gait",
+}
+
+
 def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, capsys):
     path, direct = tmp_path / "bus.mcap", tmp_path / "direct.mcap"
     words = ["drive", "weak-servo-pi3", "--duration", "0.3"]
@@ -99,14 +106,15 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, ca
         ended(served)  # it has its last tick still to do
     report = json.loads(capsys.readouterr().out)
     assert (report["pace"], report["ticks"], report["overruns"]) == ("lockstep", 31, 0)
-    assert (report["sent"], report["complete"]) == (31 * 25, True)
+    assert (report["sent"], report["complete"], report["outcome"]) == (31 * 25, True, "complete")
+    assert (report["approach_s"], report["lateness"]) == (0.0, None)  # it stands straight already
     assert report["decoded"] == report["received"] > 25 * 20
     assert served[0].complete
     assert served[0].commands == 31 * 25
     assert front.run([*words, "--on", "twin", "-o", str(direct)]) == 0
     with Session.open(path) as over_bus, Session.open(direct) as in_process:
-        for topic in ("/joint_commands", "/gait"):
-            found, expected = over_bus.joints(topic), in_process.joints(topic)
+        for topic, like in TOPICS.items():
+            found, expected = over_bus.joints(topic), in_process.joints(like)
             np.testing.assert_array_equal(found.values, expected.values)
             np.testing.assert_array_equal(found.t_ns, expected.t_ns)
         assert (over_bus.verdict, over_bus.warnings) == ("good", [])
@@ -114,25 +122,32 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, ca
         assert (facts["driven"], facts["armed"], facts["source.can0"]) == ("gait", "yes", on)
         assert over_bus.robot == load_robot("snake25")
         measured = over_bus.joints("/joint_states")
+        frames = over_bus.frames("/can/can0")
+        assert (frames["dir"] == DIR_TX).sum() == 31 * 25
+        assert over_bus.metadata["undulog.gate"]["rate"] == "4.0"
+        phases = [message.data for _, message in over_bus.messages("/gate/phase")]
+        assert phases == ["run"]
     # The robot did what the twin does with commands rounded to the bus, and said so, rounded.
     with Twin(
         weak(0.3), Rounded(find_driven("weak-servo-pi3").make(load_robot("snake25"), None))
     ) as twin:
         samples = [one for sample in twin.samples() for one in sample.sensed]
     cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])
-    found = np.array(measured.values)[:, : len(cycles)]
+    found = np.array(measured.values)
+    assert not found[:, 0].any()  # how it stood before the first command
+    found = found[:, 1 : 1 + len(cycles)]
     assert np.abs(found - cycles[: found.shape[1]].T).max() <= STEP / 2 * (1 + 1e-6)
 
 
 @pytest.mark.slow
-def test_an_adaptive_controller_does_the_same_over_the_bus_as_in_process():
+def test_an_adaptive_controller_does_the_same_over_the_bus_as_in_process(tmp_path):
     scenario = load_scenario("target-following").changed(duration_s=3.0)
     over_bus = []
     with alive(scenario) as (on, served):
         drive_bus(
-            planned("target-following", on, duration_s=3.0),
+            planned("target-following", on, tmp_path / "a.mcap", duration_s=3.0),
             stop=StopRequest(),
-            on_tick=lambda tick: over_bus.append(tick.gait),
+            on_tick=lambda tick: over_bus.append(tick.step.gait),
         )
     assert served[0].pace.ticks >= 300  # whether it still looks at the end, who stops it decides
     with Twin(scenario, Rounded(build_gait(scenario))) as twin:
@@ -146,99 +161,108 @@ def test_an_adaptive_controller_does_the_same_over_the_bus_as_in_process():
 
 
 def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):
+    path = tmp_path / "a.mcap"
     with alive(load_scenario("flat").changed(duration_s=30.0), lockstep=False) as (on, _):
-        plan = planned("flat", on, duration_s=0.5, output=tmp_path / "a.mcap")
-        report = drive_bus(plan, stop=StopRequest())
-    assert report.tally.complete
-    assert report.tally.duration_s == 0.5
-    assert report.tally.ticks <= 51 <= report.tally.ticks + report.tally.overruns
+        report = drive_bus(planned("flat", on, path, duration_s=0.5), stop=StopRequest())
+    assert report.outcome.how is How.COMPLETE
+    assert report.gait_s == 0.5
+    assert report.ticks <= 51 <= report.ticks + report.tally.overruns
     assert report.wall_s >= 0.5
-    assert report.tally.sent == 25 * report.tally.ticks
-    with Session.open(tmp_path / "a.mcap") as session:
+    assert report.tally.sent == 25 * report.ticks
+    assert sum(report.jitter.counts) == report.jitter.ticks >= report.ticks
+    assert 0.0 <= report.jitter.median_s <= report.jitter.p99_s <= report.jitter.worst_s
+    with Session.open(path) as session:
         times = session.joints("/joint_commands").t_ns[0]
         assert (np.diff(times) > 0).all()
-        assert len(times) == report.tally.ticks
+        assert len(times) == report.ticks
         assert (session.verdict == "good") == (report.tally.overruns == 0)
+        assert session.settle_s >= load_scenario("flat").settle_s > 0
 
 
-def planned(what, on, *, duration_s=0.2, armed=True, output=None):
+def planned(what, on, output, *, duration_s=0.2, robot=None):
     return bus_plan(
         find_driven(what),
         on,
+        robot=robot,
         duration_s=duration_s,
-        armed=armed,
         output=output,
         recorder=None,
         force=False,
     )
 
 
-def test_a_dry_run_sends_nothing_and_says_what_it_would(tmp_path, capsys):
-    path = tmp_path / "dry.mcap"
-    with alive(load_scenario("flat").changed(duration_s=30.0), lockstep=False) as (on, served):
-        words = ["drive", "flat", "--on", on, "--duration", "0.3", "-o", str(path)]
-        assert front.run(words) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"{on}: dry run of flat for 0.3 s"
-    assert told[2].startswith("0 frames sent, ")
-    assert "nothing was sent; the first tick would have been 101#0000 102#0000" in told[3]
-    assert served[0].commands == 0
-    with Session.open(path) as session:
-        assert "/joint_commands" not in session.channels
-        assert session.metadata["undulog"]["armed"] == "no"
-        assert session.settle_s == load_scenario("flat").settle_s > 0
-        assert session.channels["/dry_run/joint_commands"].count > 1
-        assert session.channels["/joint_states"].count > 1  # it listened
-        assert not (session.frames("/can/can0")["dir"] == DIR_TX).any()
-
-
-def test_a_dry_run_listens_to_any_bus_and_puts_nothing_on_it(capsys):
-    robot = load_robot("snake25")
-    frames = BusEncoder(robot, Direction.RX).encode({("joint01", Quantity.POSITION, ""): 0.1})
-    message = can.Message(
-        arbitration_id=int(frames["id_flags"][0]), data=frames["data"][0], is_extended_id=False
-    )
-    with can.Bus(interface="virtual", channel="drive-dry") as other:
-        ended = threading.Event()
-
-        def talk():
-            while not ended.wait(0.005):
-                other.send(message)
-
-        talker = threading.Thread(target=talk)
-        talker.start()
-        try:
-            words = ["drive", "flat", "--on", "can:virtual:drive-dry", "--duration", "0.3"]
-            assert front.run([*words, "--json"]) == 0
-        finally:
-            ended.set()
-            talker.join()
-        assert other.recv(0.1) is None
-    report = json.loads(capsys.readouterr().out)
-    assert (report["armed"], report["sent"]) == (False, 0)
-    assert report["decoded"] == report["received"] > 3
-    assert report["first_frames"][:2] == ["101#0000", "102#0000"]
-
-
-def test_asked_to_stop_the_robot_comes_to_rest_within_a_second(tmp_path):
+@pytest.mark.parametrize("how", list(OnFault))
+def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
     path, stop = tmp_path / "a.mcap", StopRequest()
+    robot = load_robot("snake25")
+    robot = dataclasses.replace(robot, safety=dataclasses.replace(robot.safety, on_fault=how))
 
     def ask(tick):
-        if tick.tick == 20:
+        if tick.tick == 80:
             stop.signal = signal.SIGINT
 
-    with alive(weak(3.0)) as (on, _):
-        report = drive_bus(
-            planned("weak-servo-pi3", on, duration_s=3.0, output=path), stop=stop, on_tick=ask
-        )
-    assert not report.tally.complete
-    assert report.tally.ticks == 21 + 101  # the next tick begins to fade, the last one is at rest
+    with alive(weak(9.0)) as (on, _):
+        plan = planned("weak-servo-pi3", on, path, duration_s=9.0, robot=robot)
+        report = drive_bus(plan, stop=stop, on_tick=ask)
+    assert report.outcome.how is How.STOPPED
+    assert report.outcome.why == "asked to stop (Ctrl-C)"
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
         said = [message.msg for _, message in session.messages("/rosout")]
+        phases = [message.data for _, message in session.messages("/gate/phase")]
         assert session.verdict == "good"
-    assert not commands[:, -1].any()
-    assert said[-1] == "at rest, as it was asked to stop, at 1.21 s"
+    assert phases == ["run", "ending"]
+    held = commands[:, 80]
+    ending = commands[:, 81:]
+    assert np.abs(held).max() > 0.1  # the gait was in full swing
+    if how is OnFault.HOLD:
+        np.testing.assert_array_equal(ending, held[:, None] + np.zeros_like(ending))
+        assert ending.shape[1] == 20
+    else:
+        assert not ending[:, -1].any()
+        assert np.abs(np.diff(commands[:, 80:])).max() <= 0.5 * 0.01 * (1 + 1e-9)
+        assert ending.shape[1] == pytest.approx(100 * (1.5 * np.abs(held).max() / 0.5 + 0.2), abs=1)
+    assert said[-1].startswith("stopped: asked to stop (Ctrl-C); the joints were ")
+
+
+def test_asked_twice_nothing_more_is_sent(tmp_path):
+    stop = StopRequest()
+
+    def ask(tick):
+        stop.signal = signal.SIGINT if tick.tick >= 20 else None
+        stop.again = tick.tick >= 25
+
+    with alive(weak(9.0)) as (on, _):
+        plan = planned("weak-servo-pi3", on, tmp_path / "a.mcap", duration_s=9.0)
+        report = drive_bus(plan, stop=stop, on_tick=ask)
+    assert report.tally.sent == 25 * 26
+    assert report.outcome.how is How.STOPPED
+    assert report.outcome.ended.startswith("nothing more was sent")
+
+
+def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
+    """A session whose first command is bent: the robot stands straight."""
+    recorded, path = tmp_path / "bent.mcap", tmp_path / "a.mcap"
+    robot = load_robot("snake25")
+    bent = np.where(np.arange(25) % 2, 0.0, 0.2)
+    with SessionWriter(recorded, session_id="bent", epoch_ns=10**18, robot=robot) as writer:
+        commands = writer.joint_state("/joint_commands", robot.joint_names, unit="rad")
+        for tick in range(31):
+            commands.write(10**18 + tick * 10_000_000, bent * np.cos(tick / 100))
+    with alive(weak(9.0)) as (on, _):
+        report = drive_bus(planned(str(recorded), on, path, duration_s=0.3), stop=StopRequest())
+    assert report.outcome.how is How.COMPLETE
+    way_s = 1.5 * 0.2 / 0.5
+    assert report.approach_s == pytest.approx(way_s, abs=0.011)
+    with Session.open(path) as session:
+        given = np.array(session.joints("/joint_commands").values)
+        assert session.metadata["undulog"]["driven.session_id"] == "bent"
+        phases = [message.data for _, message in session.messages("/gate/phase")]
+    assert phases == ["approach", "run"]
+    approach, run = given[:, :-31], given[:, -31:]
+    np.testing.assert_array_equal(run.T, [bent * np.cos(tick / 100) for tick in range(31)])
+    assert np.abs(np.diff(approach)).max() <= 0.5 * 0.01 * (1 + 1e-9)
+    assert np.abs(run[:, 0] - approach[:, -1]).max() <= 0.5 * 0.01
 
 
 def test_a_robot_that_goes_away_is_told_by_its_bus(tmp_path, capsys):
@@ -246,16 +270,120 @@ def test_a_robot_that_goes_away_is_told_by_its_bus(tmp_path, capsys):
     with alive(weak(0.1)) as (on, _):
         words = ["drive", "weak-servo-pi3", "--on", on, "--arm", "-o", str(path)]
         assert front.run([*words, "--duration", "5"]) == 1
-    assert f"error: {on}: the robot closed the connection" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert f"error: {on}: the robot closed the connection; nothing more was sent" in told.err
+    assert told.out.startswith(f"{on}: stopped at 0.1 s of 5 s: ")
     with Session.open(path) as session:
         assert session.verdict == "bad"
         assert session.channels["/joint_commands"].count == 11
 
 
-def test_a_bus_that_goes_away_ends_a_dry_run(capsys):
-    with alive(load_scenario("flat").changed(duration_s=1.5), lockstep=False) as (on, _):
-        assert front.run(["drive", "flat", "--on", on, "--duration", "60"]) == 1
-    assert "closed the connection" in capsys.readouterr().err
+def test_any_bus_of_python_can_will_do(tmp_path):
+    """A robot that does not say its name: its frames tell who it is."""
+    robot = load_robot("snake25")
+    reply = BusEncoder(robot, Direction.RX)
+    pose = np.linspace(-0.1, 0.1, 25)
+    heard = {}
+
+    def answer(bus):
+        """A robot that is where it was told to be."""
+        while (message := bus.recv(0)) is not None:
+            heard.setdefault(message.arbitration_id, []).append(bytes(message.data))
+            angle = int.from_bytes(message.data[:2], "little", signed=True) * STEP
+            pose[message.arbitration_id - 0x101] = angle
+        keys = [(name, Quantity.POSITION, "") for name in robot.joint_names]
+        for frame in reply.encode(dict(zip(keys, pose.tolist(), strict=True))):
+            bus.send(message_of(frame))
+
+    with speaking("gate-any", answer):
+        plan = planned("flat", "can:virtual:gate-any", tmp_path / "a.mcap", duration_s=0.3)
+        report = drive_bus(plan, stop=StopRequest())
+    assert report.outcome.how is How.COMPLETE, report.outcome
+    assert report.approach_s == pytest.approx(LISTEN_S + 1.5 * 0.1 / 0.5, abs=0.3)
+    assert {len(each) for each in heard.values()} == {report.tally.sent // 25}
+    raw = np.array(
+        [
+            [int.from_bytes(d[:2], "little", signed=True) for d in v]
+            for _, v in sorted(heard.items())
+        ]
+    )
+    assert np.abs(np.diff(raw)).max() * STEP <= 0.5 * 0.01 + STEP  # gentler than the first pose
+    with Session.open(tmp_path / "a.mcap") as session:
+        frames = session.frames("/can/gate_any")
+        assert (frames["dir"] == DIR_TX).sum() == report.tally.sent
+        sent = np.array(session.joints("/joint_commands").values)
+    assert np.abs(raw * STEP - sent).max() <= STEP / 2 * (1 + 1e-6)
+
+
+@contextmanager
+def speaking(channel, each):
+    """Somebody on a virtual bus of python-can, every 10 ms."""
+    with can.Bus(interface="virtual", channel=channel) as other:
+        ended = threading.Event()
+
+        def talk():
+            while not ended.wait(0.01):
+                each(other)
+
+        talker = threading.Thread(target=talk)
+        talker.start()
+        try:
+            yield other
+        finally:
+            ended.set()
+            talker.join()
+
+
+def message_of(frame):
+    return can.Message(
+        arbitration_id=int(frame["id_flags"]),
+        data=frame["data"][: frame["dlc"]].tobytes(),
+        is_extended_id=False,
+    )
+
+
+def refused(channel, each, capsys, tmp_path, *words):
+    """Exit code and what was said of a drive on a bus on which somebody speaks."""
+    with speaking(channel, each) as other:
+        path = tmp_path / "a.mcap"
+        on = ("--on", f"can:virtual:{channel}", "--arm", "-o", str(path))
+        code = front.run(["drive", "flat", *on, *words])
+        assert other.recv(0.1) is None, "something was sent"
+    with Session.open(path) as session:
+        assert session.verdict == "bad"
+        assert "/joint_commands" not in session.channels or (
+            not session.channels["/joint_commands"].count
+        )
+    return code, capsys.readouterr().err
+
+
+def test_a_bus_of_another_robot_is_refused_before_anything_is_sent(capsys, tmp_path):
+    frame = can.Message(arbitration_id=0x14B, data=bytes(8), is_extended_id=False)
+    code, said = refused("gate-other", lambda bus: bus.send(frame), capsys, tmp_path)
+    assert code == 2
+    assert "nothing was sent: another robot is on this bus: of " in said
+    assert "frames heard 0 are of snake25; others have the identifiers 14B" in said
+
+
+def test_joints_that_say_nothing_are_named(capsys, tmp_path):
+    robot = load_robot("snake25")
+    keys = [(name, Quantity.POSITION, "") for name in robot.joint_names if name != "joint07"]
+    frames = BusEncoder(robot, Direction.RX).encode(dict.fromkeys(keys, 0.0))
+
+    def say(bus):
+        for frame in frames:
+            bus.send(message_of(frame))
+
+    code, said = refused("gate-silent", say, capsys, tmp_path)
+    assert code == 1
+    assert "nothing was sent: the pose is not known, joint07 told no angle within 2 s" in said
+
+
+def test_somebody_who_commands_already_is_not_joined(capsys, tmp_path):
+    frame = can.Message(arbitration_id=0x103, data=bytes(2), is_extended_id=False)
+    code, said = refused("gate-two", lambda bus: bus.send(frame), capsys, tmp_path)
+    assert code == 1
+    assert "nothing was sent: somebody else commands snake25 on this bus: frame 103" in said
 
 
 @contextmanager
@@ -291,61 +419,78 @@ SOCKETCAND = {
 }
 
 
-def test_commands_go_to_no_other_server_than_the_virtual_robots(capsys):
-    with plain_server(SOCKETCAND) as (on, heard):
-        assert front.run(["drive", "flat", "--on", on, "--arm"]) == 2
-    said = capsys.readouterr().err
-    assert "does not say that it is a virtual robot; commands are sent to undulog's own" in said
-    assert "leave --arm out to look on" in said
-    assert heard == ["undulog"]  # nothing was opened, nothing sent
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--on", "can:virtual:bus", "--arm"), "is no virtual robot's bus"),
-        (("--on", "can:socketcand", "--arm"), "is no virtual robot's bus"),
-        (("--on", "can:socketcan:can0?host=x", "--arm"), "commands are sent to undulog's own"),
+        (("--on", "can:virtual:bus", "--arm"), "name the session with -o"),
+        (("--on", "can:socketcand", "--arm", "-o", "a.mcap"), "no channel"),
+        (("--on", "can:virtual:bus?host=x", "--arm", "-o", "a.mcap"), "no option 'host'"),
         (("--on", "unix:/tmp/a.sock"), "expected twin, twin:SCENARIO or can:"),
-        (("--on", "can:nothing:x"), "no CAN interface 'nothing'"),
-        (("--on", "can:virtual:bus", "--duration", "0"), "a duration of 0 s"),
-        (("--on", "can:virtual:bus", "--duration", "nan"), "a duration of nan s"),
+        (("--on", "can:nothing:x", "--arm", "-o", "a.mcap"), "no CAN interface 'nothing'"),
+        (("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--duration", "0"), "of 0 s"),
+        (("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--duration", "nan"), "of nan s"),
+        (("--on", "can:virtual:bus", "--recorder", "x"), "--recorder is for --arm"),
+        (("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--robot", "snake13"), "no bus map"),
         (("--on", "twin:"), "names no scenario"),
-        (("--on", "twin", "--arm", "-o", "a.mcap"), "--arm and --recorder are for a bus"),
+        (("--on", "twin", "--arm", "-o", "a.mcap"), "are for a bus"),
+        (
+            ("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--robot", "arcsnake-joint"),
+            "arcsnake-joint can't be armed: its description lacks max_rate",
+        ),
     ],
 )
 def test_wrong_usage_exits_2(words, told, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert front.run(["drive", "flat", *words]) == 2
     assert told in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
-def test_a_gait_for_another_robot_is_refused():
-    scenario = weak(0.1)
-    with alive(scenario) as (on, _):
-        plan = planned("flat", on)
-        other = dataclasses.replace(plan.driven.robot, name="other")
-        plan = dataclasses.replace(plan, driven=dataclasses.replace(plan.driven, robot=other))
-        with pytest.raises(UsageError, match="is snake25, and flat is for other"):
+def test_commands_of_another_joint_set_are_refused_with_both_lists(tmp_path, capsys):
+    recorded = tmp_path / "other.mcap"
+    names = [f"joint{i:02d}" for i in range(1, 13)]
+    with SessionWriter(recorded, session_id="o", epoch_ns=10**18) as writer:
+        writer.joint_state("/joint_commands", names, unit="rad").write(10**18, np.zeros(12))
+    words = [
+        "--on",
+        "can:virtual:bus",
+        "--arm",
+        "--robot",
+        "snake25",
+        "-o",
+        str(tmp_path / "a.mcap"),
+    ]
+    assert front.run(["drive", str(recorded), *words]) == 2
+    said = capsys.readouterr().err
+    assert "other.mcap is of another joint set than snake25; nothing was sent" in said
+    assert "it commands 12 joints: joint01, joint02, " in said
+    assert "snake25 has 25: joint01, " in said
+
+
+def test_a_gait_for_another_robot_is_refused(tmp_path):
+    other = dataclasses.replace(load_robot("snake25"), name="other")
+    with alive(weak(0.1)) as (on, _):
+        plan = planned("flat", on, tmp_path / "a.mcap", robot=other)
+        with pytest.raises(UsageError, match="is snake25, and flat is for other; nothing was sent"):
             drive_bus(plan, stop=StopRequest())
+    assert not (tmp_path / "a.mcap").exists()
 
 
-def test_nobody_there_exits_1(capsys):
+def test_nobody_there_exits_1(capsys, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     on = f"can:socketcand:can0?host=127.0.0.1&port={port}"
-    for arm in ((), ("--arm",)):
-        assert front.run(["drive", "flat", "--on", on, *arm, "--duration", "0.1"]) == 1
-        assert "refused" in capsys.readouterr().err
+    words = ("--arm", "-o", str(tmp_path / "a.mcap"), "--duration", "0.1")
+    assert front.run(["drive", "flat", "--on", on, *words]) == 1
+    assert "refused" in capsys.readouterr().err
 
 
-def test_a_robot_that_says_nothing_is_lost():
+def test_a_robot_that_says_nothing_is_sent_nothing(tmp_path):
     answers = SOCKETCAND | {"undulog": b"< undulog virtual-robot snake25 paced >"}
-    lost = pytest.raises(SourceError, match=r"the robot is lost: silent for 0\.5 s")
-    with plain_server(answers) as (on, heard), lost:
-        drive_bus(planned("flat", on, duration_s=5.0), stop=StopRequest())
-    assert heard[:3] == ["undulog", "open", "rawmode"]
-    assert set(heard[3:]) == {"send"}
+    silent = pytest.raises(SourceError, match=r"nothing was sent: the pose is not known, all 25")
+    with plain_server(answers) as (on, heard), silent:
+        drive_bus(planned("flat", on, tmp_path / "a.mcap", duration_s=5.0), stop=StopRequest())
+    assert heard == ["undulog", "open", "rawmode"]
 
 
 @pytest.mark.parametrize("cut", [3, 12, 40, 60, 100, 120])
@@ -356,7 +501,7 @@ def test_ticks_and_frames_stay_in_order_however_the_stream_is_cut(cut):
         b"< frame 203 1.010000 0A >"
     )
     with plain_server(answers, (stream[:cut], stream[cut:])) as (on, _):
-        link = VirtualRobotLink(parse_address(on), Tally(lambda: 0))
+        link = find_virtual_robot(parse_address(on), Tally(lambda: 0))
         try:
             assert (link.robot_name, link.lockstep) == ("snake25", True)
             found = [link.wait_tick(5.0) for _ in range(3)]
@@ -375,7 +520,7 @@ def identifiers(arrays):
 def test_commands_are_rounded_to_the_bus_and_sent_as_socketcand_has_them():
     robot = load_robot("snake25")
     command = np.linspace(-0.5, 0.5, 25)
-    frames = CommandEncoder(robot).frames(GaitTick(command, np.empty(0), "walk", ()))
+    frames = CommandEncoder(robot).frames(command)
     assert frames["id_flags"].tolist() == list(range(0x101, 0x11A))
     raw = frames["data"][:, :2].copy().view("<i2")[:, 0]
     np.testing.assert_array_equal(raw, np.round(np.degrees(command) * 100))

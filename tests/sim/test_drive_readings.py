@@ -32,7 +32,7 @@ def test_nothing_is_known_before_the_first_frame(robot):
     assert np.isnan(readings.angle).all()
     assert np.isnan(readings.velocity).all()
     assert readings.ranges == readings.acceleration == readings.magnetic_field == {}
-    assert known.silence_s(3.0) == math.inf
+    assert (known.status(3.0).silence_s == math.inf).all()
 
 
 def test_each_sensor_has_its_newest_value(robot, encode):
@@ -54,8 +54,24 @@ def test_each_sensor_has_its_newest_value(robot, encode):
     np.testing.assert_allclose(
         readings.magnetic_field["compass"], [2e-5, 1e-5, math.nan], atol=1e-8
     )
-    assert known.silence_s(1.5) == pytest.approx(0.49)
+    silence_s = known.status(1.5).silence_s
+    assert silence_s[2] == pytest.approx(0.49)
+    assert (np.delete(silence_s, 2) == math.inf).all()
     assert known.tally.decoded == 6
+
+
+def test_the_gate_is_told_what_the_servos_tell_of_themselves(robot, encode):
+    known = BusReadings(robot)
+    values = joint(Quantity.POSITION, 0.1) | joint(Quantity.CURRENT, -1.2)
+    known.add(encode(values | joint(Quantity.TEMPERATURE, 41.0)), 0.0)
+    known.add(encode(joint(Quantity.POSITION, 0.2) | joint(Quantity.CURRENT, 0.7)), 0.01)
+    status = known.status(0.02)
+    assert status.angle[2] == pytest.approx(0.2, abs=1e-4)
+    assert status.current[2] == pytest.approx(0.7, abs=1e-3)
+    assert status.temperature[2] == 41.0  # the second frame says that it is not known
+    assert np.isnan(status.voltage).all()  # not on this bus
+    assert np.isnan(np.delete(status.current, 2)).all()
+    assert np.isnan(known.status(0.6).current).all()
 
 
 def test_nothing_in_range_is_infinitely_far_and_unknown_is_not_a_value(robot, encode):
@@ -95,5 +111,5 @@ def test_frames_of_others_are_counted_and_say_nothing(robot):
     frames["dir"] = [0, DIR_TX]
     known = BusReadings(robot)
     known.add(frames, 0.0)
-    assert known.silence_s(1.0) == math.inf
+    assert (known.status(1.0).silence_s == math.inf).all()
     assert (known.tally.frames, known.tally.decoded) == (2, 0)

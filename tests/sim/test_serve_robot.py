@@ -197,7 +197,7 @@ def test_commands_in_steps_are_the_same_in_process(scenario):
     assert len(np.unique(commands[:, 0])) > 20
 
 
-def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, running):
+def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, running):
     live = running(scenario.changed(duration_s=0.3), fast=False, wait=True)
     time.sleep(0.3)
     assert live.pacer.tally.ticks == 0
@@ -206,7 +206,11 @@ def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, running):
     served = live.ended()
     assert served.complete
     assert served.start_ns > before + PERIOD_NS // 2 - 1_000_000
-    frames = live.replies(31 * JOINTS)
+    waiting = live.replies(JOINTS)  # while it waits its servos tell where they are
+    np.testing.assert_array_equal(positions(robot, waiting), np.zeros(JOINTS))
+    while int(waiting["t_device_ns"][0]) < served.start_ns:
+        waiting = live.replies(JOINTS)
+    frames = np.concatenate([waiting, live.replies(30 * JOINTS)])
     cycles = frames["t_device_ns"].reshape(-1, JOINTS).astype(np.int64) - served.start_ns
     stood_still = round(served.pace.stood_still_s * 1e9)
     assert cycles[0, 0] == 0

@@ -120,6 +120,7 @@ def driven(scenario, port, control, *words):
         [
             *(*UNDULOG, "drive", str(scenario), "--on", f"can:socketcand:can0?port={port}"),
             *("--arm", "--recorder", str(control), "--json", *words),
+            *("-o", str(control.with_suffix(".drive.mcap"))),
         ],
         check=False, capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip

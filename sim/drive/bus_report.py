@@ -1,0 +1,118 @@
+"""How a drive over a bus went, for the log, for JSON and for people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..gate.gate import Remark
+from ..gate.lateness import Jitter
+from ..gate.outcome import How, Outcome
+from .loop import LoopTally
+
+
+@dataclass
+class BusReport:
+    """How it went.
+
+    Attributes:
+        outcome: The end.
+        tally: Of the loop.
+        lockstep: Whether the robot set the pace.
+        approach_s: Time from the first tick until the gait began [s]; None where it never did.
+        gait_s: Time of the gait's last tick [s].
+        ticks: Ticks that the gait commanded.
+        cuts: How often commands of single joints were changed, by why.
+        jitter: Lateness of the ticks; None where the robot set the pace.
+        wall_s: How long it took.
+        first_frames: The commands of the first tick, as candump writes frames.
+        told: Samples of the gait that the recorder took.
+        not_told: Why the recorder was not told all, or None.
+    """
+
+    outcome: Outcome
+    tally: LoopTally
+    lockstep: bool
+    approach_s: float | None
+    gait_s: float
+    ticks: int
+    cuts: dict[str, int]
+    jitter: Jitter | None
+    wall_s: float = 0.0
+    first_frames: list[str] = field(default_factory=list[str])
+    told: int = 0
+    not_told: str | None = None
+
+
+def remarks_of(report: BusReport) -> list[Remark]:
+    """What is worth a line of the log at the end.
+
+    Args:
+        report: How it went.
+
+    Returns:
+        The remarks; warnings are reasons for a verdict that is not good.
+    """
+    remarks: list[Remark] = []
+    if report.jitter is not None:
+        remarks.append(Remark("info", str(report.jitter)))
+    overruns = report.tally.overruns
+    if overruns:
+        text = f"{overruns} control ticks were left out, as the one before took too long"
+        remarks.append(Remark("warn", text))
+    changed = {why: count for why, count in report.cuts.items() if count}
+    if changed:
+        listed = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in changed.items())
+        remarks.append(Remark("warn", f"the gate changed commands of single joints: {listed}"))
+    return remarks
+
+
+def report_facts(report: BusReport) -> dict[str, Any]:
+    """A report for JSON.
+
+    Args:
+        report: How it went.
+
+    Returns:
+        Plain values.
+    """
+    tally = report.tally
+    return {
+        "armed": True,
+        "pace": "lockstep" if report.lockstep else "real time",
+        **report.outcome.to_dict(),
+        "complete": report.outcome.how is How.COMPLETE,
+        "duration_s": report.gait_s,
+        "approach_s": report.approach_s,
+        "whole_s": tally.loop_s,
+        "ticks": report.ticks,
+        "overruns": tally.overruns,
+        "sent": tally.sent,
+        "received": tally.received,
+        "decoded": tally.decoded,
+        "changed": report.cuts,
+        "lateness": None if report.jitter is None else report.jitter.to_dict(),
+        "real_time_factor": tally.loop_s / max(report.wall_s, 1e-3),
+        "first_frames": report.first_frames,
+        "gait_told": report.told,
+        "gait_not_told": report.not_told,
+    }
+
+
+def report_lines(report: BusReport) -> list[str]:
+    """A report for people, what came of it left out.
+
+    Args:
+        report: How it went.
+
+    Returns:
+        Lines.
+    """
+    tally = report.tally
+    pace = "in lockstep with the robot" if report.lockstep else "in real time"
+    before = "" if report.approach_s is None else f", begun after {report.approach_s:.3g} s"
+    lines = [f"{report.ticks} ticks {pace}{before}; {report.outcome.ended}"]
+    heard = f"{tally.received} received, {tally.decoded} of them with readings"
+    lines.append(f"{tally.sent} frames sent, {heard}")
+    lines += [f"warning: {text}" if kind == "warn" else text for kind, text in remarks_of(report)]
+    return lines

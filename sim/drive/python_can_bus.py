@@ -1,0 +1,108 @@
+"""Any bus that python-can can open, to be driven on: heard by a thread, sent to from the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import can
+from can.util import cast_from_string
+
+from capture.errors import SourceError, UsageError
+from capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
+from capture.robot import ClockDomain
+from capture.sources.can_interfaces import DEVICE_TIME, check_interface, known_options
+from capture.sources.contract import SourceAddress
+from capture.sources.events import Tally
+from capture.sources.options import only
+from capture.sources.python_can import PythonCanLink, bus_class, failure, open_bus
+from capture.sources.socketcand import server_of
+
+_SEND_S = 0.02
+"""So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one
+waits 3 ms."""
+
+
+class PythonCanBus:
+    """One bus of python-can.
+
+    Attributes:
+        place: What it is, for messages.
+        clock: Whose clock the frames' device times are on.
+    """
+
+    def __init__(self, address: SourceAddress, tally: Tally) -> None:
+        """Open it.
+
+        Args:
+            address: ``can:INTERFACE:CHANNEL``; its options are those of python-can's interface.
+            tally: Where to count.
+
+        Raises:
+            UsageError: If there is no such interface, or it has no such option.
+            SourceError: If it can't be opened.
+        """
+        interface, _, channel = address.rest.partition(":")
+        check_interface(address.text, interface)
+        if not channel:
+            raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+        device_time = interface in DEVICE_TIME
+        self.place = address.text
+        self.clock = ClockDomain.DEVICE if device_time else ClockDomain.HOST
+        kind = bus_class(address.text, interface)
+        options: dict[str, object] = {"channel": cast_from_string(channel)}
+        if interface == "socketcand":
+            options["host"], options["port"] = server_of(address)
+        else:
+            if kind.__module__.startswith("can."):  # others' classes may take what they don't name
+                only(address, known_options(kind))
+            options |= {key: cast_from_string(value) for key, value in address.options.items()}
+        try:
+            self._bus = open_bus(address.text, kind, options)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise SourceError(address.text, f"can't open it: {reason}") from error
+        self._link = PythonCanLink(self._bus, tally, device_time=device_time, detail="")
+        self._now_ns = tally.now_ns
+
+    def receive(self) -> Sequence[FrameArray]:
+        """Take what has come, without waiting; CAN FD frames carry nothing of a bus map.
+
+        Returns:
+            Arrays of frames.
+
+        Raises:
+            SourceError: If the bus is lost.
+        """
+        try:
+            found = self._link.read(self._now_ns())
+        except OSError as error:
+            raise self._lost(error) from error
+        return [frames for frames in found if len(frames) and not holds_fd(frames)]
+
+    def send(self, frames: FrameArray) -> None:
+        """Put frames on the bus.
+
+        Args:
+            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+
+        Raises:
+            SourceError: If the bus doesn't take them.
+        """
+        columns = (frames["id_flags"].tolist(), frames["dlc"].tolist(), frames["data"])
+        for id_flags, length, data in zip(*columns, strict=True):
+            message = can.Message(
+                arbitration_id=id_flags & ID_MASK,
+                is_extended_id=bool(id_flags & EXTENDED_FLAG),
+                data=data[:length].tobytes(),
+            )
+            try:
+                self._bus.send(message, timeout=_SEND_S)
+            except (can.CanError, OSError) as error:
+                raise self._lost(failure(error)) from error
+
+    def close(self) -> None:
+        """Release it; safe to call twice."""
+        self._link.close()
+
+    def _lost(self, error: OSError) -> SourceError:
+        return SourceError(self.place, f"the bus is lost: {error.strerror or error}")
