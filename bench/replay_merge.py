@@ -1,0 +1,138 @@
+"""Time of bringing two converted sessions together, beside going row by row.
+
+``python bench/replay_merge.py [MINUTES]`` writes two sessions of 25 joints at 100 Hz as
+``bench/replay_convert.py`` does, converts both, and merges the two recordings three times as
+``undulog view A B`` does: chunks get their session's name in front, those of the second session are
+moved along both timelines, and all go into one file; then the whole of what that verb does once
+both are converted, with the differences. Beside it the same row by row, on a hundredth
+of the rows of every entity: each row is read from its recording and sent by itself. And Rerun's own
+``rerun rrd merge``, which puts no names in front and moves nothing. Ten minutes by default.
+"""
+
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from pathlib import Path
+
+import rerun as rr
+from replay_convert import write_session
+from rerun.chunk import Chunk, LazyChunkStream
+
+from capture import Session
+from replay.beside.alignment import Align, align
+from replay.beside.merge import chunks_of
+from replay.beside.side import convert, read_side
+from replay.beside.write import Converted, write_beside
+from replay.viewer import viewer_binary
+
+BAR_S = 3.0
+PART = 100
+
+
+def streams(recordings: list[Path]) -> list[LazyChunkStream]:
+    """The recordings' chunks under their names; the second one is moved."""
+    return [
+        chunks_of(path, f"/{name}", later_ns=k * 1_234_567_890, more_cycles=7 * k)
+        for k, (name, path) in enumerate(zip(("robot", "twin"), recordings, strict=True))
+    ]
+
+
+def write(target: Path, chunks: LazyChunkStream | Iterable[Chunk]) -> None:
+    """Write them as one recording."""
+    rec = rr.RecordingStream("undulog", recording_id="bench", send_properties=False)
+    rec.save(target)
+    rec.send_chunks(chunks)
+    rec.disconnect()
+
+
+def some_rows(stream: LazyChunkStream) -> Iterable[Chunk]:
+    """Every hundredth row of a stream's chunks, a chunk each."""
+    for chunk in stream.to_chunks():
+        batch = chunk.to_record_batch()
+        for row in range(0, batch.num_rows, PART):
+            yield from Chunk.from_record_batch(batch.slice(row, 1))
+
+
+def rows(recordings: list[Path]) -> int:
+    """How many rows there are in all."""
+    return sum(chunk.num_rows for stream in streams(recordings) for chunk in stream.to_chunks())
+
+
+def timed(what: str, work: Callable[[], object], target: Path) -> tuple[float, float]:
+    """Run it; print and return how long it took: wall clock and CPU [s]."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    work()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    print(f"{what}: {wall:.2f} s, {cpu:.2f} s of CPU, {target.stat().st_size / 1e6:.0f} MB")
+    return wall, cpu
+
+
+def convert_both(folder: Path, minutes: float) -> list[Converted]:
+    """Write two sessions and convert them."""
+    with ExitStack() as stack:
+        logs = [folder / "robot.mcap", folder / "twin.mcap"]
+        for log in logs:
+            write_session(log, minutes)
+        sessions = [stack.enter_context(Session.open(log)) for log in logs]
+        sides = [read_side(session, session.path.stem) for session in sessions]
+        return [
+            Converted(one, *convert(session, session.path.with_suffix(".rrd")))
+            for one, session in zip(align(sides, Align.PHASE), sessions, strict=True)
+        ]
+
+
+def main(minutes: float) -> None:
+    """Write, convert, merge, print."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        converted = convert_both(folder, minutes)
+        recordings = [one.recording.path for one in converted]
+        sizes = " and ".join(f"{path.stat().st_size / 1e6:.0f}" for path in recordings)
+        count = rows(recordings)
+        print(f"two sessions of {minutes:g} min, {sizes} MB of .rrd, {count} rows in all")
+        target = folder / "merged.rrd"
+        merges = [
+            timed(
+                "merge", lambda: write(target, LazyChunkStream.merge(*streams(recordings))), target
+            )
+            for _ in range(3)
+        ]
+        subprocess.run([viewer_binary(), "rrd", "verify", target], check=True, capture_output=True)
+        whole = [
+            timed(
+                "merge with views, differences and comparison",
+                lambda: write_beside(converted, target, Align.PHASE),
+                target,
+            )
+            for _ in range(3)
+        ]
+        slowest = max(wall for wall, _ in (*merges, *whole))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        print(f"bar {BAR_S:g} s, slowest {slowest:.2f} s; peak memory {peak:.0f} MB, all in all")
+        part = folder / "rows.rrd"
+        _, slow = timed(
+            f"row by row, every {PART}th row",
+            lambda: write(
+                part, (row for stream in streams(recordings) for row in some_rows(stream))
+            ),
+            part,
+        )
+        quick = min(cpu for _, cpu in merges)
+        print(f"all rows would take {PART * slow:.0f} s of CPU, {PART * slow / quick:.0f} times")
+        own = folder / "own.rrd"
+        command = [viewer_binary(), "rrd", "merge", *recordings, "-o", own]
+        timed(
+            "rerun rrd merge (its CPU isn't ours)",
+            lambda: subprocess.run(command, check=True, capture_output=True),
+            own,
+        )
+        if slowest > BAR_S:
+            sys.exit(f"slower than {BAR_S:g} s")
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)
