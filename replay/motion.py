@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -61,12 +62,17 @@ class Motion:
             Link centres [m], shape (k, m + 1, 3), and rotations, shape (k, m + 1, 3, 3); NaN
             from the first link whose pose isn't known to the tail.
         """
-        return link_poses(
-            self.robot,
-            self.head_position[rows],
-            rotation_from_quaternion(self.head_quaternion[rows]),
-            self.angles[rows] if angles is None else angles,
-        )
+        if angles is None:
+            centre, rotation = self._links
+            return centre[rows], rotation[rows]
+        turn = rotation_from_quaternion(self.head_quaternion[rows])
+        return link_poses(self.robot, self.head_position[rows], turn, angles)
+
+    @cached_property
+    def _links(self) -> tuple[FloatArray, FloatArray]:
+        """All links, as they were measured."""
+        turn = rotation_from_quaternion(self.head_quaternion)
+        return link_poses(self.robot, self.head_position, turn, self.angles)
 
 
 @dataclass(frozen=True)
