@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
@@ -40,6 +41,8 @@ class HeadlessViewer:
             UndulogError: If it doesn't start, e.g. without a Vulkan driver.
         """
         (port,) = free_ports(1)
+        # The viewer leaves a folder behind when it is told to end; here it goes with ours.
+        self._scratch = tempfile.TemporaryDirectory(prefix="undulog-viewer-")
         window = ["--window-size", f"{size[0]}x{size[1]}"]
         with Path(log or os.devnull).open("ab") as sink:
             self._process = subprocess.Popen(  # noqa: S603  our own arguments
@@ -50,6 +53,8 @@ class HeadlessViewer:
                 ],
                 stdout=sink,
                 stderr=sink,
+                env={**os.environ, "TMPDIR": self._scratch.name},
+                process_group=0,  # a Ctrl-C ends it through us, not in the middle of a picture
             )
         self._client = self._connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
         try:
@@ -76,6 +81,7 @@ class HeadlessViewer:
         if self._process.poll() is None:
             self._process.terminate()
         self._process.wait()
+        self._scratch.cleanup()
 
     def open(self, recording: Path, seconds: float) -> None:
         """Show a recording, standing still.
