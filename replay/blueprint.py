@@ -10,32 +10,42 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from .content import Content
+from .mean_cycle import ENSEMBLE_CYCLE
+from .tabs import Tab
 from .timeline import SESSION_TIME
 from .views import Views, build_views
 
 
-def build_blueprint(content: Content) -> rrb.Blueprint:
+def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
     """Lay out the views of what a recording holds.
 
     Args:
         content: What it holds.
+        front: The tab in front; the session's where the recording has no such tab. In front, the
+            mean cycle plays on its own timeline.
 
     Returns:
         The blueprint, with the viewer's own panels folded away; it opens playing, or
         following the end of what still grows.
     """
     views = build_views(content)
-    tabs = [_session(content, views)]
+    tabs: dict[Tab, rrb.Container] = {"session": _session(content, views)}
     if views.maps or views.steps:
         rows = [rrb.Horizontal(*row) for row in (views.maps, views.steps) if row]
-        tabs.append(rrb.Vertical(*rows, row_shares=[1.35, 1.0][: len(rows)], name="Cycles"))
+        shares = [1.35, 1.0][: len(rows)]
+        tabs["cycles"] = rrb.Vertical(*rows, row_shares=shares, name="Cycles")
     if views.mean_plots and views.mean_words is not None:
-        tabs.append(_mean(views, views.mean_words))
+        tabs["mean-cycle"] = _mean(views, views.mean_words)
+    shown: Tab = front if front in tabs else "session"
+    root = tabs[shown]
+    if len(tabs) > 1:
+        root = rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(shown))
+    timeline = ENSEMBLE_CYCLE if shown == "mean-cycle" else SESSION_TIME
     return rrb.Blueprint(
-        tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0),
+        root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        _time_panel(content),
+        _time_panel(content, timeline),
         auto_views=False,
         auto_layout=False,
     )
@@ -71,12 +81,12 @@ def _mean(views: Views, words: rrb.TextDocumentView) -> rrb.Container:
     return rrb.Horizontal(left, right, column_shares=[1.1, 1.0], name="Mean cycle")
 
 
-def _time_panel(content: Content) -> rrb.TimePanel:
+def _time_panel(content: Content, timeline: str) -> rrb.TimePanel:
     if content.live:
-        return rrb.TimePanel(state="collapsed", timeline=SESSION_TIME, play_state="following")
+        return rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
     return rrb.TimePanel(
         state="collapsed",
-        timeline=SESSION_TIME,
+        timeline=timeline,
         play_state="playing",
         loop_mode="all",
         # The one timeline of numbers is that of the mean cycle's degrees: at the gait's own speed.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,7 @@ from capture.errors import UsageError
 
 from .beside.options import BesideOptions
 from .clip_cli import ClipOptions, view_clip
+from .tabs import Tab
 
 if TYPE_CHECKING:
     from .rrd import Recording
@@ -26,6 +28,7 @@ def view(
     web: bool = False,
     connect: str | None = None,
     result: list[Path] | None = None,
+    tab: Tab = "session",
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
     beside: Annotated[BesideOptions | None, Parameter(name="*")] = None,
@@ -58,6 +61,7 @@ def view(
         result: Show what was found before instead of analysing now: `.json` of `undulog analyse`.
             Results of an experiment or a comparison that the session is part of mark the modules
             they name. May be given several times.
+        tab: The tab in front; the mean cycle's plays at once.
         clip: Write a moving picture of the body to this `.gif` or `.mp4` file instead of opening
             the viewer; it is drawn off screen.
         shot: How the clip is filmed.
@@ -69,8 +73,8 @@ def view(
     _check_usage(files, live, save=save, web=web, connect=connect, clip=clip, json=json)
     if beside is not None and len(files) < 2:
         raise UsageError(f"{', '.join(beside.given)}: needs two sessions or more, side by side")
-    if result and (len(files) != 1 or clip is not None):
-        raise UsageError("--result is shown over one session; give one file, without --clip")
+    if (result or tab != "session") and (len(files) != 1 or clip is not None):
+        raise UsageError("--result and --tab are of one session; give one file, without --clip")
     if shot is not None and clip is None:
         raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
     if clip is not None:
@@ -85,7 +89,7 @@ def view(
 
         view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1:
-        _view_file(files[0], result or [], save=save, web=web, json=json)
+        _view_file(files[0], result or [], tab, save=save, web=web, json=json)
     else:
         from .beside.cli import view_beside
 
@@ -119,10 +123,10 @@ def _check_usage(
 
 
 def _view_file(
-    file: Path, results: Sequence[Path], *, save: Path | None, web: bool, json: bool
+    file: Path, results: Sequence[Path], tab: Tab, *, save: Path | None, web: bool, json: bool
 ) -> None:
     if save is not None:
-        recording, duration_s = _convert(file, save, results)
+        recording, duration_s = _convert(file, save, results, tab)
         _report(recording, duration_s, json=json)
         return
 
@@ -131,7 +135,7 @@ def _view_file(
     if not web:
         viewer.require_display()
     with tempfile.TemporaryDirectory(prefix="undulog-view-") as folder:
-        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd", results)
+        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd", results, tab)
         for warning in recording.warnings:
             print(f"note: {warning}")
         if web:
@@ -140,9 +144,12 @@ def _view_file(
             viewer.show(recording.path)
 
 
-def _convert(file: Path, output: Path, results: Sequence[Path]) -> tuple[Recording, float]:
+def _convert(
+    file: Path, output: Path, results: Sequence[Path], tab: Tab
+) -> tuple[Recording, float]:
     from capture import Session
 
+    from .blueprint import build_blueprint
     from .results import computed, saved
     from .rrd import write_recording
 
@@ -157,6 +164,7 @@ def _convert(file: Path, output: Path, results: Sequence[Path]) -> tuple[Recordi
             steady=layer.steady,
             named=layer.named,
             notes=layer.notes,
+            layout=partial(build_blueprint, front=tab),
         )
         return recording, session.duration_s
 
