@@ -72,6 +72,7 @@ _GROUPS = {
 
 _EXTRAS = {
     "pybullet": "sim",
+    "tomlkit": "sim",
     "mujoco": "mujoco",
     "numba": "numba",
     "rerun": "replay",

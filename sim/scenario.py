@@ -10,6 +10,8 @@ import hashlib
 from dataclasses import dataclass, field
 from typing import Any
 
+import tomlkit
+
 from capture.errors import UsageError
 from capture.robot import Robot
 
@@ -21,7 +23,6 @@ from .modules import Modules
 from .physics.engine import EngineKind
 from .sensing import Noise, SensorModels
 from .serve.faults import BusFault
-from .toml_text import toml_text
 from .world import Push, World
 from .world.toml import body_length, world_table
 
@@ -148,4 +149,4 @@ class Scenario:
             values["disturbances"] = [dataclasses.asdict(push) for push in self.disturbances]
         if self.faults:
             values["faults"] = [fault.as_table() for fault in self.faults]
-        return toml_text(values)
+        return tomlkit.dumps(values)

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tomllib
 from pathlib import Path
 from typing import Any, cast
+
+import tomlkit
 
 from capture.errors import DataError
 from capture.part_file import part_file, write_text
 from capture.robot import Robot
 from capture.robot.description import parse_robot
 from sim.modules import Modules
-from sim.toml_text import toml_text
 
 from .fit import Calibration
 
@@ -29,7 +29,7 @@ def robot_text(calibration: Calibration) -> str:
         calibration: The fit.
 
     Returns:
-        TOML; its comments say where it comes from, those of the former description are gone.
+        TOML: the former description, its comments kept, under a head that says what was fitted.
 
     Raises:
         DataError: If the scenario's robot has no description.
@@ -37,24 +37,27 @@ def robot_text(calibration: Calibration) -> str:
     robot = calibration.scenario.robot
     if not robot.toml:
         raise DataError(f"{robot.name} has no description to put a servo into")
-    values: dict[str, Any] = tomllib.loads(robot.toml)
+    values = cast("dict[str, Any]", tomlkit.parse(robot.toml))
     for joint in cast("list[dict[str, Any]]", values.get("joints", [])):
         joint.pop("servo", None)
     defaults = cast("dict[str, Any]", values.setdefault("defaults", {}))
+    servo = cast("dict[str, Any]", defaults.setdefault("servo", {}))
     # Of a joint that keeps to what all share; a module's own factor is taken out again.
     factor = {one.module: one.value for one in calibration.parameters if one.module is not None}
     first = robot.joints[0]
     shared = dataclasses.replace(
         first.servo, stall_torque=first.servo.stall_torque / factor.get(first.name, 1.0)
     )
-    defaults["servo"] = dict(vars(shared))
+    for key, value in vars(shared).items():
+        if servo.get(key) != value:  # what was not fitted stays as it was written
+            servo[key] = value
     head = [f"# {robot.name}, its servo fitted to {Path(calibration.session).name}."]
     for one in calibration.parameters:
         low, high = one.ci95
         unit = "" if one.unit == "1" else f" {one.unit}"
         known = "" if one.determined else "; not determined by this session"
         head.append(f"# {one.label}: {one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}{known}")
-    text = "\n".join(head) + "\n" + toml_text(values)
+    text = "\n".join([*head, "", tomlkit.dumps(values)])
     parse_robot(text, "fitted robot", dict(robot.databases))  # it can be read back
     return text
 

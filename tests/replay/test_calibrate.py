@@ -36,7 +36,7 @@ length = 0.06
 radius = 0.025
 mass = 0.1
 inertia = [4e-5, 5e-5, 5e-5]
-[defaults.servo]
+[defaults.servo]  # of the data sheet
 stall_torque = 0.3
 gear_stiffness = 12.0
 gear_damping = 0.008
@@ -120,6 +120,7 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     servo = load_robot(output).joints[1].servo
     assert servo.stall_torque == found["stall_torque", None]["value"]
     assert servo.gear_stiffness == 12.0  # what wasn't fitted stays
+    assert "[defaults.servo]  # of the data sheet\n" in output.read_text()
     again = load_scenario(str(world))
     assert again.robot.joints[0].servo == servo
     assert again.duration_s == pytest.approx(4.5)
