@@ -14,7 +14,7 @@ import rerun as rr
 
 from capture.arrays import FloatArray, IntArray
 
-from ..joints import Places
+from ..joints import Places, log_look, log_rows
 from ..power import TOTAL
 from ..sampling import mark_gaps, typical_step_ns
 from .alignment import Aligned
@@ -60,14 +60,14 @@ def dashed(values: FloatArray, dashes: Dashes) -> FloatArray:
     """Leave spaces in a line.
 
     Args:
-        values: Shape (n,).
+        values: Shape (n, k).
         dashes: Their rhythm.
 
     Returns:
-        Shape (n,), NaN in the spaces.
+        Shape (n, k), NaN in the spaces.
     """
-    place = np.arange(values.size) % (dashes.drawn + dashes.left_out)
-    return np.where(place < dashes.drawn, values, np.nan)
+    place = np.arange(len(values)) % (dashes.drawn + dashes.left_out)
+    return np.where((place < dashes.drawn)[:, None], values, np.nan)
 
 
 def places_in(other: Side, first: Places | None, own: Places | None) -> Places | None:
@@ -100,15 +100,12 @@ def log_lines(rec: rr.RecordingStream, one: Aligned, rank: int, places: Places) 
             continue
         track = tracks[name]
         entity = f"{LINES}{side.entity}/{rr.escape_entity_path_part(label)}"
-        title = name if label == name else f"{name} {label}"
-        look = rr.SeriesLines(
-            names=f"{side.name}: {title}", colors=side.palette[name], widths=_WIDTH
-        )
-        rec.log(entity, look, static=True)
-        t_ns, values = mark_gaps(track.t_ns, np.rad2deg(track.values)[:, None])
-        shown = dashed(values[:, 0], dashes_of(track.t_ns, rank)) if rank else values[:, 0]
-        for rows, times in one.clock.rows(t_ns):
-            rec.send_columns(entity, times, rr.Scalars.columns(scalars=shown[rows]))
+        title = f"{side.name}: {name}" if label == name else f"{side.name}: {name} {label}"
+        log_look(rec, entity, [name], side.palette, titles={name: title}, width=_WIDTH)
+        t_ns, values = mark_gaps(track.t_ns, track.values[:, None])
+        if rank:
+            values = dashed(values, dashes_of(track.t_ns, rank))
+        log_rows(rec, one.clock, entity, t_ns, values, degrees=True)
 
 
 def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None:
