@@ -15,6 +15,8 @@ from capture.errors import UsageError
 from capture.interruption import interruptible
 
 if TYPE_CHECKING:
+    from analysis.compare.result import Comparison
+
     from .run import Again
     from .sameness import Sameness
 
@@ -27,45 +29,72 @@ def replay(
     /,
     *,
     on: str,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     change: Annotated[list[str] | None, Parameter(name="--set")] = None,
     duration: float | None = None,
+    arm: bool = False,
+    robot: str | None = None,
+    recorder: Path | None = None,
     force: bool = False,
     json: bool = False,
 ) -> int:
-    """Run a recorded experiment again in the twin, and say what differs.
+    """Run a recorded experiment again, in the twin or on the robot, and say what differs.
 
     The session's commands are given to the twin of its robot at their own times, and the run is
     recorded. In the world that a twin's session ran in, it is the same to the last bit. With
     `--set` one value of that world is another; then it says from when on that mattered, and what
-    differs as `undulog compare` has it. Over a bus, `undulog drive` gives recorded commands.
+    differs as `undulog compare` has it.
+
+    On a bus it is a dry run in the twin, which says what it would take. With `--arm` the commands
+    are sent, behind the same safety gate as those of `undulog drive`.
 
     Example: `undulog replay run.mcap --on twin --set servo.stall_torque=0.2 -o weak.mcap`
 
     Args:
         file: The session, `.mcap`; of the twin, of a robot, or one of commands.
-        on: `twin` (the world that it was recorded in) or `twin:SCENARIO`, which the session of a
-            real robot needs.
-        output: The session to write, `.mcap`.
+        on: `twin` (the world that it was recorded in), `twin:SCENARIO`, which the session of a
+            real robot needs, or a bus, `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
+        output: The session to write, `.mcap`; a dry run needs none.
         change: `KEY=VALUE`, a key of the scenario file with dots and its value, e.g.
             `world.ground.mu_normal=0.4`; may be given several times.
         duration: How long in seconds, instead of as long as there are commands.
+        arm: Send the commands.
+        robot: The robot on the bus, a name or a TOML file; by default the session's own.
+        recorder: Control socket of the recorder that is told the gait; by default the only one
+            that runs.
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
-    if output.suffix != ".mcap":
-        raise UsageError(
-            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
-        )
-    refuse_existing(output, force=force)
+    if output is not None:
+        if output.suffix != ".mcap":
+            raise UsageError(
+                f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+            )
+        refuse_existing(output, force=force)
     scheme, colon, world = on.partition(":")
     if scheme != _TWIN:
-        raise UsageError(
-            f"--on {on}: expected twin or twin:SCENARIO; over a bus: "
-            f"'undulog drive {file} --on {on}'"
+        from .over_bus import replay_on_bus
+
+        if change:
+            raise UsageError("--set changes the twin's world: on a bus the world is as it is")
+        return replay_on_bus(
+            file,
+            on,
+            _show,
+            arm=arm,
+            robot=robot,
+            duration_s=duration,
+            output=output,
+            recorder=recorder,
+            force=force,
+            as_json=json,
         )
     if colon and not world:
         raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
+    if arm or robot is not None or recorder is not None:
+        raise UsageError("--arm, --robot and --recorder are for a bus")
+    if output is None:
+        raise UsageError("a run of the twin is recorded: name the session with -o, e.g. -o b.mcap")
     from .run import find_repetition, replay_in_twin
 
     changes = _changes(change or [])
@@ -87,15 +116,17 @@ def replay(
         print("\n".join(_told(again)))
         comparison = again.comparison
         if comparison is not None and not (again.same and again.same.exact):
-            from analysis.command_line import show
-            from analysis.compare.table import render_comparison
-
-            print()
-            show(
-                lambda width, color: render_comparison(comparison, width=width, color=color),
-                None,
-            )
+            _show(comparison)
     return 0
+
+
+def _show(comparison: Comparison) -> None:
+    """Print a comparison below what was said."""
+    from analysis.command_line import show
+    from analysis.compare.table import render_comparison
+
+    print()
+    show(lambda width, color: render_comparison(comparison, width=width, color=color), None)
 
 
 def _changes(words: Sequence[str]) -> dict[str, Any]:

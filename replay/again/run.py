@@ -118,13 +118,21 @@ def replay_in_twin(
     )
     with Session.open(repetition.original) as first, Session.open(output) as second:
         of_twin = "physics_rate_hz" in first.metadata.get("undulog", {})
-        comparison, why = _compared(first, second)
+        comparison, why = compared(first, second)
     same = sameness(repetition.original, output) if of_twin else None
     return Again(repetition.original, repetition.scenario, recording, same, comparison, why)
 
 
-def _compared(first: Session, second: Session) -> tuple[Comparison | None, str | None]:
-    """What differs, or why that can't be told, e.g. of a run shorter than two cycles."""
+def compared(first: Session, second: Session) -> tuple[Comparison | None, str | None]:
+    """Hold a run against the one that its commands were taken from.
+
+    Args:
+        first: That one.
+        second: The new one.
+
+    Returns:
+        What differs; or None, and why that can't be told, e.g. of a run shorter than two cycles.
+    """
     if RESPONSE_TOPIC not in first.channels:
         return None, f"{first.path.name} has commands and no response ({RESPONSE_TOPIC})"
     try:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from capture.console import emit_json, progress
 from capture.daemon.control_socket import find_sockets
@@ -13,12 +15,76 @@ from capture.errors import UsageError
 from capture.interruption import interruptible
 from capture.robot import Robot
 
+from ..gate.dry_run_cli import run_dry
 from ..gate.outcome import How
 from .bus_report import BusReport, report_facts, report_lines
 from .console_watch import ConsoleWatch
 from .driven import Driven
 from .loop import BusTick
 from .over_bus import BusPlan, bus_plan, drive_bus
+
+
+@dataclass(frozen=True)
+class ArmedRun:
+    """An armed drive and how it went.
+
+    Attributes:
+        plan: What was to be done.
+        report: How it went.
+    """
+
+    plan: BusPlan
+    report: BusReport
+
+    @property
+    def complete(self) -> bool:
+        """Whether it ran to its planned end."""
+        return self.report.outcome.how is How.COMPLETE
+
+    def facts(self) -> dict[str, Any]:
+        """For JSON."""
+        plan = self.plan
+        return {
+            "driven": plan.driven.name,
+            "kind": plan.driven.kind,
+            "on": plan.address.text,
+            "robot": plan.robot.name,
+            "path": str(plan.output),
+            "planned_duration_s": plan.duration_s,
+            "recorder": str(plan.recorder) if plan.recorder is not None else None,
+            **report_facts(self.report),
+        }
+
+    def lines(self) -> list[str]:
+        """For people, the answer first."""
+        plan, report = self.plan, self.report
+        driven, why = plan.driven, report.outcome.why
+        if self.complete:
+            lines = [f"{plan.address.text}: drove {driven.name} for {report.gait_s:g} s"]
+        else:
+            at = f"at {report.gait_s:g} s of {plan.duration_s:g} s"
+            lines = [f"{plan.address.text}: stopped {at}: {why}"]
+        first, *more = report_lines(report)
+        lines += [f"{driven.kind} for {plan.robot.name}, {first}", *more]
+        lines.append(f"session: {plan.output}")
+        if plan.recorder is not None:
+            told = f"was told {report.told} samples of the gait"
+            lines.append(f"the recorder at {plan.recorder} {told}")
+        if report.not_told is not None:
+            lines.append(f"warning: it was not told all: {report.not_told}")
+        return lines
+
+    def complain(self) -> int:
+        """Say on stderr what ended it early.
+
+        Returns:
+            The exit code: 0 if it ran to its planned end, 1 if not.
+        """
+        if self.complete:
+            return 0
+        outcome = self.report.outcome
+        sys.stderr.write(f"error: {outcome.why}; {outcome.ended}\n")
+        return 1
 
 
 def drive_armed(
@@ -30,9 +96,8 @@ def drive_armed(
     output: Path | None,
     recorder: Path | None,
     force: bool,
-    as_json: bool,
-) -> int:
-    """Drive over a bus, and say how it went.
+) -> ArmedRun:
+    """Drive over a bus, with progress on a terminal.
 
     Args:
         driven: What to drive.
@@ -42,10 +107,9 @@ def drive_armed(
         output: The session to write.
         recorder: Control socket of a recorder; the only one that runs if None.
         force: Replace an existing session.
-        as_json: Report as one JSON object.
 
     Returns:
-        The exit code: 0 if it ran to its planned end, 1 if not.
+        How it went, also where it ended early.
 
     Raises:
         UsageError: If something of it can't be.
@@ -76,7 +140,67 @@ def drive_armed(
 
         report = drive_bus(plan, stop=stop, on_tick=show, console=console)
         console.gone()  # what is said from here on goes nowhere then
-    return _tell(plan, report, as_json=as_json)
+    return ArmedRun(plan, report)
+
+
+def drive_on_bus(
+    driven: Driven,
+    on: str,
+    *,
+    arm: bool,
+    robot: Robot | None = None,
+    duration_s: float | None = None,
+    output: Path | None = None,
+    recorder: Path | None = None,
+    force: bool = False,
+    as_json: bool = False,
+) -> int:
+    """What a verb does on a bus: a dry run in the twin, or armed; and say how it went.
+
+    Args:
+        driven: What to drive.
+        on: The bus.
+        arm: Whether commands are sent.
+        robot: On which robot; the one that it was made for if None.
+        duration_s: How long [s]; its own length if None.
+        output: The session to write; a dry run needs none.
+        recorder: Control socket of a recorder; the only one that runs if None.
+        force: Replace an existing session.
+        as_json: Report as one JSON object.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        UsageError: If something of it can't be.
+        SourceError: If nobody is there, or the robot is no robot to start with.
+    """
+    if not arm:
+        if recorder is not None:
+            raise UsageError("--recorder is for --arm: a dry run sends nothing")
+        return run_dry(
+            driven,
+            on,
+            robot=robot,
+            duration_s=duration_s,
+            output=output,
+            force=force,
+            as_json=as_json,
+        )
+    run = drive_armed(
+        driven,
+        on,
+        robot=robot,
+        duration_s=duration_s,
+        output=output,
+        recorder=recorder,
+        force=force,
+    )
+    if as_json:
+        emit_json(run.facts())
+    else:
+        print("\n".join(run.lines()))
+    return run.complain()
 
 
 def _only_recorder() -> Path | None:
@@ -86,41 +210,3 @@ def _only_recorder() -> Path | None:
         listed = "\n".join(f"  --recorder {path}" for path in found)
         raise UsageError(f"{len(found)} recorders run; which one is told the gait?\n{listed}")
     return found[0] if found else None
-
-
-def _tell(plan: BusPlan, report: BusReport, *, as_json: bool) -> int:
-    outcome = report.outcome
-    if as_json:
-        facts = {
-            "driven": plan.driven.name,
-            "kind": plan.driven.kind,
-            "on": plan.address.text,
-            "robot": plan.robot.name,
-            "path": str(plan.output),
-            "planned_duration_s": plan.duration_s,
-            "recorder": str(plan.recorder) if plan.recorder is not None else None,
-        }
-        emit_json({**facts, **report_facts(report)})
-    else:
-        print("\n".join(_told(plan, report)))
-    if outcome.how is How.COMPLETE:
-        return 0
-    sys.stderr.write(f"error: {outcome.why}; {outcome.ended}\n")
-    return 1
-
-
-def _told(plan: BusPlan, report: BusReport) -> list[str]:
-    driven, outcome = plan.driven, report.outcome
-    if outcome.how is How.COMPLETE:
-        lines = [f"{plan.address.text}: drove {driven.name} for {report.gait_s:g} s"]
-    else:
-        at = f"at {report.gait_s:g} s of {plan.duration_s:g} s"
-        lines = [f"{plan.address.text}: stopped {at}: {outcome.why}"]
-    lines.append(f"{driven.kind} for {plan.robot.name}, {report_lines(report)[0]}")
-    lines += report_lines(report)[1:]
-    lines.append(f"session: {plan.output}")
-    if plan.recorder is not None:
-        lines.append(f"the recorder at {plan.recorder} was told {report.told} samples of the gait")
-    if report.not_told is not None:
-        lines.append(f"warning: it was not told all: {report.not_told}")
-    return lines

@@ -70,11 +70,18 @@ def drive(
     if scheme == _TWIN and colon and not rest:
         raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
     if scheme != _TWIN:
-        return _on_bus(
-            what,
+        from capture import load_robot
+
+        from .bus_cli import drive_on_bus
+        from .over_bus import bus_address
+
+        bus_address(on)
+        described = load_robot(robot) if robot is not None else None
+        return drive_on_bus(
+            find_driven(what, robot=described),
             on,
             arm=arm,
-            robot=robot,
+            robot=described,
             duration_s=duration,
             output=output,
             recorder=recorder,
@@ -88,44 +95,6 @@ def drive(
     world = load_scenario(rest) if rest else None
     driven = find_driven(what, world)
     return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
-
-
-def _on_bus(
-    what: str,
-    on: str,
-    *,
-    arm: bool,
-    robot: str | None,
-    duration_s: float | None,
-    output: Path | None,
-    recorder: Path | None,
-    force: bool,
-    as_json: bool,
-) -> int:
-    from capture import load_robot
-
-    from ..gate.dry_run_cli import run_dry
-    from .bus_cli import drive_armed
-    from .driven import find_driven
-    from .over_bus import bus_address
-
-    bus_address(on)
-    described = load_robot(robot) if robot is not None else None
-    driven = find_driven(what, robot=described)
-    if arm:
-        return drive_armed(
-            driven,
-            on,
-            robot=described,
-            duration_s=duration_s,
-            output=output,
-            recorder=recorder,
-            force=force,
-            as_json=as_json,
-        )
-    if recorder is not None:
-        raise UsageError("--recorder is for --arm: a dry run sends nothing")
-    return run_dry(driven, on, duration_s=duration_s, output=output, force=force, as_json=as_json)
 
 
 def _on_twin(

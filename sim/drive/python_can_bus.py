@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import can
@@ -52,6 +53,8 @@ class PythonCanBus:
         options: dict[str, object] = {"channel": cast_from_string(channel)}
         if interface == "socketcand":
             options["host"], options["port"] = server_of(address)
+            # It logs each message that comes in two pieces, and each error besides raising it.
+            logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
         else:
             if kind.__module__.startswith("can."):  # others' classes may take what they don't name
                 only(address, known_options(kind))
@@ -105,4 +108,5 @@ class PythonCanBus:
         self._link.close()
 
     def _lost(self, error: OSError) -> SourceError:
-        return SourceError(self.place, f"the bus is lost: {error.strerror or error}")
+        reason = (error.strerror or str(error)).partition("\n")[0].strip()
+        return SourceError(self.place, f"the bus is lost: {reason}")

@@ -69,8 +69,8 @@ class VirtualBus:
 
         Args:
             tick: Its number.
-            state: The newest frames of the robot's state, for those who come later; those of
-                before if None.
+            state: The newest frames of the robot's state, for those who come later; None where they
+                soon hear newer ones.
         """
         if self._server is not None:
             self._server.mark(tick, state)

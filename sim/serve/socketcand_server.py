@@ -140,11 +140,11 @@ class SocketcandServer:
 
         Args:
             tick: Its number; a client that goes to raw mode later is told of the newest.
-            state: Frames that such a client is told before it, as it has not heard them.
+            state: Frames that such a client is told before it, as it has not heard them; None
+                where it soon hears newer ones.
         """
         self._tick = tick
-        if state is not None:
-            self._state = frame_text(state)
+        self._state = b"" if state is None else frame_text(state)
         for client in [c for c in self._clients.values() if c.raw and c.marks]:
             if not tick:
                 self._give(client, self._state)
