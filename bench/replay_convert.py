@@ -1,79 +1,202 @@
-"""Time, size and memory of converting a session for the viewer.
+"""An hour of the 25-joint snake converted for the viewer: time, size and memory, held to bars.
 
-``python bench/replay_convert.py [MINUTES]`` writes a session of 25 joints at 100 Hz (commands,
-states with velocity and torque, current, voltage, odometry, gait; encoder noise 3 mrad), converts
-it in a fresh process and prints what that took. Ten minutes by default.
+The session is that of ``hour_session.py``: 25 joints at 100 Hz, each sampled at a time of its own,
+with currents, voltages, temperatures, 16 distance sensors, odometry and gait, noise and the parts'
+resolution; ``--can`` adds the raw frames, which are read past. It is converted by
+``write_recording`` in a process of its own, and by ``undulog view --save``, which analyses it
+first. Peak memory is the largest resident set, mapped file included; the file is in the page
+cache, and the best of several runs counts. Processor time, all threads, is printed beside: other
+processes disturb it less.
+
+The peer is what one writes first: every sample of every joint, and every pose of the body, by a
+``log`` call of its own, on the same two timelines. It takes ``--rows`` seconds of the session, and
+its figures are scaled to the whole, which suits it: nothing in it gets slower with time.
+
+Run: python bench/replay_convert.py [--minutes 60] [--runs 2] [--can] [--rows 20]
+     [--folder DIR | --keep FILE]
 """
 
+from __future__ import annotations
+
+import argparse
+import json
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import rerun as rr
+from analyse_hour import cost, verdict
 
-from capture import SessionWriter, load_robot
-from capture.robot import Plane
+from capture import Session
+from replay.body import capsule_poses, capsule_shape
+from replay.motion import assemble, frames_of, read_head
+from replay.quantities import quantities
+from replay.tracks import read_columns, wanted_fields
+
+HOUR_S = 3600
+CONVERT_S, SIZE_MB, PEAK_MB = 30.0, 350.0, 500.0
+"""The bars, for an hour; memory is not to grow with the session."""
 
 CONVERT = """
-import resource, sys, time
+import json, resource, sys, time
 from pathlib import Path
+start = time.perf_counter()
 from capture import Session
 from replay import write_recording
-start = time.perf_counter()
 with Session.open(sys.argv[1]) as session:
     write_recording(session, Path(sys.argv[2]))
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-print(f"{time.perf_counter() - start:.1f} s, peak memory {peak:.0f} MB", end=", ")
+took = time.perf_counter() - start
+used = resource.getrusage(resource.RUSAGE_SELF)
+print(json.dumps([took, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e6]))
 """
 
 
-def write_session(path: Path, minutes: float) -> None:
-    """Write the session."""
-    robot = load_robot("snake25")
-    names = robot.joint_names
-    yaw = robot.joint_indices(Plane.HORIZONTAL)
-    rng = np.random.default_rng(0)
-    t = np.arange(round(minutes * 6000)) / 100.0
-    phase = np.pi * t
-    wave = phase[:, None] - np.arange(len(yaw)) * np.pi / 3
-    command, position, velocity, effort = (np.zeros((len(t), len(names))) for _ in range(4))
-    command[:, yaw] = 0.4 * np.sin(wave)
-    position[:, yaw] = 0.38 * np.sin(wave - 0.15)
-    position += 0.003 * rng.standard_normal(position.shape)
-    velocity[:, yaw] = 0.38 * np.pi * np.cos(wave - 0.15)
-    effort[:, yaw] = 0.1 * np.cos(wave + 0.5)
-    head = np.stack([0.25 * t, 0.05 * np.sin(phase), np.full_like(t, 0.025)], axis=1)
-    turn = 0.2 * np.sin(phase + 1.0)
-    epoch_ns = 1_735_689_600_000_000_000
-    with SessionWriter(path, session_id="bench", epoch_ns=epoch_ns, robot=robot) as w:
-        commands = w.joint_state("/joint_commands", names, unit="rad")
-        states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-        current = w.joint_state("/joint_current", names, unit="A")
-        voltage = w.joint_state("/joint_voltage", names, unit="V")
-        gait = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-        odometry = w.odometry("/odom", frame="world", child="link01")
-        for i, t_ns in enumerate((epoch_ns + np.round(t * 1e9).astype(np.int64)).tolist()):
-            commands.write(t_ns, command[i])
-            states.write(t_ns, position[i], velocity[i], effort[i])
-            current.write(t_ns, effort[i])
-            voltage.write(t_ns, 6.0 * effort[i])
-            gait.write(t_ns, np.array([0.4, phase[i]]))
-            heading = np.array([0.0, 0.0, np.sin(turn[i] / 2), np.cos(turn[i] / 2)])
-            odometry.write(t_ns, head[i], heading, np.zeros(3), np.zeros(3))
+class Figures(NamedTuple):
+    """What a conversion took.
+
+    Attributes:
+        wall_s: From start to end, imports included.
+        processor_s: User and system time, all threads.
+        peak_mb: Largest resident memory.
+        size_mb: Of the recording.
+    """
+
+    wall_s: float
+    processor_s: float
+    peak_mb: float
+    size_mb: float
 
 
-def main(minutes: float) -> None:
-    """Write, convert three times, print."""
-    with tempfile.TemporaryDirectory() as folder:
-        log, recording = Path(folder) / "bench.mcap", Path(folder) / "bench.rrd"
-        write_session(log, minutes)
-        print(f"{minutes:g} min, 25 joints at 100 Hz, {log.stat().st_size / 1e6:.0f} MB of MCAP")
-        for _ in range(3):
-            command = [sys.executable, "-c", CONVERT, str(log), str(recording)]
-            done = subprocess.run(command, check=True, capture_output=True, text=True)
-            print(f"{done.stdout}{recording.stat().st_size / 1e6:.0f} MB of .rrd")
+def converted(session: Path, recording: Path) -> Figures:
+    """Convert in a process of its own."""
+    command = [sys.executable, "-c", CONVERT, str(session), str(recording)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    wall_s, processor_s, peak_mb = json.loads(done.stdout.splitlines()[-1])
+    return Figures(wall_s, processor_s, peak_mb, recording.stat().st_size / 1e6)
+
+
+def converted_by_command(session: Path, recording: Path) -> Figures:
+    """Convert by the command line, which analyses first."""
+    took = cost("view", str(session), "--save", str(recording), "--force")
+    peak_mb = took.peak_mib * (1 << 20) / 1e6
+    return Figures(took.wall_s, took.processor_s, peak_mb, recording.stat().st_size / 1e6)
+
+
+def row_by_row(path: Path, seconds: float, recording: Path) -> tuple[float, float, int]:
+    """The beginning of the session, a log call for each sample; seconds, megabytes and calls."""
+    with Session.open(path) as session:
+        start_ns = session.start_ns
+        stop_ns = start_ns + round(seconds * 1e9)
+        wanted = {topic: one for topic, one in wanted_fields(session).items() if topic != "/gait"}
+        columns = read_columns(session, wanted, start_ns=start_ns, stop_ns=stop_ns)
+        robot = session.robot
+        assert robot is not None
+        measured = columns["/joint_states", "position"]
+        frames = frames_of(read_head(session, robot, measured, []), session.end_ns)
+        rows = slice(0, int(np.searchsorted(frames.head.t_ns, stop_ns)))
+        commands = columns["/joint_commands", "position"]
+        motion = assemble(
+            robot, frames.between(rows).head, positions=measured, commands=commands, power=()
+        )
+    lengths, radii = capsule_shape(robot)
+    samples = [
+        (int(t_ns), f"{entity}/{track.name}", value)
+        for entity, tracks in quantities(columns).items()
+        for track in tracks
+        for t_ns, value in zip(track.t_ns.tolist(), track.values.tolist(), strict=True)
+    ]
+    every = slice(None)
+    origin, turn = capsule_poses(robot, *motion.links(every))
+    assert motion.commands is not None
+    asked_origin, asked_turn = capsule_poses(robot, *motion.links(every, motion.commands))
+    rec = rr.RecordingStream("rows", send_properties=False)
+    rec.set_log_time_enabled(False)
+    rec.set_log_tick_enabled(False)
+    rec.save(recording)
+
+    def stand_at(t_ns: int) -> None:
+        rec.set_time("session_time", duration=np.timedelta64(t_ns - start_ns, "ns"))
+        rec.set_time("gait_cycle", duration=np.timedelta64((t_ns - start_ns) // 2, "ns"))
+
+    start = time.perf_counter()
+    for t_ns, entity, value in samples:
+        stand_at(t_ns)
+        rec.log(entity, rr.Scalars(value))
+    for i, t_ns in enumerate(motion.t_ns.tolist()):
+        stand_at(t_ns)
+        for entity, place, way in (
+            ("/world/measured", origin[i], turn[i]),
+            ("/world/commanded", asked_origin[i], asked_turn[i]),
+        ):
+            shape = rr.Capsules3D(lengths=lengths, radii=radii, translations=place, quaternions=way)
+            rec.log(entity, shape)
+    rec.disconnect()
+    calls = len(samples) + 2 * motion.t_ns.size
+    return time.perf_counter() - start, recording.stat().st_size / 1e6, calls
+
+
+def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
+    """Convert and print; whether all bars are met."""
+    part = minutes * 60 / HOUR_S
+    recording = path.with_name("bench.rrd")
+    print(f"{minutes:g} min, 25 joints at 100 Hz, {path.stat().st_size / 1e6:.0f} MB of MCAP")
+    ours = [converted(path, recording) for _ in range(runs)]
+    good = [
+        verdict("MCAP to .rrd", min(one.wall_s for one in ours), round(CONVERT_S * part, 2), "s"),
+        verdict("size", ours[0].size_mb, round(SIZE_MB * part, 1), "MB"),
+        verdict("peak memory", max(one.peak_mb for one in ours), PEAK_MB, "MB"),
+    ]
+    print(f"      processor time {min(one.processor_s for one in ours):.1f} s")
+    command = converted_by_command(path, recording)
+    print(
+        f"      undulog view --save, which analyses first: {command.wall_s:.1f} s (processor time "
+        f"{command.processor_s:.1f} s), {command.size_mb:.0f} MB, peak {command.peak_mb:.0f} MB"
+    )
+    took_s, size_mb, calls = row_by_row(path, rows_s, recording)
+    scale = minutes * 60 / rows_s
+    print(
+        f"      row by row, {rows_s:g} s of it: {took_s:.1f} s and {size_mb:.1f} MB for {calls} "
+        f"calls; scaled to {minutes:g} min {took_s * scale:.0f} s and {size_mb * scale:.0f} MB"
+    )
+    recording.unlink()
+    return all(good)
+
+
+def write(path: Path, seconds: int, *, can: bool) -> None:
+    """Write the session in another process, so that its memory is not this one's."""
+    code = (
+        "import sys; from pathlib import Path; from hour_session import write_session; "
+        f"write_session(Path(sys.argv[1]), int(sys.argv[2]), can={can})"
+    )
+    command = [sys.executable, "-c", code, str(path), str(seconds)]
+    subprocess.run(command, check=True, cwd=Path(__file__).parent)
+
+
+def main() -> None:
+    """Write, measure, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--runs", type=int, default=2)
+    parser.add_argument("--can", action="store_true", help="with raw frames, 8,000 a second")
+    parser.add_argument("--rows", type=float, default=20.0, help="what the peer takes [s]")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--folder", type=Path, help="a folder with 2 GB to spare")
+    place.add_argument("--keep", type=Path, help="the session, written if it is not there")
+    options = parser.parse_args()
+    seconds = max(round(options.minutes * 60), 60)
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
+        if not path.exists():
+            write(path, seconds, can=options.can)
+        good = measure(path, seconds / 60, options.runs, options.rows)
+    sys.exit(0 if good else 1)
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)
+    main()
