@@ -1,0 +1,178 @@
+"""The mean cycle in a recording: its own timeline, closed, and true to a twin's periodic motion."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import undulog
+from analysis.analyse import measure_session
+from analysis.cycles import cycle_maps
+from analysis.result_artefact import Artefact
+from capture import Session
+from replay.cycles import cycle_tables
+from replay.mean_cycle import ENSEMBLE_CYCLE
+from replay.results import computed
+from replay.rrd import write_recording
+
+CHAIN = """name = "chain5"
+description = "Five yaw joints."
+clock = "simulated"
+assumed = ["links", "servo"]
+[chain]
+joints = 5
+planes = ["horizontal"]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+"""
+WAVE = """description = "A wave on the ground."
+robot = "chain5.toml"
+duration_s = 8.0
+settle_s = 3.0
+physics_rate_hz = 4000
+[gait]
+ramp_s = 0.5
+[gait.horizontal]
+amplitude = 0.4
+frequency_hz = 1.0
+lag = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory, read_back):
+    """A chain of five joints in a steady wave: (session's file, what was said, recording)."""
+    folder = tmp_path_factory.mktemp("twin")
+    (folder / "chain5.toml").write_text(CHAIN)
+    (folder / "wave.toml").write_text(WAVE)
+    words = ["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]
+    assert undulog.run(words) == 0
+    with Session.open(folder / "run.mcap") as session:
+        layer = computed(session)
+        said = write_recording(session, folder / "run.rrd", analysis=layer.analysis)
+    return folder / "run.mcap", said, read_back(folder / "run.rrd")
+
+
+def rows(recorded, entity):
+    """Values by degrees, shape (73, joints)."""
+    return np.array(recorded.column(entity, "Scalars:scalars"), dtype=float)
+
+
+def test_it_runs_from_0_to_360_degrees_and_closes(recording):
+    _, recorded = recording
+    times = recorded.times("/ensemble/measured", ENSEMBLE_CYCLE)
+    np.testing.assert_array_equal(times, np.arange(0, 361, 5))
+    angles = rows(recorded, "/ensemble/measured")
+    np.testing.assert_array_equal(angles[0], angles[-1])
+
+
+def test_angles_and_errors_are_the_closed_form(recording):
+    said, recorded = recording
+    assert said.content.mean.period_s == pytest.approx(2.0)
+    phase = np.radians(np.arange(0, 361, 5))[:, None]
+    k = np.arange(13)
+    late = phase - k * np.pi / 3 - np.radians(7 + 0.5 * k)
+    (series,) = said.content.mean.measured
+    angles = rows(recorded, "/ensemble/measured")
+    assert len(series.names) == 25
+    np.testing.assert_allclose(angles[:, ::2], np.degrees(0.38 * np.sin(late)), atol=1e-3)
+    np.testing.assert_allclose(angles[:, 1::2], 0.0, atol=1e-9)
+    error = np.degrees(0.38 * np.sin(late) - 0.4 * np.sin(phase - k * np.pi / 3))
+    np.testing.assert_allclose(rows(recorded, "/ensemble/error")[:, ::2], error, atol=1e-3)
+
+
+def test_power_is_averaged_as_power_is(recording):
+    _, recorded = recording
+    phase = np.radians(np.arange(0, 361, 5))[:, None]
+    k = np.arange(13)
+    late = phase - k * np.pi / 3 - np.radians(7 + 0.5 * k)
+    power = 0.1 * np.cos(late + 1.2) * 0.38 * np.pi * np.cos(late)
+    np.testing.assert_allclose(rows(recorded, "/ensemble/power")[:, ::2], power, atol=1e-5)
+
+
+def test_the_body_moves_about_its_own_middle(recording):
+    _, recorded = recording
+    entity = "/ensemble/body/measured"
+    origin, turn, length = (
+        np.array(recorded.column(entity, f"Capsules3D:{part}"), dtype=float)
+        for part in ("translations", "quaternions", "lengths")
+    )
+    assert origin.shape == (73, 26, 3)
+    along = Rotation.from_quat(turn.reshape(-1, 4)).apply([0.0, 0.0, 1.0]).reshape(origin.shape)
+    middle = origin + 0.5 * length[..., None] * along
+    np.testing.assert_allclose(middle.mean(axis=1), 0.0, atol=1e-3)
+    assert (middle[:, 0, 0] > 0.3).all()  # the head is in front
+    assert np.ptp(middle[:, 0, 1]) > 0.03  # and swings
+
+
+def test_nothing_of_it_is_on_the_sessions_timelines_but_a_shape_that_stands(recording):
+    _, recorded = recording
+    assert recorded.times("/ensemble/measured", "session_time").size == 0
+    assert recorded.times("/ensemble/body/on_session_time/measured", "session_time").size == 1
+
+
+def test_one_cycle_has_no_interval_and_says_so(recording):
+    _, recorded = recording
+    assert not any(path.endswith("/low") for path in recorded.entities)
+    words = recorded.static("/ensemble/about", "TextDocument:text")[0]
+    assert "Mean of 1 cycle, 0.0 to 2.0 s" in words
+    assert "there is no interval" in words
+
+
+def test_the_twins_settled_motion_is_its_mean_cycle(twin):
+    file, said, recorded = twin
+    (series,) = said.content.mean.measured
+    angles = np.radians(rows(recorded, "/ensemble/measured"))
+    with Session.open(file) as session:
+        joints = session.joints("/joint_states", "position")
+        gait = session.joints("/gait")
+        start_ns = session.start_ns
+    phase = dict(zip(gait.names, zip(gait.t_ns, gait.values, strict=True), strict=True))
+    t_ns, logged = phase["horizontal.phase"]
+    for k, name in enumerate(series.names):
+        own, values = joints.t_ns[k], joints.values[k]
+        last = own - start_ns > 7_000_000_000  # the last cycle, sample by sample
+        at = np.degrees(np.interp(own[last], t_ns, np.unwrap(logged))) % 360
+        drawn = np.interp(at, np.arange(0, 361, 5), angles[:, k])
+        assert joints.names[k] == name
+        # Between 5 degrees a straight line is off by 0.4 (pi / 72)^2 / 2 rad at most.
+        np.testing.assert_allclose(values[last], drawn, atol=1.5e-3)
+
+
+def test_the_twins_interval_is_as_narrow_as_its_cycles_agree(twin):
+    _, _, recorded = twin
+    low = rows(recorded, "/ensemble/places/head/low")
+    high = rows(recorded, "/ensemble/places/head/high")
+    assert (high >= low).all()
+    assert np.degrees(1e-3) > (high - low).max()
+
+
+def test_the_cycles_agree_with_the_reports_maps(twin):
+    with Session.open(twin[0]) as session:
+        measured = measure_session(session)
+    maps = cycle_maps(measured)
+    gain, lag, energy = cycle_tables(measured.analysis)
+    inside = gain.start_s >= maps.start_s[0]
+    np.testing.assert_allclose(
+        gain.value[:, inside].mean(axis=1), 100 * (maps.gain.mean(axis=1) - 1), atol=0.02
+    )
+    np.testing.assert_allclose(
+        lag.value[:, inside].mean(axis=1), np.degrees(maps.lag_rad.mean(axis=1)), atol=0.02
+    )
+    np.testing.assert_allclose(energy.value / (energy.stop_s - energy.start_s), maps.power_w)
+
+
+def test_joints_with_a_false_sensor_are_left_out(session_file, analysis, tmp_path, read_back):
+    frozen = Artefact("joint09", "/joint_states", "position", "frozen", ((0.2, 1.0),))
+    false = dataclasses.replace(analysis, artefacts=(frozen,))
+    with Session.open(session_file) as session:
+        said = write_recording(session, tmp_path / "a.rrd", analysis=false)
+    (series,) = said.content.mean.measured
+    assert "joint09" not in series.names
+    assert any("the mean cycle leaves out joint09" in note for note in said.warnings)
+    shapes = read_back(tmp_path / "a.rrd").column("/ensemble/body/measured", "Capsules3D:radii")
+    assert {len(row) for row in shapes} == {9}  # the links before the joint
