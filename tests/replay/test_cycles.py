@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.cycles import CycleMaps
-from analysis.result_energy import EnergyResult, JointCycles, Transport
 from analysis.result import Estimate
+from analysis.result_energy import EnergyResult, JointCycles, Transport
 from analysis.result_over_time import JointOverTime, ResponseOverTime
 from capture import Session
 from capture.palette import joint_colors
