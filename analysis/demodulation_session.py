@@ -41,8 +41,13 @@ class _Pace:
 
 
 @dataclass(frozen=True)
-class _Logged:
-    """``/gait``: times [s] of shape (n,), and values of shape (n,) by name; phases run on."""
+class LoggedGait:
+    """What the controller meant, as it was logged on ``/gait``.
+
+    Attributes:
+        t_s: Times [s], shape (n,).
+        values: Values by name, shapes (n,); phases run on over a whole turn.
+    """
 
     t_s: FloatArray
     values: Mapping[str, FloatArray]
@@ -53,7 +58,15 @@ class _Logged:
         return [name for name in self.values if name.endswith(".phase")]
 
     def phase_name(self, joint: str, plane: str) -> str | None:
-        """The joint's own phase, else that of its plane, else that of the only plane."""
+        """Which phase a joint follows.
+
+        Args:
+            joint: The joint's name.
+            plane: Its plane; empty where no robot says.
+
+        Returns:
+            The name of its own phase, else of its plane's, else of the only one; None without.
+        """
         for name in (f"{joint}.phase", f"{plane}.phase"):
             if name in self.phases:
                 return name
@@ -65,7 +78,11 @@ class _Logged:
         return [None if phase is None else _Pace(phase, phase.edges_s()) for phase in rising]
 
     def runs(self) -> list[tuple[int, int]]:
-        """Half-open index ranges between sudden changes and gaps."""
+        """Where the gait goes on without a sudden change or a gap.
+
+        Returns:
+            Half-open ranges of indices, of more than two samples each.
+        """
         step = np.diff(self.t_s)
         broken: BoolArray = step > GAP_FACTOR * np.median(step)
         for name, value in self.values.items():
@@ -137,7 +154,7 @@ def response_over_time(
     )
 
 
-def _logged(session: Session, warn: Warn) -> _Logged | None:
+def _logged(session: Session, warn: Warn) -> LoggedGait | None:
     why = f"the session has no {GAIT_TOPIC}"
     if GAIT_TOPIC in session.channels:
         try:
@@ -153,7 +170,7 @@ def _logged(session: Session, warn: Warn) -> _Logged | None:
                 known = {name: value[finite] for name, value in values.items()}
                 # A log may keep its phases within a turn, or not.
                 known |= {k: np.unwrap(v) for k, v in known.items() if k.endswith(".phase")}
-                return _Logged(t_s[finite], known)
+                return LoggedGait(t_s[finite], known)
             why = f"{GAIT_TOPIC} logs no phase"
     warn(f"gain and lag over time are null: {why}")
     return None
