@@ -35,8 +35,9 @@ class Ending:
         rest = np.clip(np.zeros_like(last), limits.lower, limits.upper)
         target = start if limits.on_fault is OnFault.HOLD else rest
         self._ramp = Ramp(start, target, limits.ramp_rate)
-        self.duration_s = self._ramp.duration_s + HOLD_S
-        """How long it takes [s]."""
+        back_s = float(np.max(np.abs(start - last) / limits.rate, initial=0.0))
+        self.duration_s = back_s + self._ramp.duration_s + HOLD_S
+        """How long it takes [s], with the way of the commands back to where the joints are."""
 
     def at(self, time_s: float) -> FloatArray:
         """What is wanted at a time.

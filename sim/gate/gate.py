@@ -290,7 +290,7 @@ class Gate:
         if found is not None and (self.phase is not Phase.ENDING or found.kind in MUTE):
             self._fail(found, clamp, heard.status)
         elif at_once:
-            self._halt(stop)
+            self._halt(f"{stop}, twice")
         elif stop and self.phase is not Phase.ENDING:
             self.outcome = Outcome(How.STOPPED, stop, "")
             self._end(clamp, heard.status)
@@ -331,7 +331,7 @@ class Gate:
         before = self.outcome or Outcome(How.STOPPED, why, "")
         self.outcome = Outcome(
             before.how,
-            before.why,
+            before.why if before.how is How.FAULT else why,
             "nothing more was sent; the servos hold their last commands",
             before.fault,
         )

@@ -43,8 +43,8 @@ class Jitter:
     def __str__(self) -> str:
         """One line."""
         return (
-            f"ticks were late by {self.median_s * 1e3:.2g} ms (median), "
-            f"{self.p99_s * 1e3:.2g} ms (99 %), {self.worst_s * 1e3:.2g} ms at worst"
+            f"ticks were late by {self.median_s * 1e3:.2f} ms (median), "
+            f"{self.p99_s * 1e3:.2f} ms (99 %), {self.worst_s * 1e3:.2f} ms at worst"
         )
 
 

@@ -82,7 +82,7 @@ class Watch:
         value = float(np.max(silence_s[silent]))
         return GateFault(
             FaultKind.LOST,
-            f"the robot is lost: {names} silent for more than {limit_s:g} s",
+            f"{names} lost: no angle for more than {limit_s:g} s",
             joint=self._limits.joint_names[int(np.argmax(silent))] if silent.sum() == 1 else "",
             value=value,
             limit=limit_s,
@@ -115,9 +115,9 @@ class Watch:
 
 
 def _named(names: tuple[str, ...], chosen: BoolArray) -> str:
-    """Some joints by name, or all of them."""
+    """Who, as the subject of a sentence."""
     if chosen.all():
-        return f"all {len(names)} joints"
+        return "the robot is"
     found = [name for name, is_one in zip(names, chosen, strict=True) if is_one]
     more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
-    return ", ".join(found[:_SHOWN]) + more
+    return ", ".join(found[:_SHOWN]) + more + (" is" if len(found) == 1 else " are")

@@ -128,7 +128,7 @@ def test_an_ending_starts_where_the_joints_are(how):
     end = begin if how is OnFault.HOLD else np.zeros(25)
     np.testing.assert_allclose(ending.at(ending.duration_s), end, atol=1e-15)
     expected_s = 0.0 if how is OnFault.HOLD else 1.5 * 0.3 / 0.5
-    assert ending.duration_s == pytest.approx(expected_s + 0.2)
+    assert ending.duration_s == pytest.approx(0.5 / 4.0 + expected_s + 0.2)
 
 
 def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():

@@ -1,0 +1,304 @@
+"""The gate's state machine and its watch, tick by tick, against a robot of closed form."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from capture import load_robot
+from capture.errors import SourceError, UsageError
+from capture.log.frames import DIR_TX, ERROR_FLAG, empty_frames
+from capture.robot import OnFault
+from capture.sources.bus_watch import BUS_OFF
+from sim.gait import GaitTick
+from sim.gate.faults import FaultKind, GateFault
+from sim.gate.gate import POSE_S, Gate, Heard, Phase
+from sim.gate.lateness import jitter
+from sim.gate.limits import gate_limits
+from sim.gate.outcome import How
+from sim.gate.presence import Presence
+from sim.gate.status import JointStatus
+from sim.readings import Readings
+
+ROBOT = load_robot("snake25")
+LIMITS = gate_limits(ROBOT)
+COUNT = 25
+RATE_HZ = 100
+
+
+class Wave:
+    """A gait: joint i follows amplitude sin(w t + i), from the first tick on."""
+
+    names = ()
+
+    def __init__(self, amplitude=0.3, frequency_hz=0.5):
+        self.amplitude, self.w = amplitude, 2 * np.pi * frequency_hz
+        self.asked = []
+
+    def at(self, time_s):
+        return self.amplitude * np.sin(self.w * time_s + np.arange(COUNT))
+
+    def step(self, time_s, readings):
+        del readings
+        self.asked.append(time_s)
+        return GaitTick(self.at(time_s), np.empty(0), "walk", ())
+
+
+def heard(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0, **more):
+    def all_of(value):
+        return np.broadcast_to(np.asarray(value, dtype=float), COUNT).copy()
+
+    status = JointStatus(
+        all_of(angle), all_of(current), all_of(temperature), all_of(voltage), all_of(silence_s)
+    )
+    return Heard(Readings(status.angle, all_of(0.0)), status, **more)
+
+
+def gate(gait, *, duration_s=1.0, limits=LIMITS, listen_s=0.0):
+    return Gate(
+        gait, limits, duration_s=duration_s, rate_hz=RATE_HZ, place="can:test", listen_s=listen_s
+    )
+
+
+class Bench:
+    """A gate with a robot that is where it was told to be one tick before."""
+
+    def __init__(self, gait=None, start=0.0, **options):
+        self.gait = gait or Wave()
+        self.gate = gate(self.gait, **options)
+        self.angle = np.full(COUNT, start)
+        self.tick = 0
+        self.sent = []
+
+    def step(self, change=None, stop="", *, at_once=False, skip=0, **more):
+        angle = self.angle.copy()
+        if change is not None:
+            change(angle)
+        self.tick += skip
+        found = self.gate.step(self.tick, heard(angle, **more), stop, at_once=at_once)
+        self.tick += 1
+        if found.command is not None:
+            self.sent.append(found.command)
+            self.angle = found.command
+        return found
+
+    def until(self, phase, **more):
+        for _ in range(2000):
+            found = self.step(**more)
+            if self.gate.phase is phase:
+                return found
+        raise AssertionError(f"never came to {phase}")
+
+
+def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():
+    bench = Bench(start=0.1)
+    bench.until(Phase.DONE)
+    assert bench.gate.outcome.how is How.COMPLETE
+    way = np.abs(bench.gait.at(0.0) - 0.1).max()
+    ramp_ticks = int(np.ceil(1.5 * way / 0.5 * RATE_HZ - 1e-9)) - 1
+    sent = np.array(bench.sent)
+    assert bench.gate.run_from == ramp_ticks
+    np.testing.assert_array_equal(
+        sent[ramp_ticks:], [bench.gait.at(tick / RATE_HZ) for tick in range(101)]
+    )
+    assert np.abs(np.diff(sent[: ramp_ticks + 1], axis=0)).max() <= 0.5 / RATE_HZ * (1 + 1e-9)
+    assert np.abs(sent[0] - 0.1).max() <= 0.5 / RATE_HZ
+    assert bench.gait.asked == [tick / RATE_HZ for tick in range(101)]  # once a tick, in order
+    assert bench.gate.step(bench.tick, heard(0.0)).command is None
+
+
+def test_nothing_is_sent_until_every_joint_is_known():
+    bench = Bench()
+
+    def unknown(angle):
+        angle[[3, 8]] = np.nan
+
+    for _ in range(int(POSE_S * RATE_HZ)):
+        assert bench.step(unknown).command is None
+    with pytest.raises(SourceError, match="joint04, joint09 told no angle within 2 s"):
+        bench.step(unknown)
+    assert bench.sent == []
+
+
+def test_a_bus_that_has_to_be_listened_to_is():
+    bench = Bench(start=0.0, listen_s=0.5)
+    found = [bench.step().command is None for _ in range(60)]
+    assert found == [True] * 50 + [False] * 10
+
+
+@pytest.mark.parametrize(
+    ("more", "error", "told"),
+    [
+        ({"another_robot": "another robot"}, UsageError, "nothing was sent: another robot"),
+        (
+            {"trouble": GateFault(FaultKind.STRANGER, "somebody else commands")},
+            SourceError,
+            "nothing was sent: somebody else commands",
+        ),
+    ],
+)
+def test_before_the_first_command_trouble_is_a_refusal(more, error, told):
+    bench = Bench()
+    bench.gate = gate(bench.gait, listen_s=0.01)
+    if error is UsageError:
+        bench.step(**more)  # it listens
+    with pytest.raises(error, match=told):
+        bench.step(**more)
+    assert bench.sent == []
+
+
+def test_a_joint_far_beyond_its_limits_is_not_driven_and_one_a_little_beyond_is_brought_back():
+    far = Bench(start=0.9)
+    with pytest.raises(SourceError, match=r"joint01 is at 0.900 rad, 0.376 rad beyond its limits"):
+        far.step()
+    near = Bench(start=0.6)
+    near.until(Phase.DONE)
+    assert np.abs(near.sent).max() <= np.pi / 6
+
+
+def stuck(angle):
+    angle[6] = 0.0
+
+
+CASES = {
+    "tracking": (stuck, {}, "joint07: tracking error 0.4", 0.3),
+    "current": (None, {"current": 1.5}, "joint01: current 1.5 A, more than 1.4 A", 0.3),
+    "temperature": (None, {"temperature": 71.0}, "joint01: temperature 71 degC, more", 0.3),
+    "voltage": (None, {"voltage": 4.5}, "joint01: voltage 4.5 V, less than 5 V", 0.3),
+    "lost": (None, {"silence_s": 0.26}, "the robot is lost: no angle for more than 0.25 s", 0.0),
+    "late": (None, {"late_s": 0.3}, "a control tick was 0.3 s late, more than 0.2 s", 0.0),
+}
+
+
+@pytest.mark.parametrize("how", list(OnFault))
+@pytest.mark.parametrize("kind", list(CASES))
+def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
+    change, more, text, after_s = CASES[kind]
+    limits = dataclasses.replace(LIMITS, on_fault=how, voltage=np.full(COUNT, 5.0))
+    bench = Bench(Wave(0.5), duration_s=60.0, limits=limits)
+    while bench.gate.phase is not Phase.RUN:
+        bench.step()
+    while kind == "tracking" and abs(bench.angle[6]) < 0.36:
+        bench.step()
+    first = bench.tick
+    while bench.gate.phase is Phase.RUN:
+        bench.step(change, **more)
+    assert (bench.tick - 1 - first) / RATE_HZ == pytest.approx(after_s, abs=0.0101)
+    assert bench.gate.outcome.fault.kind == kind
+    assert bench.gate.outcome.why.startswith(text)
+    begun = len(bench.sent)
+    while bench.gate.phase is Phase.ENDING:
+        bench.step(change, **more)
+    steps = np.abs(np.diff(np.array(bench.sent)[begun - 2 :], axis=0))
+    assert steps.max() <= 4.0 / RATE_HZ * (1 + 1e-9)
+    assert len(bench.sent) - begun <= (0.53 / 4.0 + 1.5 * 0.53 / 0.5 + 0.21) * RATE_HZ
+    if how is OnFault.RAMP_DOWN and kind != "current":
+        np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
+    if how is OnFault.HOLD:
+        np.testing.assert_allclose(bench.sent[-1], bench.sent[-5], atol=1e-12)
+    assert bench.gate.outcome.how is How.FAULT
+    assert bench.gate.step(bench.tick, heard(0.0)).command is None  # and nothing after it
+
+
+def test_an_excess_that_goes_away_in_time_is_no_fault():
+    bench = Bench(duration_s=3.0)
+    bench.until(Phase.RUN)
+    for k in range(280):
+        bench.step(current=1.5 if k % 29 < 28 else 1.0)  # 0.28 s of 0.29 s
+    assert bench.gate.phase is Phase.RUN
+    assert bench.gate.joints_that_yielded == ROBOT.joint_names
+
+
+@pytest.mark.parametrize("kind", [FaultKind.BUS_OFF, FaultKind.STRANGER])
+def test_where_nobody_hears_or_another_commands_nothing_more_is_sent(kind):
+    bench = Bench(duration_s=60.0)
+    bench.until(Phase.RUN)
+    count = len(bench.sent)
+    assert bench.step(trouble=GateFault(kind, "so")).command is None
+    assert bench.gate.phase is Phase.DONE
+    assert len(bench.sent) == count
+    assert bench.gate.outcome.ended.startswith("nothing more was sent")
+
+
+def test_a_late_tick_is_caught_up_without_a_jump_and_too_late_a_one_is_a_fault():
+    bench = Bench(Wave(0.5, 1.0), duration_s=60.0)
+    bench.until(Phase.RUN)
+    for _ in range(5):
+        for _ in range(20):
+            bench.step()
+        bench.step(skip=19, late_s=0.19)
+    assert bench.gate.phase is Phase.RUN
+    assert bench.gate.cuts["by_rate"] > 0
+    assert np.abs(np.diff(np.array(bench.sent), axis=0)).max() <= 4.0 / RATE_HZ * (1 + 1e-9)
+    before = bench.sent[-1]
+    bench.step(skip=100, late_s=1.0)
+    assert bench.gate.phase is Phase.ENDING
+    assert np.abs(bench.sent[-1] - before).max() <= 0.5 / RATE_HZ * (1 + 1e-9)
+
+
+def test_asked_to_stop_it_ends_and_asked_again_at_once():
+    bench = Bench(duration_s=60.0)
+    bench.until(Phase.RUN)
+    for _ in range(50):
+        bench.step()
+    bench.step(stop="asked")
+    assert bench.gate.phase is Phase.ENDING
+    bench.step(stop="asked")
+    assert bench.step(stop="asked", at_once=True).command is None
+    assert (bench.gate.phase, bench.gate.outcome.how) == (Phase.DONE, How.STOPPED)
+    assert bench.gate.outcome.why == "asked, twice"
+
+
+def test_asked_to_stop_before_anything_was_sent_nothing_is():
+    bench = Bench(listen_s=1.0)
+    bench.step()
+    assert bench.step(stop="asked").command is None
+    assert (bench.gate.outcome.how, bench.gate.outcome.ended) == (How.STOPPED, "nothing was sent")
+
+
+def test_a_gait_that_says_nonsense_moves_nothing():
+    class Nonsense(Wave):
+        def at(self, time_s):
+            return np.full(COUNT, np.nan) if time_s > 0.1 else np.zeros(COUNT)
+
+    bench = Bench(Nonsense(), duration_s=0.3)
+    remarks = []
+    while bench.gate.phase is not Phase.DONE:
+        remarks += bench.step().remarks
+    assert not np.array(bench.sent).any()
+    said = [text for level, text in remarks if level == "warn"]
+    assert said[0] == "gate: joint01: command is no number; the one before is held"
+    assert len(said) == COUNT  # once a joint
+
+
+def frames_of(*identifiers, way=0):
+    frames = empty_frames(len(identifiers))
+    frames["id_flags"] = identifiers
+    frames["dlc"], frames["dir"] = 8, way
+    return frames
+
+
+def test_who_is_on_the_bus():
+    presence = Presence(ROBOT)
+    assert presence.add(frames_of(0x201, 0x202, 0x300)) is None
+    assert presence.another_robot() is None
+    assert presence.add(frames_of(0x101, way=DIR_TX)) is None  # an echo of our own
+    assert "frame 107 was heard" in presence.add(frames_of(0x201, 0x107)).text
+    assert presence.add(frames_of(ERROR_FLAG | BUS_OFF)).kind is FaultKind.BUS_OFF
+    assert presence.add(frames_of(ERROR_FLAG | 0x80)) is None  # a hit frame is repeated
+    presence.add(frames_of(*[0x14B] * 7))
+    assert "heard 4 are of snake25" in presence.another_robot()
+    # A request and its reply that share an identifier can't be told apart.
+    assert Presence(load_robot("arcsnake-joint")).add(frames_of(0x14B)) is None
+
+
+def test_lateness_is_summed_up_as_numpy_has_it():
+    assert jitter([]) is None
+    late = np.random.default_rng(3).exponential(2e-3, 5000)
+    found = jitter(late.tolist())
+    assert found.median_s == pytest.approx(np.median(late))
+    assert found.p99_s == pytest.approx(np.percentile(late, 99))
+    assert found.worst_s == late.max()
+    assert sum(found.counts) == 5000
+    assert found.counts[3] == ((late > 0.5e-3) & (late <= 1e-3)).sum()
+    assert list(found.to_dict()["counts"])[3] == "<= 1 ms"
