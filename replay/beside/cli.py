@@ -10,6 +10,8 @@ from typing import Any
 
 from capture import Session
 from capture.console import emit_json, progress
+from capture.interruption import interruptible
+from capture.part_file import check_stop
 
 from .. import viewer
 from . import words
@@ -66,19 +68,25 @@ def _write(
     how: Align,
     place: Place,
 ) -> Beside:
-    with ExitStack() as stack, progress("view", total=2 * len(files) + 1) as bar:
+    with (
+        ExitStack() as stack,
+        interruptible() as stop,
+        progress("view", total=2 * len(files) + 1) as bar,
+    ):
         sessions = [stack.enter_context(Session.open(file)) for file in files]
         sides: list[Side] = []
         for k, (session, name) in enumerate(zip(sessions, names, strict=True)):
+            check_stop(path, stop)
             bar.update(k, note=name)
             sides.append(read_side(session, name))
         aligned = align(sides, how)  # before the long part, since it may refuse
         converted: list[Converted] = []
         for k, (session, one) in enumerate(zip(sessions, aligned, strict=True)):
+            check_stop(path, stop)
             bar.update(len(files) + k, note=f"recording {one.side.name}")
             converted.append(Converted(one, *convert(session, folder / f"{k}.rrd")))
         bar.update(2 * len(files), note="side by side")
-        return write_beside(converted, path, how, place)
+        return write_beside(converted, path, how, place, stop)
 
 
 def _report(beside: Beside, how: Align, place: Place, *, json: bool) -> None:

@@ -31,7 +31,7 @@ _WHITE: Color = (236, 236, 240, 255)
 _TINTS: tuple[Color, ...] = (_WHITE, (240, 140, 200, 255), (176, 150, 250, 255))
 _MODES = (FillMode.MajorWireframe, FillMode.DenseWireframe)
 _NAME_RATE_HZ = 25.0
-_LIFT_RADII, _TIER_RADII = 9.0, 5.0
+_LIFT_RADII, _LIFT, _TIER = 5.0, 0.05, 0.08
 _MESH_OPACITY = 90
 
 
@@ -104,7 +104,8 @@ def log_name(
         colors=tint(place), radii=rr.Radius.ui_points(0.5), show_labels=True
     )
     rec.log(entity, look, static=True)
-    lift = (_LIFT_RADII + place * _TIER_RADII) * robot.links[0].radius
+    span = sum(link.length for link in robot.links)
+    lift = _LIFT_RADII * robot.links[0].radius + (_LIFT + _TIER * place) * span
     chosen = decimate(head.t_ns, _NAME_RATE_HZ)
     point = (head.position[chosen] + [0.0, 0.0, lift]).astype(np.float32)
     known = np.isfinite(point).sum(axis=1) == point.shape[1]  # no name where there is no body

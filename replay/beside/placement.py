@@ -3,7 +3,8 @@
 Where a robot's world has its origin is the choice of whoever tracked it, so by default the other
 bodies are laid on the first one: turned about the vertical and moved on the ground, so that at the
 first moment that both sessions share the heads are at one point and the bodies point one way. A
-body's direction is the mean of its links' directions, which doesn't swing with the head.
+body's direction is the mean of its links' over one cycle of its gait, in which what swings to the
+left swings to the right too; without a gait it is that of the moment.
 """
 
 from __future__ import annotations
@@ -16,10 +17,9 @@ import numpy as np
 from capture.arrays import FloatArray, IntArray
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
-from ..motion import HeadPath
 from ..sampling import interpolate
 from ..tracks import resampled
-from .alignment import Align, Aligned, counterparts
+from .alignment import Align, Aligned, counterparts, times_of
 from .side import Side
 
 _LOOK_AT = 1000
@@ -27,6 +27,9 @@ _LOOK_AT = 1000
 
 _ROTATION = 0.99
 """A quaternion shorter than this is none."""
+
+_INSTANTS = 48
+"""Of a cycle, at which a body's direction is taken."""
 
 _SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
 
@@ -79,18 +82,19 @@ def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
     if one is None or other is None:
         return None
     at_ns, known = counterparts(a, b, how, one.t_ns)
-    shared = known & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1])
-    shared &= np.isfinite(_poses(one)).all(axis=1)
-    rows = np.flatnonzero(shared)[:_LOOK_AT]
-    here = _stance(a.side, one, one.t_ns[rows])
-    there = _stance(b.side, other, at_ns[rows])
-    both = np.flatnonzero(np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1))
-    if not both.size:
+    known &= np.isfinite(one.position).all(axis=1)
+    rows = np.flatnonzero(known & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1]))[:_LOOK_AT]
+    there = interpolate(other.t_ns, other.position, at_ns[rows])
+    found = np.flatnonzero(np.isfinite(there).all(axis=1))
+    if not found.size:
         return None
-    (x, y, heading), (own_x, own_y, own_heading) = here[both[0]], there[both[0]]
-    turn = math.remainder(heading - own_heading, 2 * math.pi)
-    turned_x, turned_y, _ = Placement(turn)(np.array([own_x, own_y, 0.0])).tolist()
-    return Placement(turn, float(x - turned_x), float(y - turned_y))
+    first = rows[found[0]]
+    heading, own = _heading(a, int(one.t_ns[first])), _heading(b, int(at_ns[first]))
+    if heading is None or own is None:
+        return None
+    turn = math.remainder(heading - own, 2 * math.pi)
+    step = one.position[first] - Placement(turn)(there[found[0]])
+    return Placement(turn, float(step[0]), float(step[1]))
 
 
 def told_placed(placed: Placement, name: str, first: str) -> str:
@@ -138,22 +142,34 @@ def head_distance(
     return np.asarray(np.hypot(apart[:, 0], apart[:, 1]), dtype=np.float64)
 
 
-def _poses(head: HeadPath) -> FloatArray:
-    return np.concatenate([head.position, head.quaternion], axis=1)
+def _heading(one: Aligned, t_ns: int) -> float | None:
+    """Which way a body points in the cycle after a time [rad]; None where it isn't known."""
+    times, rhythm = np.array([t_ns], dtype=np.int64), one.clock.rhythm
+    if rhythm is not None:
+        cycle = interpolate(rhythm.t_ns, rhythm.cycles, times)
+        ends, known = times_of(rhythm, cycle + 1.0)
+        if known[0]:
+            times = t_ns + np.arange(_INSTANTS) * (int(ends[0]) - t_ns) // _INSTANTS
+    forward = _directions(one.side, times)
+    forward = forward[np.isfinite(forward).all(axis=1)]
+    if not forward.size:
+        return None
+    x, y = forward.sum(axis=0)
+    return math.atan2(y, x)
 
 
-def _stance(side: Side, head: HeadPath, t_ns: IntArray) -> FloatArray:
-    """Where the head is on the ground [m] and which way the body points [rad], shape (n, 3)."""
-    robot = side.robot
-    assert robot is not None  # noqa: S101 - a head is read of a robot
-    pose = interpolate(head.t_ns, _poses(head), t_ns)
-    norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+def _directions(side: Side, t_ns: IntArray) -> FloatArray:
+    """Sum of the links' forward axes on the ground, shape (n, 2); NaN where a pose isn't known."""
+    robot, head = side.robot, side.head
+    assert robot is not None  # noqa: S101 - the caller saw a head
+    assert head is not None  # noqa: S101
+    position = interpolate(head.t_ns, head.position, t_ns)
+    quaternion = interpolate(head.t_ns, head.quaternion, t_ns)
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Between q and -q, which are the same pose, the straight line leaves the rotations.
-    quaternion = np.where(norm > _ROTATION, pose[:, 3:] / norm, np.nan)
-    names = robot.joint_names
+    quaternion = np.where(norm > _ROTATION, quaternion / norm, np.nan)
+    names, known = robot.joint_names, {track.name for track in side.measured}
     angles = resampled(side.measured, names, t_ns, interpolate)
-    known = {track.name for track in side.measured}
     angles[:, [name not in known for name in names]] = 0.0  # as good a guess as any
-    _, rotation = link_poses(robot, pose[:, :3], rotation_from_quaternion(quaternion), angles)
-    forward = rotation[..., 0].mean(axis=1)
-    return np.column_stack([pose[:, :2], np.arctan2(forward[:, 1], forward[:, 0])])
+    _, rotation = link_poses(robot, position, rotation_from_quaternion(quaternion), angles)
+    return rotation[..., :2, 0].sum(axis=1)

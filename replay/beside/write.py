@@ -14,7 +14,8 @@ from rerun.chunk import LazyChunkStream
 from analysis.compare.compare import Choices, compare_seen
 from analysis.compare.side import Seen
 from capture.errors import LogWriteError, UndulogError
-from capture.part_file import part_file
+from capture.interruption import StopRequest
+from capture.part_file import check_stop, part_file
 
 from ..joints import log_angles, log_scalars
 from ..rrd import APPLICATION, Recording, recording_id, require_whole
@@ -82,7 +83,11 @@ class Beside:
 
 
 def write_beside(
-    sessions: Sequence[Converted], path: Path, how: Align, place: Place = Place.START
+    sessions: Sequence[Converted],
+    path: Path,
+    how: Align,
+    place: Place = Place.START,
+    stop: StopRequest | None = None,
 ) -> Beside:
     """Bring converted sessions together.
 
@@ -91,12 +96,13 @@ def write_beside(
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         how: What happens at once.
         place: Where the bodies are drawn.
+        stop: Looked at now and then; once an end is asked for, nothing is written.
 
     Returns:
         What was written.
 
     Raises:
-        LogWriteError: If the file can't be written.
+        LogWriteError: If the file can't be written, or an end was asked for.
     """
     rr.set_strict_mode(True)
     sides = [one.aligned.side for one in sessions]
@@ -104,7 +110,12 @@ def write_beside(
         f"{one.aligned.side.name}: {said}" for one in sessions for said in one.recording.warnings
     ]
     found = {one.aligned.side.name: _compare(sessions[0], one) for one in sessions[1:]}
-    told += [f"{name}: {said}" for name, one in found.items() for said in one.notes]
+    several = len(found) > 1
+    told += [
+        f"{name} (B): {said}" if several else said
+        for name, one in found.items()
+        for said in one.notes
+    ]
     placements = _placements(sessions, how, place, told)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
@@ -119,7 +130,9 @@ def write_beside(
                 raise LogWriteError(path, f"can't be written: {error}") from error
             rec.send_recording_name(", ".join(names))
             rec.send_recording_start_time_nanos(sides[0].start_ns)
+            check_stop(path, stop)
             rec.send_chunks(merged(sessions))
+            check_stop(path, stop)
             shown = _log(rec, sessions, found, placements, how)
             quantities = bars.log_bars(
                 rec, [(one.aligned.side, one.seen) for one in sessions if one.seen is not None]
@@ -139,6 +152,7 @@ def write_beside(
         finally:
             rec.disconnect()
         require_whole(draft, path)
+        check_stop(path, stop)
     return Beside(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
 
 

@@ -2,6 +2,8 @@
 
 import json
 import math
+import signal
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +12,12 @@ import pytest
 import undulog
 from analysis.compare.compare import Choices, compare_sessions
 from capture import Session, SessionWriter, load_robot
+from capture.errors import LogWriteError
+from capture.interruption import StopRequest
+from capture.palette import joint_colors
+from replay.beside.alignment import Align, align
+from replay.beside.side import convert, read_side
+from replay.beside.write import Converted, write_beside
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
@@ -224,16 +232,9 @@ def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     found = beside["time"]
     x, y, z, w = found.static("/twin/world", "Transform3D:quaternion")[0]
     turn = 2 * math.atan2(z, w)
-    # The bodies' directions: the mean of the links', which the joints turn one after the other.
-    lean = {
-        wave: np.angle(
-            np.mean(np.exp(1j * np.cumsum([0, *wave.angle(np.arange(5), wave.cycles(0.0))])))
-        )
-        for wave in (ROBOT, TWIN)
-    }
-    expected = lean[ROBOT] - lean[TWIN] - TWIN.turn
     assert (x, y) == (0.0, 0.0)
-    assert abs(math.remainder(turn - expected, 2 * math.pi)) < 1e-6
+    # In a whole cycle each body bends to either side alike, so its head's axis is its direction.
+    assert abs(math.remainder(turn + TWIN.turn, 2 * math.pi)) < 1e-3
     moved = np.array(found.static("/twin/world", "Transform3D:translation")[0])
     cos, sin = math.cos(turn), math.sin(turn)
     there = TWIN.head(np.zeros(1))[0]
@@ -406,3 +407,58 @@ def test_files_of_one_name_are_told_apart(files, tmp_path, capsys):
     told = json.loads(view(capsys, files[0], files[0], "--save", tmp_path / "x.rrd", "--json"))
     assert [one["name"] for one in told["sessions"]] == ["a 1", "a 2"]
     assert any("same content" in warning for warning in told["warnings"])
+
+
+def test_an_end_that_is_asked_for_leaves_what_was_there(files, tmp_path, capsys):
+    path = tmp_path / "x.rrd"
+    path.write_bytes(b"mine")
+    stop = StopRequest()
+    stop.signal = signal.SIGTERM
+    with ExitStack() as stack:
+        sessions = [stack.enter_context(Session.open(file)) for file in files]
+        aligned = align([read_side(one, one.path.stem) for one in sessions], Align.TIME)
+        converted = [
+            Converted(one, *convert(session, tmp_path / f"{one.side.name}.rrd"))
+            for one, session in zip(aligned, sessions, strict=True)
+        ]
+        with pytest.raises(LogWriteError, match="stopped on request"):
+            write_beside(converted, path, Align.TIME, stop=stop)
+    assert path.read_bytes() == b"mine"
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "x.rrd"]
+
+
+@pytest.fixture(scope="module")
+def window(show, files, tmp_path_factory):
+    """Robot and twin as a user first sees them, after 3 s."""
+    path = tmp_path_factory.mktemp("window") / "pair.rrd"
+    words = ["view", *map(str, files), "--names", "robot,twin", "--save", str(path)]
+    assert undulog.run(words) == 0
+    return show(path, 3.0)
+
+
+@pytest.mark.slow
+def test_no_view_complains_and_those_in_front_show_something(window, rgb):
+    assert window.complaints() == []
+    shown = 0
+    for name in window.views:
+        try:
+            picture = rgb(window.picture(name))
+        except ConnectionError:  # behind a tab
+            continue
+        shown += 1
+        marks = np.abs(picture - np.median(picture, axis=(0, 1))).max(axis=-1) > 60
+        assert marks.sum() > 200, f"the view {name!r} is empty"
+    assert shown == 10  # bodies, words, angles, differences, three bars and three differences
+
+
+@pytest.mark.slow
+def test_both_bodies_and_both_kinds_of_line_are_drawn(window, rgb):
+    bodies = rgb(window.picture("robot solid, twin as wireframe"))
+    red, blue = bodies[..., 0], bodies[..., 2]
+    assert (bodies.min(axis=-1) > 200).sum() > 300  # the wireframe
+    assert ((red > 1.5 * blue) & (red > 90)).sum() + ((blue > 1.3 * red) & (blue > 60)).sum() > 500
+    lines = rgb(window.picture("Head, middle, tail [°]"))
+    legend = lines[:, : lines.shape[1] // 4]
+    for joint in (0, 2, 4):
+        color = np.abs(lines - joint_colors(5)[joint, :3].astype(int)).max(axis=-1) <= 30
+        assert color.sum() - color[:, : legend.shape[1]].sum() > 300
