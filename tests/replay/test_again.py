@@ -171,7 +171,11 @@ def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("--on can:socketcan:can0 -o a.mcap", "undulog drive"),
+        ("--on cam:socketcan:can0 -o a.mcap", "expected twin, twin:SCENARIO or can:"),
+        ("--on can:virtual:x -o a.mcap --set engine=mujoco", "on a bus the world is as it is"),
+        ("--on can:virtual:x --arm", "name the session with -o"),
+        ("--on twin -o a.mcap --arm", "are for a bus"),
+        ("--on twin", "name the session with -o"),
         ("--on twin: -o a.mcap", "names no scenario"),
         ("--on twin:flatt -o a.mcap", "did you mean flat"),
         ("--on twin -o a.json", "name it"),

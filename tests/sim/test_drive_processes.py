@@ -2,6 +2,7 @@
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -77,6 +78,7 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
     path = tmp_path / "recorded.mcap"
     with served("weak-servo-pi3", "--duration", "60") as (on, _), recorded(on, path, alone):
         words = ["drive", "weak-servo-pi3", "--on", on, "--arm", "--duration", "2", "--json"]
+        words += ["-o", str(tmp_path / "driven.mcap")]
         drove = undulog(*words, env=alone)
         assert drove.returncode == 0, drove.stderr
         report = json.loads(drove.stdout)
@@ -109,16 +111,6 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
         assert np.abs(given - meant).max() <= STEP / 2 * (1 + 1e-6)
 
 
-def test_without_a_recorder_it_says_that_the_gait_is_not_recorded(alone):
-    with served("flat", "--lockstep", "--fast", "--duration", "0.2") as (on, robot):
-        drove = undulog("drive", "flat", "--on", on, "--arm", "--duration", "0.2", env=alone)
-        assert drove.returncode == 0
-        assert drove.stderr == "note: no recorder runs and there is no -o: /gait is not recorded\n"
-        assert "21 ticks in lockstep with the robot, 0 left out" in drove.stdout
-        end = json.loads(robot.communicate(timeout=60)[0].splitlines()[-1])
-    assert (end["event"], end["complete"], end["commands"]) == ("end", True, 21 * 25)
-
-
 def test_several_recorders_have_to_be_told_apart(tmp_path, alone):
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     with (
@@ -126,39 +118,76 @@ def test_several_recorders_have_to_be_told_apart(tmp_path, alone):
         recorded(on, first, alone),
         recorded(on, second, alone),
     ):
-        drove = undulog("drive", "flat", "--on", on, "--arm", "--duration", "0.2", env=alone)
+        words = ("drive", "flat", "--on", on, "--arm", "-o", str(tmp_path / "c.mcap"))
+        drove = undulog(*words, "--duration", "0.2", env=alone)
         assert drove.returncode == 2
         assert "2 recorders run; which one is told the gait?" in drove.stderr
         sockets = [line.split()[-1] for line in drove.stderr.splitlines()[1:]]
         chosen = undulog(
-            *("drive", "flat", "--on", on, "--arm", "--duration", "0.2"),
-            *("--recorder", sockets[1], "--json"),
+            *(*words, "--duration", "0.2", "--recorder", sockets[1], "--json"),
             env=alone,
         )
         assert chosen.returncode == 0, chosen.stderr
         assert json.loads(chosen.stdout)["recorder"] == sockets[1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
     path = tmp_path / "a.mcap"
     with served("flat", "--lockstep", "--fast") as (on, _):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
         with process(*words, env=alone) as driving:
-            deadline = time.monotonic() + 60
-            while not (path.exists() and path.stat().st_size > 0):
-                assert driving.poll() is None, driving.stderr.read()
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
-            time.sleep(1.0)
+            under_way(driving, path)
             driving.send_signal(number)
             told, complained = driving.communicate(timeout=60)
-    assert (driving.returncode, complained) == (0, "")
-    assert told.startswith("stopped at rest at ")
+    assert driving.returncode == 1
+    why = {
+        signal.SIGTERM: "asked to stop (SIGTERM)",
+        signal.SIGINT: "asked to stop (Ctrl-C)",
+        signal.SIGHUP: "the console is gone",
+    }[number]
+    assert complained.startswith(f"error: {why}; the joints were brought straight within ")
+    assert told.startswith(f"{on}: stopped at ")
+    assert told.splitlines()[0].endswith(why)
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
         assert (session.verdict, session.warnings) == ("good", [])
     assert not commands[:, -1].any()
+
+
+def under_way(driving, path):
+    """Wait until a drive is in full swing."""
+    deadline = time.monotonic() + 60
+    while not (path.exists() and path.stat().st_size > 0):
+        assert driving.poll() is None, driving.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(1.0)
+
+
+def test_a_terminal_that_goes_ends_the_drive_and_the_session_is_whole(tmp_path, alone):
+    """A real pseudo-terminal: progress is written to it, its other end is closed."""
+    path = tmp_path / "a.mcap"
+    with served("flat", "--lockstep", "--fast") as (on, _):
+        words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
+        screen, terminal = pty.openpty()
+        with subprocess.Popen(
+            [*UNDULOG, *words], stdin=terminal, stdout=terminal, stderr=terminal, env=alone
+        ) as driving:
+            os.close(terminal)
+            deadline = time.monotonic() + 60
+            seen = b""
+            while b"run, " not in seen:
+                assert time.monotonic() < deadline, seen
+                seen += os.read(screen, 65536)
+            os.close(screen)  # no signal: it is no controlling terminal
+            assert driving.wait(60) == 1
+    with Session.open(path) as session:
+        commands = np.array(session.joints("/joint_commands").values)
+        said = [message.msg for _, message in session.messages("/rosout")]
+        assert session.verdict == "good"
+    assert not commands[:, -1].any()
+    assert said[-1].startswith("stopped: the console is gone; the joints were brought straight")
 
 
 def test_a_killed_robot_ends_the_drive_with_its_name(tmp_path, alone):
@@ -166,11 +195,7 @@ def test_a_killed_robot_ends_the_drive_with_its_name(tmp_path, alone):
     with served("flat", "--lockstep", "--fast") as (on, robot):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
         with process(*words, env=alone) as driving:
-            deadline = time.monotonic() + 60
-            while not (path.exists() and path.stat().st_size > 0):
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
-            time.sleep(0.5)
+            under_way(driving, path)
             robot.kill()
             _, complained = driving.communicate(timeout=60)
     assert driving.returncode == 1
