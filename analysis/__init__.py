@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .compare.compare import Choices, compare_sessions
     from .compare.decisions import Margins
     from .compare.result import Comparison
-    from .experiment import analyse_experiment
+    from .experiment.analyse import analyse_experiment
     from .notebook.files import load
     from .notebook.picture import Picture
     from .result import Analysis, Estimate, Index, JointResult
@@ -67,7 +67,7 @@ _HOMES = {
     "Options": "stretch",
     "Picture": "notebook.picture",
     "Reversal": "result_experiment",
-    "analyse_experiment": "experiment",
+    "analyse_experiment": "experiment.analyse",
     "analyse_session": "analyse",
     "compare_sessions": "compare.compare",
     "load": "notebook.files",

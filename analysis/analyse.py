@@ -14,16 +14,17 @@ from capture.environment import base_versions
 from capture.log.signals import Signal
 
 from .artefact_words import warn_flags, within
-from .body_motion import body_motion
+from .body.motion import body_motion
 from .coupling import one_gait_coupling
 from .demodulation_session import response_over_time
-from .energy_cycles import energy_result
+from .energy.cycles import energy_result
+from .energy.ledger import check_ledger
+from .energy.transport import transport
 from .fitting import GaitFit, fit_gait
 from .flags import find_artefacts
 from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
 from .indices import heterogeneity_indices
 from .joints import Energies, Span, joint_energies, joint_results
-from .ledger import check_ledger
 from .oscillators.session import session_couplings
 from .reading import Warn, by_plane, drag_ratio, read_columns, settle_time_s
 from .response import CONFIDENCE, around, t_factor
@@ -39,7 +40,6 @@ from .result_artefact import flags_by_joint
 from .series import Series, clean
 from .spectrum import BINS_PER_SIDE
 from .stretch import Options, choose_stretch
-from .transport import transport
 from .windows import Stretch, whole_cycles
 
 _NS = 1e9

@@ -72,7 +72,7 @@ def analyse(
     def text(width: int, color: bool) -> str:
         if isinstance(result, Analysis):
             return render(result, width=width, color=color)
-        from .experiment_table import render_experiment
+        from .experiment.table import render_experiment
 
         return render_experiment(result, width=width, color=color)
 
@@ -89,7 +89,7 @@ def _one(file: Path, options: Options, null: Path | None) -> Analysis:
         with Session.open(file) as session:
             if null is None:
                 return analyse_session(session, options)
-            from .null_model_check import analyse_with_null
+            from .null_model.check import analyse_with_null
 
             return analyse_with_null(session, null, options)
 
@@ -105,7 +105,7 @@ def experiment_of(files: Sequence[Path], options: Options, verb: str) -> Experim
     Returns:
         The experiment.
     """
-    from .experiment import analyse_experiment
+    from .experiment.analyse import analyse_experiment
 
     with progress(verb, total=len(files)) as bar:
         return analyse_experiment(opened(files, bar), options)

@@ -10,7 +10,7 @@ import numpy as np
 from capture.arrays import FloatArray
 from capture.robot import Robot
 
-from .energy import Energy, integrate, power_of
+from .energy.joint import Energy, integrate, power_of
 from .fitting import GaitFit
 from .reading import Columns, Warn, planes_of
 from .response import gain_estimate, lag_estimate

@@ -12,7 +12,7 @@ from capture.errors import MissingChannelError
 from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
 
-from .null import DRAG_RATIO
+from .body.null import DRAG_RATIO
 
 COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"

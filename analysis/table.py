@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from . import formats
 from .answer import answer
 from .command_line import UNLIMITED
-from .null_model_result import ModelledAnalysis, told_null
+from .null_model.result import ModelledAnalysis, told_null
 from .oscillators.text import chain_detail
 from .result import Analysis, BodyResult, Estimate, Index, JointResult
 from .table_lines import more_lines

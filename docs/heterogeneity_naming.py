@@ -22,8 +22,8 @@ import numpy as np
 from heterogeneity_tables import LEVEL, WAYS
 
 from analysis import analyse_session
-from analysis.reversal import mirror_test
-from analysis.reversal_modules import weak_modules
+from analysis.reversal.mirror import mirror_test
+from analysis.reversal.modules import weak_modules
 from capture import Session
 from sim import Wave, load_scenario, parse_scenario
 from sim.modules import Modules

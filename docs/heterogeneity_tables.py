@@ -14,8 +14,14 @@ import numpy as np
 from scipy.signal import lfilter
 
 from analysis import analyse_session
-from analysis.reversal import family_wise_p, label_scores, labellings, mirror_test, parts
-from analysis.reversal_modules import weak_modules
+from analysis.reversal.mirror import (
+    family_wise_p,
+    label_scores,
+    labellings,
+    mirror_test,
+    parts,
+)
+from analysis.reversal.modules import weak_modules
 from capture import Session
 from sim import load_scenario
 from sim.modules import Modules

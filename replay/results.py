@@ -15,7 +15,7 @@ from analysis.compare.result import Comparison
 from analysis.cycles import cycle_maps
 from analysis.formats import p_value
 from analysis.notebook.files import load
-from analysis.null_model_result import ModelledAnalysis
+from analysis.null_model.result import ModelledAnalysis
 from analysis.result import Analysis
 from analysis.result_experiment import Experiment
 from capture import Session

@@ -10,7 +10,12 @@ import numpy as np
 from capture.errors import DataError
 
 from .. import formats
-from ..experiment_runs import SAME_COMMAND, SAME_FREQUENCY, GaitRun, command_change
+from ..experiment.runs import (
+    SAME_COMMAND,
+    SAME_FREQUENCY,
+    GaitRun,
+    command_change,
+)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from capture.errors import DataError, LogError
 from capture.robot import Robot
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
-from ..body_motion import ODOMETRY_TOPIC, head_poses
+from ..body.motion import ODOMETRY_TOPIC, head_poses
 from ..joints import Span
 from ..reading import Warn
 from ..series import Series

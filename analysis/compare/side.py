@@ -12,7 +12,7 @@ from capture import Session
 from capture.arrays import FloatArray
 
 from ..analyse import Measured, measure_session
-from ..experiment_runs import GaitRun, gait_run
+from ..experiment.runs import GaitRun, gait_run
 from ..reading import Warn
 from ..result import Analysis
 from ..stretch import Options

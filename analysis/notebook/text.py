@@ -10,15 +10,15 @@ from typing import Any
 from ..answer import answer
 from ..compare.result import Comparison
 from ..compare.table import render_comparison
-from ..experiment_answer import told_p
-from ..experiment_table import render_experiment, reversal_detail
+from ..experiment.answer import told_p
+from ..experiment.table import render_experiment, reversal_detail
 from ..formats import plain
-from ..kick_answer import kick_answer, kick_detail
+from ..kicks.answer import kick_answer, kick_detail
 from ..result import Analysis, Coupling
 from ..result_coupling import LocalCoupling
 from ..result_experiment import Experiment, Reversal
 from ..result_sweep import LinearCoupling
-from ..sweep_answer import sweep_answer, sweep_detail
+from ..sweep.answer import sweep_answer, sweep_detail
 from ..table import render
 
 MOST_ROWS = 40

@@ -1,6 +1,6 @@
 """Modes of I - P, the signed Laplacian of what the body couples.
 
-With P = d psi / d psi_c of open-loop kicks (:mod:`analysis.kicks`) and generators that feel their
+With P = d psi / d psi_c of open-loop kicks (:mod:`..kicks.local`) and generators that feel their
 own servos, eps P_ij is the embodied coupling, and deviations of the phases relax as
 
     d phi' = -eps (I - P) d phi,

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 from .. import formats
 from ..answer import answer
-from ..experiment_answer import percent
-from ..experiment_table import by_warning, method, reversal_detail
-from ..kick_answer import kick_checks
+from ..experiment.answer import percent
+from ..experiment.table import by_warning, method, reversal_detail
+from ..kicks.answer import kick_checks
 from ..result import Analysis, Coupling, Estimate, JointResult
 from ..result_coupling import LocalCoupling
 from ..result_experiment import Experiment, Run
 from ..result_sweep import LinearCoupling
-from ..sweep_answer import sweep_checks
+from ..sweep.answer import sweep_checks
 from .drawn import Drawing
 from .entries import Entries, entries_of
 from .matrix import matrix_picture

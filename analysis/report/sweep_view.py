@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ..experiment_answer import percent
+from ..experiment.answer import percent
 from ..result_sweep import LinearCoupling
-from ..sweep_coupling import NONLINEAR
+from ..sweep.coupling import NONLINEAR
 from .tables import Fact
 from .trials import Trial
 from .typeset import digits

@@ -11,7 +11,7 @@ from ..answer import find
 from ..result import Coupling, Estimate, Index
 from ..result_coupling import LocalCoupling, RowCheck
 from ..result_experiment import Experiment, Reversal
-from ..reversal_modules import SIGNIFICANT
+from ..reversal.modules import SIGNIFICANT
 
 LEVEL_NOTE = (
     f"Each test stands by itself at a level of {100 * SIGNIFICANT:g} %; those that look at several "

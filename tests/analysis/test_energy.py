@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.energy import integrate, power_of
+from analysis.energy.joint import integrate, power_of
 from analysis.series import Series, clean, coverage, sample_weights
 from capture.log.signals import Signal
 

@@ -10,8 +10,8 @@ import pytest
 
 import undulog
 from analysis import analyse_experiment
-from analysis.experiment_runs import mirror_fault
-from analysis.experiment_table import render_experiment
+from analysis.experiment.runs import mirror_fault
+from analysis.experiment.table import render_experiment
 from capture import Session, SessionWriter, load_robot
 from capture.errors import UsageError
 from capture.robot import Plane

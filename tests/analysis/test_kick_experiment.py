@@ -8,7 +8,7 @@ import pytest
 
 import undulog
 from analysis import analyse_experiment
-from analysis.experiment_table import render_experiment
+from analysis.experiment.table import render_experiment
 from analysis.result_coupling import LocalCoupling
 from capture import Session, SessionWriter
 

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.kick_runs import Kick, Kind, deviation_of, kick_of, missing_kicks, sort_kicks
-from analysis.kick_validity import predict, valid_to
-from analysis.kicks import (
+from analysis.kicks.local import (
     Answers,
     Measured,
     answers_of,
@@ -13,7 +11,16 @@ from analysis.kicks import (
     nonlinearity,
     row_sums,
 )
-from analysis.lti_reading import lti_reading
+from analysis.kicks.lti_reading import lti_reading
+from analysis.kicks.runs import (
+    Kick,
+    Kind,
+    deviation_of,
+    kick_of,
+    missing_kicks,
+    sort_kicks,
+)
+from analysis.kicks.validity import predict, valid_to
 from capture.errors import UsageError
 
 NAMES = ("head", "neck", "waist", "hip", "tail")

@@ -4,14 +4,19 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from analysis.body import observed, perfect_tracking, place_links, track
-from analysis.null import (
+from analysis.body.null import (
     SAMPLES,
     Chain,
     free_chain,
     one_cycle,
     places,
     viscous_chain,
+)
+from analysis.body.places import (
+    observed,
+    perfect_tracking,
+    place_links,
+    track,
 )
 from analysis.series import Series
 from capture import load_robot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from analysis.null_model import null_test
+from analysis.null_model.deviation import null_test
 from analysis.response import Response
 from capture.errors import DataError
 from capture.null_model import NullModel, SharedParameter

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.kick_runs import Kind, missing_kicks, sort_kicks
+from analysis.kicks.runs import Kind, missing_kicks, sort_kicks
 from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane
 

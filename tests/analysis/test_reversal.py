@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, nct, ttest_ind
 from scipy.stats import t as t_distribution
 
-from analysis.reversal import labellings, mirror_test
-from analysis.reversal_modules import reversal_of, weak_modules
-from analysis.reversal_shares import variance_shares
+from analysis.reversal.mirror import labellings, mirror_test
+from analysis.reversal.modules import reversal_of, weak_modules
+from analysis.reversal.shares import variance_shares
 from capture.errors import UsageError
 
 

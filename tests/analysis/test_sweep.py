@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from analysis.series import Series
-from analysis.sweep import (
+from analysis.sweep.chain import (
     Phasors,
     impedance,
     impedance_behind_servos,
     servo_side,
     transfer,
 )
-from analysis.sweep_runs import CommandTones, find_sweep
-from analysis.tone_finder import common_step, find_tones
-from analysis.tones import fit_tones
+from analysis.sweep.runs import CommandTones, find_sweep
+from analysis.sweep.tone_finder import common_step, find_tones
+from analysis.sweep.tones import fit_tones
 from capture.robot import Servo
 
 LINEAR = dataclasses.replace(Servo(), coulomb_friction=0.0)

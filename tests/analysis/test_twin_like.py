@@ -7,7 +7,12 @@ import pytest
 
 import undulog
 from analysis.analyse import analyse_session
-from analysis.null import SAMPLES, one_cycle, places, viscous_chain
+from analysis.body.null import (
+    SAMPLES,
+    one_cycle,
+    places,
+    viscous_chain,
+)
 from analysis.stretch import Options
 from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane

@@ -1,0 +1,103 @@
+"""Energy of each joint, four ways, on the samples' own times.
+
+E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
+can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
+times motor current, signed and clipped. Gaps are not bridged: the weights of
+:func:`analysis.series.sample_weights` count no time inside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import FloatArray, IntArray
+from capture.log.signals import Signal
+
+from ..cycle_sums import Weighed, cycle_sums, weigh
+from ..series import Series, clean
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energies of one power signal, cycle by cycle.
+
+    Attributes:
+        net_j: Integral of the power in each cycle [J], shape (c,).
+        plus_j: Of its positive part [J], shape (c,).
+        coverage: Fraction of the window that has samples.
+        covered: Fraction of each cycle that has samples, shape (c,).
+    """
+
+    net_j: FloatArray
+    plus_j: FloatArray
+    coverage: float
+    covered: FloatArray
+
+    @property
+    def abs_j(self) -> FloatArray:
+        """Integral of the absolute power in each cycle, 2 plus - net [J], shape (c,)."""
+        return 2 * self.plus_j - self.net_j
+
+
+def integrate(
+    powers: Sequence[Series], start_s: float, stop_s: float, cycles: int = 1
+) -> list[Energy | None]:
+    """Integrate powers over one window; those with the same times are weighed once.
+
+    Args:
+        powers: Powers [W], each on its own times.
+        start_s: Start of the window [s].
+        stop_s: Its end, not included [s].
+        cycles: Parts of equal length that the window is cut into.
+
+    Returns:
+        The energies of each, or None where the window has no samples of it.
+    """
+    found: list[Energy | None] = []
+    last: Weighed | None = None
+    for power in powers:
+        part = power.between(start_s, stop_s)
+        if part.count < 2 or stop_s <= start_s:
+            found.append(None)
+            continue
+        if last is None or not np.array_equal(last.t_s, part.t_s):
+            last = weigh(part.t_s, start_s, stop_s, cycles)
+        work = last.weights * part.values
+        net = cycle_sums(work, last.starts)
+        plus = cycle_sums(np.maximum(work, 0.0, out=work), last.starts)
+        found.append(Energy(net, plus, last.coverage, last.covered))
+    return found
+
+
+def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
+    """Product of two signals as a power on the first one's times.
+
+    Args:
+        first: E.g. torque, or current.
+        second: E.g. velocity, or voltage; interpolated where it was sampled at other times, but
+            not across its gaps.
+        origin_ns: Unix time that becomes 0 s.
+
+    Returns:
+        The power [W].
+    """
+    if np.array_equal(first.t_ns, second.t_ns):
+        factor = second.values
+    else:
+        factor = _interpolate(first.t_ns, second)
+    return clean(first.name, first.t_ns, first.values * factor, origin_ns)
+
+
+def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
+    known = clean(signal.name, signal.t_ns, signal.values, int(t_ns[0]) if t_ns.size else 0)
+    if known.count < 2:
+        return np.full(t_ns.size, np.nan)
+    t_s = (t_ns - t_ns[0]).astype(np.float64) * 1e-9
+    values = known.at(t_s)
+    values[(t_s < known.t_s[0]) | (t_s > known.t_s[-1])] = np.nan
+    for k in known.gaps:
+        values[(t_s > known.t_s[k]) & (t_s < known.t_s[k + 1])] = np.nan
+    return values

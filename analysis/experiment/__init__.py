@@ -1,0 +1,1 @@
+"""Several sessions as runs of one experiment: what they are, and one answer from all."""

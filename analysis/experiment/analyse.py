@@ -1,0 +1,255 @@
+"""Several sessions of one experiment in, one answer out."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from capture import Session
+from capture.environment import base_versions
+from capture.errors import UsageError
+from capture.robot import Robot
+
+from ..analyse import Examined, examine_session
+from ..coupling import one_gait_coupling
+from ..equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
+from ..kicks.answer import kick_answer
+from ..kicks.coupling import ROW_TOLERANCE, kick_coupling
+from ..kicks.experiment import find_kicks
+from ..kicks.runs import MOST_KICK, MOST_PATTERN, SAME
+from ..oscillators.body import body_oscillators
+from ..reading import Warn
+from ..response import CONFIDENCE
+from ..result import Analysis, Provenance
+from ..result_coupling import LocalCoupling
+from ..result_experiment import Experiment, Reversal, Run
+from ..reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
+from ..reversal.modules import SIGNIFICANT, reversal_of
+from ..reversal.shares import RESAMPLES
+from ..stretch import Options
+from ..sweep.answer import sweep_answer
+from ..sweep.coupling import NONLINEAR, sweep_coupling
+from ..sweep.runs import (
+    MOST_CONDITION,
+    CommandTones,
+    Sweep,
+    command_tones,
+    find_sweep,
+)
+from .answer import experiment_answer
+from .indices import experiment_indices
+from .runs import (
+    SAME_COMMAND,
+    SAME_FREQUENCY,
+    GaitRun,
+    Role,
+    gait_run,
+    mirror_fault,
+    responses,
+    sort_runs,
+)
+
+_LOW_FLOOR = 0.01
+"""A p-value that can't go below this leaves little room under the level."""
+
+
+def analyse_experiment(sessions: Iterable[Session], options: Options | None = None) -> Experiment:
+    """Compute what several sessions tell together.
+
+    Args:
+        sessions: Open sessions, each used once and in turn, so they may be opened one by one.
+        options: What the user chose, for each of them.
+
+    Returns:
+        The result. What can't be computed is None, and a warning says why.
+
+    Raises:
+        MissingChannelError: If a session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If there is no session, or the options leave nothing of one.
+    """
+    options = options or Options()
+    examined: list[Examined] = []
+    robots: list[Robot | None] = []
+    commanded: list[CommandTones | None] = []
+    for session in sessions:
+        examined.append(examine_session(session, options))
+        robots.append(session.robot)
+        commanded.append(command_tones(session, options, examined[-1]))
+    if not examined:
+        raise UsageError("an experiment needs at least one session")
+    warnings: list[str] = []
+    runs = [
+        gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait)
+        for one, robot in zip(examined, robots, strict=True)
+    ]
+    kicks = find_kicks(runs, [one.gait for one in examined])
+    sweep = find_sweep(commanded) if kicks is None else None
+    if sweep is not None:
+        return _of_sweep(sweep, commanded, examined, runs, options)
+    parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
+    rest = [k for k, part in enumerate(parts) if part in (None, "base")]
+    own_roles, own_why = sort_runs([runs[k] for k in rest])
+    roles = {rest[k]: role for k, role in own_roles.items()}
+    why = {rest[k]: reason for k, reason in own_why.items()}
+    # Kicks around one gait are asked about its coupling; the reversal only if it is there, too.
+    only_kicks = kicks is not None and len(set(roles.values())) < 2
+    if only_kicks:
+        why = {k: reason for k, reason in why.items() if parts[k] is None}
+    told = {k: part for k, part in enumerate(parts) if part is not None}
+    told |= {} if only_kicks else {k: role.value for k, role in roles.items()}
+    for k, reason in why.items():
+        warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
+    chosen = [runs[k] for k in roles]
+    names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
+    ways = list(roles.values())
+    forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
+    robot = robots[next(iter(roles))] if roles else None
+    reversal = None
+    if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
+        reversal = reversal_of(names, forward, reverse)
+        _warn_floor(reversal, warnings.append)
+    coupling = (
+        one_gait_coupling(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
+    )
+    return Experiment(
+        answer=kick_answer(coupling) if only_kicks else experiment_answer(reversal, roles),
+        sessions=tuple(one.analysis for one in examined),
+        runs=tuple(
+            _run(one.analysis, run, told.get(k), why.get(k))
+            for k, (one, run) in enumerate(zip(examined, runs, strict=True))
+        ),
+        heterogeneity=experiment_indices(forward, reverse, reversal),
+        reversal=reversal,
+        coupling=coupling,
+        warnings=tuple(warnings),
+        provenance=_provenance([one.analysis for one in examined], options),
+        oscillators=body_oscillators(coupling) if isinstance(coupling, LocalCoupling) else None,
+    )
+
+
+def _of_sweep(
+    sweep: Sweep,
+    commanded: Sequence[CommandTones | None],
+    examined: Sequence[Examined],
+    runs: Sequence[GaitRun],
+    options: Options,
+) -> Experiment:
+    """The experiment of a lag sweep or a multisine: its gaits are no repeats of each other."""
+    analyses = [one.analysis for one in examined]
+    warnings = [
+        f"{run.label} is no run of the sweep; it is left out"
+        for k, run in enumerate(runs)
+        if k not in sweep.index
+    ]
+    paths = [Path(one.session.path) for one in analyses]
+    coupling = sweep_coupling(sweep, commanded, paths, options, warnings.append)
+    none = np.zeros((0, 0), dtype=np.complex128)
+    return Experiment(
+        answer=sweep_answer(coupling),
+        sessions=tuple(analyses),
+        runs=tuple(
+            _run(one, run, *(("sweep", None) if k in sweep.index else (None, "is no run of it")))
+            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
+        ),
+        heterogeneity=experiment_indices(none, none, None),
+        reversal=None,
+        coupling=coupling,
+        warnings=tuple(warnings),
+        provenance=_provenance(analyses, options),
+    )
+
+
+def _runs(count: int) -> str:
+    return f"{count} independent run{'' if count == 1 else 's'}"
+
+
+def _both_ways(
+    runs: Sequence[GaitRun],
+    ways: Sequence[Role],
+    names: Sequence[str],
+    robot: Robot | None,
+    warn: Warn,
+) -> bool:
+    """Whether the reversal test can be made; warns why not, and of what it takes on trust."""
+    counts = {role: sum(way is role for way in ways) for role in Role}
+    if not any(counts.values()):
+        warn("no run with a travelling wave: the reversal test can't be made")
+        return False
+    if min(counts.values()) < MIN_RUNS:
+        warn(
+            f"boundary or module: not separable from {_runs(counts[Role.FORWARD])} with "
+            f"the wave from head to tail and {counts[Role.REVERSE]} from tail to head; record at "
+            "least 6 of each"
+        )
+        return False
+    fault = mirror_fault(robot, runs[0].names)
+    if fault is not None:
+        warn(f"the robot is not its own mirror image, so a profile need not mirror: {fault}")
+        return False
+    if len(names) < 2:
+        warn("fewer than two joints have gain and lag in every run: nothing can be mirrored")
+        return False
+    if len(names) < len(runs[0].names):
+        lost = [name for name in runs[0].names if name not in names]
+        warn(f"without gain and lag at it or its mirror joint in every run: {', '.join(lost)}")
+    if robot is None:
+        warn("no robot description: the log's order of joints is taken as a chain, head to tail")
+    starts = {
+        role: [run.start_ns for run, way in zip(runs, ways, strict=True) if way is role]
+        for role in Role
+    }
+    first, second = sorted(starts.values(), key=min)
+    if max(first) < min(second):
+        warn(
+            "all runs one way come before all runs the other way: warming up looks like a "
+            "difference of direction; let them alternate"
+        )
+    return True
+
+
+def _warn_floor(reversal: Reversal, warn: Warn) -> None:
+    if reversal.p_floor <= _LOW_FLOOR:
+        return
+    never = ", so no difference can be shown" if reversal.p_floor >= SIGNIFICANT else ""
+    warn(
+        f"p can't go below {reversal.p_floor:.2g} with {reversal.forward_runs} + "
+        f"{reversal.reverse_runs} runs{never}; record at least 6 of each"
+    )
+
+
+def _run(one: Analysis, run: GaitRun, role: str | None, why: str | None) -> Run:
+    return Run(one.session.id, one.session.path, run.wave, role, why if role is None else None)
+
+
+def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
+    paths = [one.session.path for one in analyses]
+    return Provenance(
+        command=shlex.join(["undulog", "analyse", *paths, *options.arguments()]),
+        versions=base_versions(),
+        inputs={
+            path: one.provenance.inputs[path] for path, one in zip(paths, analyses, strict=True)
+        },
+        options={
+            **asdict(options),
+            "confidence": CONFIDENCE,
+            "level": SIGNIFICANT,
+            "same_command": SAME_COMMAND,
+            "same_frequency": SAME_FREQUENCY,
+            "most_labellings": MOST_LABELLINGS,
+            "random_labellings": RANDOM_LABELLINGS,
+            "bootstrap_resamples": RESAMPLES,
+            "same_kick": SAME,
+            "most_kick": MOST_KICK,
+            "most_pattern": MOST_PATTERN,
+            "row_tolerance": ROW_TOLERANCE,
+            "most_condition": MOST_CONDITION,
+            "nonlinear": NONLINEAR,
+            "margin_gain": EQUIVALENT_GAIN,
+            "margin_lag_rad": EQUIVALENT_LAG_RAD,
+        },
+    )

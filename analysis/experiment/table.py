@@ -1,0 +1,218 @@
+"""An experiment as text for a terminal: the answer first, then mirror pairs and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .. import formats
+from ..command_line import UNLIMITED
+from ..kicks.answer import kick_detail
+from ..oscillators.text import body_detail
+from ..result import Estimate
+from ..result_coupling import LocalCoupling
+from ..result_experiment import Experiment, Reversal
+from ..result_sweep import LinearCoupling
+from ..reversal.modules import SIGNIFICANT
+from ..sweep.answer import sweep_detail, sweep_method
+from ..table import put, sheet
+from .answer import percent, told_p
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+_MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
+"""How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
+
+
+def render_experiment(
+    experiment: Experiment, *, width: int = UNLIMITED, color: bool = False
+) -> str:
+    """Set an experiment as text.
+
+    Args:
+        experiment: The result.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        Several lines, the last one ended.
+    """
+    text, prose, wide = sheet(width, color=color)
+    count = len(experiment.sessions)
+    prose.print(
+        f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.",
+        style="bold",
+        markup=False,
+    )
+    reversal = experiment.reversal
+    if reversal is not None:
+        for line in reversal_detail(reversal):
+            prose.print(line, markup=False)
+        prose.print()
+        put(prose, wide, _joint_table(reversal), [("its mirror",)])
+    if isinstance(experiment.coupling, LocalCoupling):
+        for line in kick_detail(experiment.coupling):
+            prose.print(line, markup=False)
+    if experiment.oscillators is not None:
+        for line in body_detail(experiment.oscillators):
+            prose.print(line, markup=False)
+    if isinstance(experiment.coupling, LinearCoupling):
+        for line in sweep_detail(experiment.coupling):
+            prose.print(line, markup=False)
+    prose.print()
+    put(prose, wide, _run_table(experiment), [("wave",), ("Hz",)])
+    prose.print()
+    for warning in experiment.warnings:
+        prose.print(f"Warning: {warning}", markup=False)
+    for warning, names in by_warning(experiment):
+        prose.print(f"Warning: {warning} ({names})", markup=False)
+    coupling = experiment.coupling
+    if not coupling.identifiable:
+        record = f" To identify it, record {coupling.record}." if coupling.record else ""
+        prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
+    prose.print(f"Method: {method(experiment)}", style="dim", markup=False)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+
+
+def reversal_detail(reversal: Reversal) -> Iterable[str]:
+    """What stands below the answer.
+
+    Args:
+        reversal: The test.
+
+    Yields:
+        Sentences.
+    """
+    for weak in reversal.weak:
+        yield (
+            f"{weak.name} against its mirror {weak.mirror}, over both directions: "
+            f"{_gain(weak.log_gain_contrast)} in gain, {_lag(weak.lag_contrast_rad)} in lag "
+            f"({told_p(weak.p)}, named by {weak.by})."
+        )
+    shares = (reversal.module_share, reversal.boundary_share)
+    if shares[0].value is not None:
+        yield (
+            f"Spread over the joints: modules {percent(shares[0])}, boundary {percent(shares[1])}."
+        )
+    if max(reversal.equivalence_gain_p, reversal.equivalence_lag_p) < SIGNIFICANT:
+        yield "Shown to be alike: every mirror pair within 2 % and 1°."
+    yield f"The test is {reversal.blind}."
+
+
+def _gain(log_gain: Estimate) -> str:
+    return formats.estimate(formats.relative(log_gain), " %", most=2)
+
+
+def _lag(lag_rad: Estimate) -> str:
+    return formats.estimate(formats.degrees(lag_rad), "°", most=2)
+
+
+def _joint_table(reversal: Reversal) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("joint", "its mirror"):
+        table.add_column(name, no_wrap=True)
+    for name in ("gain % (95 %)", "lag° (95 %)", "p"):
+        table.add_column(name, justify="right", no_wrap=True)
+    gains = [formats.relative(one.log_gain_difference) for one in reversal.joints]
+    lags = [formats.degrees(one.lag_difference_rad) for one in reversal.joints]
+    digits = [formats.decimals_for(column, most=3) for column in (gains, lags)]
+    for one, *pair in zip(reversal.joints, gains, lags, strict=True):
+        cells = [
+            f"{formats.number(q.value, d)} {formats.interval(q.ci95, d)}".rstrip()
+            for q, d in zip(pair, digits, strict=True)
+        ]
+        table.add_row(escape(one.name), escape(one.mirror), *cells, formats.p_value(one.p))
+    return table
+
+
+def _run_table(experiment: Experiment) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("session", "wave"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("Hz", justify="right", no_wrap=True)
+    table.add_column("role", no_wrap=True)
+    for run, session in zip(experiment.runs, experiment.sessions, strict=True):
+        table.add_row(
+            escape(formats.plain(Path(run.path).name)),
+            run.wave or formats.MISSING,
+            formats.number(session.gait.frequency_hz.value, 3),
+            run.role or "left out",
+        )
+    return table
+
+
+def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
+    """The sessions' own warnings, each once; what the experiment itself answers is left out.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Warning, and the names of the files that have it, or ``all sessions``.
+    """
+    expected = ["boundary or module:"]
+    if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
+        expected += _MANY_TONES
+    said: dict[str, list[str]] = {}
+    for session in experiment.sessions:
+        for warning in session.warnings:
+            if not warning.startswith(tuple(expected)):
+                said.setdefault(warning, []).append(Path(session.session.path).name)
+    everyone = len(experiment.sessions)
+    return [
+        (warning, "all sessions" if len(names) == everyone else ", ".join(names))
+        for warning, names in said.items()
+    ]
+
+
+def method(experiment: Experiment) -> str:
+    """How the numbers of an experiment were made.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        One sentence, beginning in lower case.
+    """
+    coupling = experiment.coupling
+    if isinstance(coupling, LocalCoupling):
+        return _kick_method(coupling)
+    if isinstance(coupling, LinearCoupling):
+        return sweep_method(coupling)
+    return _reversal_method(experiment.reversal)
+
+
+def _kick_method(coupling: LocalCoupling) -> str:
+    return (
+        f"local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
+        "kick: central differences of each joint's phase and log amplitude, intervals one by one "
+        "at 95 % from the responses' noise (Student's t), those of indices at least 95 %; all four "
+        "matrices with --json."
+    )
+
+
+def _reversal_method(reversal: Reversal | None) -> str:
+    if reversal is None:
+        return "each session by itself as undulog analyse gives it; nothing is pooled."
+    tried = (
+        f"all {reversal.labellings}"
+        if reversal.labellings_tried == reversal.labellings
+        else f"{reversal.labellings_tried} random ones of {reversal.labellings}"
+    )
+    return (
+        f"reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
+        "with the wave from head to tail minus its mirror joint with the wave from tail to head; "
+        f"largest studentised difference T = {formats.number(reversal.statistic, 2)}, its null by "
+        f"dealing out the runs' labels anew ({tried}; p can't go below "
+        f"{formats.number(reversal.p_floor, 4)}), family-wise over joints, gain and lag; intervals "
+        "hold together at 95 %, those of shares by bootstrap over runs."
+    )

@@ -1,0 +1,1 @@
+"""Coupling around one gait, from kicks of single joints."""

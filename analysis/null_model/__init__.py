@@ -1,0 +1,1 @@
+"""One direction recorded, held to a model of identical modules."""

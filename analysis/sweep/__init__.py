@@ -1,0 +1,1 @@
+"""Linear coupling of a chain without contact, from lag sweeps and multisines."""
