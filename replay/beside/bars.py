@@ -2,7 +2,8 @@
 
 The first session's bars are wide, the others' narrow, all in their joints' colours and at the
 joints' places along their own bodies. Differences are those of ``undulog compare``, with the
-intervals that hold together. A whisker in each bar reaches to the far end of its 95 % interval.
+intervals that hold together. A whisker reaches to the far end of a bar's 95 % interval; where it
+would end with its bar, it only added its light to the bar's colour, so there is none.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ DIFFERENCES = "/segments"
 
 _WIDE, _NARROW = 0.5, 0.26
 _ALL = _WIDE + _NARROW
-_WHISKER = 0.25  # of the bar
+_WHISKER = 0.25  # of the bar's width
+_SEEN = 0.02
+"""A whisker is drawn if it ends further from its bar's end than this share of the bar."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,7 @@ def _log(rec: rr.RecordingStream, entity: str, side: Side, joint: str, bar: _Bar
     color = side.palette.get(joint, GREY)
     drawn = rr.BarChart([bar.height], abscissa=[place + bar.left], widths=[bar.width], color=color)
     rec.log(f"{entity}/estimate/{name}", drawn, static=True)
-    if bar.far is not None:
+    if bar.far is not None and abs(bar.far - bar.height) > _SEEN * abs(bar.height):
         width = _WHISKER * bar.width
         left = place + bar.left + (bar.width - width) / 2
         thin = rr.BarChart([bar.far], abscissa=[left], widths=[width], color=GREY)
