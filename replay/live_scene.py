@@ -21,6 +21,8 @@ from .blueprint import build_blueprint
 from .colors import power_limit
 from .content import Content, Signal, Start
 from .facts import log_facts
+from .live_bars import CycleBars
+from .live_cycles import CycleMeter
 from .live_decode import Batch, LiveLog
 from .live_plot import LivePlot
 from .live_window import Fresh, Window
@@ -60,6 +62,7 @@ class LiveScene:
         self._commanded = LivePlot(joints.COMMANDED, degrees=True)
         self._errors = LivePlot(joints.ERROR, degrees=True)
         self._joint_power = LivePlot(power.MECHANICAL)
+        self._meter, self._bars = CycleMeter(epoch_ns), CycleBars()
         self._signals: dict[str, LivePlot] = {}
         self._of_joints: dict[str, bool] = {}
         self._places: joints.Places | None = None
@@ -88,7 +91,8 @@ class LiveScene:
             errors=self._errors.series,
             has_power=self._has_power,
             joint_power=self._joint_power.series,
-            charts=(),
+            charts=self._bars.charts,
+            cycles=self._bars.cycles,
             modes=min(self._modes, 2),  # one or several: more lay out nothing anew
             has_events=self._has_events,
             signals=tuple(
@@ -121,6 +125,8 @@ class LiveScene:
         self._draw_signals(batch, palette)
         self._draw_words(batch)
         self._draw_body(palette)
+        for cycle in self._meter.add(batch, self._log.robot):
+            self._bars.write(self._rec, self._clock, cycle, palette)
         self._lay_out(dropped)
 
     def finish(self, dropped: int = 0) -> None:
@@ -364,4 +370,6 @@ def _shape(content: Content) -> tuple[object, ...]:
         content.modes,
         content.has_events,
         content.signals,
+        content.charts,
+        content.cycles,
     )

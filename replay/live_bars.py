@@ -1,0 +1,104 @@
+"""The last cycle of each joint as bars, and all cycles as steps, while they are recorded.
+
+The entities are the replay's; here a bar is the newest cycle, and a joint of which the cycle tells
+nothing has none. Power takes the place of the net energy: its mean over the cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+from rerun.components import InterpolationMode
+
+from .cycles import CYCLES, GAIN, LAG, Quantity
+from .heat_maps import POWER
+from .joints import Color, Series
+from .live_cycles import Cycle
+from .live_plot import LivePlot
+from .response import SEGMENTS, Chart
+from .timeline import SESSION_TIME, Clock
+from .tracks import Track
+
+_WIDTH = 0.8
+_STEPS = rr.SeriesLines.from_fields(interpolation_mode=InterpolationMode.StepAfter)
+
+
+class CycleBars:
+    """Bars and steps of gain, lag and power."""
+
+    def __init__(self) -> None:
+        """Nothing has been drawn."""
+        self._plots: dict[Quantity, LivePlot] = {}
+        self._drawn: set[str] = set()
+
+    @property
+    def charts(self) -> tuple[Chart, ...]:
+        """The bar charts that have been written to."""
+        return tuple(
+            Chart(quantity.key, f"{quantity.name}, last cycle [{quantity.unit}]", ())
+            for quantity in (GAIN, LAG, POWER)
+            if quantity in self._plots
+        )
+
+    @property
+    def cycles(self) -> tuple[tuple[Quantity, tuple[Series, ...]], ...]:
+        """The quantities whose steps have been written, each with where."""
+        return tuple(
+            (quantity, self._plots[quantity].series)
+            for quantity in (GAIN, LAG, POWER)
+            if quantity in self._plots
+        )
+
+    def write(
+        self, rec: rr.RecordingStream, clock: Clock, cycle: Cycle, palette: Mapping[str, Color]
+    ) -> None:
+        """Draw a cycle, at the time at which it started.
+
+        Args:
+            rec: The recording.
+            clock: Its timelines.
+            cycle: The cycle.
+            palette: Colour by joint name, head to tail.
+        """
+        since = np.timedelta64(cycle.start_ns - clock.start_ns, "ns")
+        t_ns = np.array([cycle.start_ns], dtype=np.int64)
+        rec.set_time(SESSION_TIME, duration=since)
+        for quantity, values in (
+            (GAIN, 100.0 * (cycle.gain - 1.0)),
+            (LAG, np.degrees(cycle.lag_rad)),
+            (POWER, 1e3 * cycle.power_w),
+        ):
+            if quantity not in self._plots:
+                if not np.isfinite(values).any():
+                    continue
+                self._plots[quantity] = LivePlot(f"{CYCLES}/{quantity.key}")
+            tracks = [Track(name, t_ns, values[i : i + 1]) for i, name in enumerate(cycle.names)]
+            self._write_bars(rec, quantity, tracks, palette)
+            plot = self._plots[quantity]
+            plot.write(rec, clock, tracks, palette)
+            for one in plot.series:
+                rec.log(one.entity, _STEPS, static=True)
+        rec.reset_time()
+
+    def _write_bars(
+        self,
+        rec: rr.RecordingStream,
+        quantity: Quantity,
+        tracks: Sequence[Track],
+        palette: Mapping[str, Color],
+    ) -> None:
+        place = {name: i + 1 for i, name in enumerate(palette)}
+        for track in tracks:
+            part = rr.escape_entity_path_part(track.name)
+            entity = f"{SEGMENTS}/{quantity.key}/estimate/{part}"
+            if np.isfinite(track.values).all():
+                left = place[track.name] - _WIDTH / 2
+                color = palette[track.name]
+                bar = rr.BarChart(track.values, abscissa=[left], widths=[_WIDTH], color=color)
+                rec.log(entity, bar)
+                self._drawn.add(entity)
+            elif entity in self._drawn:
+                rec.log(entity, rr.Clear(recursive=False))
+                self._drawn.discard(entity)
