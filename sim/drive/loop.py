@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 from capture.arrays import FloatArray
 from capture.bus.encoding import BusEncoder, BusValue
-from capture.errors import SourceError
+from capture.errors import SourceError, UndulogError
 from capture.interruption import StopRequest
 from capture.log.frames import FrameArray, empty_frames
 from capture.robot import Direction, Quantity, Robot
 
-from ..gate.faults import GateFault
+from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate, GateStep, Heard, Phase
 from ..gate.presence import Presence
 from ..scenario import CONTROL_RATE_HZ
@@ -121,6 +121,9 @@ class ControlLoop:
     ) -> None:
         """Run until the gate is done; a bus that is lost after the first command is its fault.
 
+        A gait that fails, or a session that can't be written, ends the drive as a fault does, and
+        what it raised is raised again when the robot is at rest.
+
         Args:
             stop: Looked at in each tick.
             on_tick: Told of each tick after the commands are sent.
@@ -129,8 +132,11 @@ class ControlLoop:
         Raises:
             SourceError: If the bus is lost, or the robot isn't there, before anything was sent.
             UsageError: If another robot is there.
+            LogWriteError: If the session can't be written.
+            Exception: What the gait raised.
         """
         gone = False
+        unwritten: UndulogError | None = None
         while self._gate.phase is not Phase.DONE:
             try:
                 tick, received = self._pace.next()
@@ -146,7 +152,16 @@ class ControlLoop:
                 self._gate.lost(str(error))
                 return
             self.tally.loop_s, self.tally.overruns = tick / CONTROL_RATE_HZ, self._pace.overruns
-            on_tick(BusTick(tick, step, received, sent))
+            if unwritten is None:
+                try:
+                    on_tick(BusTick(tick, step, received, sent))
+                except UndulogError as error:
+                    if not self.tally.sent:
+                        raise
+                    unwritten = error
+                    self._gate.report(GateFault(FaultKind.LOG, str(error)))
+        if failed := unwritten or self._gate.gait_error:
+            raise failed
 
     def _hear(self, tick: int, received: Sequence[FrameArray]) -> Heard:
         time_s, trouble = tick / CONTROL_RATE_HZ, None

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from capture.bus.decoding import identifier_text
 from capture.daemon.clock import SessionClock
-from capture.errors import UndulogError, UsageError
+from capture.errors import LogWriteError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import FrameArray
 from capture.robot import Robot
@@ -194,8 +194,10 @@ def drive_bus(
             loop.run(stop, tell.tick, console)
             report = _report(gate, loop.tally, lockstep=lockstep)
             tell.end(report)
-        except UndulogError as error:
-            tell.failed(str(error))
+        except LogWriteError:
+            raise  # there is nobody to tell
+        except Exception as error:
+            tell.failed(str(error) or type(error).__name__)
             raise
         report.wall_s = time.monotonic() - begun
         report.first_frames = tell.first_frames

@@ -18,6 +18,8 @@ class FaultKind(StrEnum):
     BUS_OFF = "bus-off"
     STRANGER = "stranger"
     BUS = "bus"
+    GAIT = "gait"
+    LOG = "log"
 
 
 MUTE = frozenset({FaultKind.BUS_OFF, FaultKind.BUS, FaultKind.STRANGER})

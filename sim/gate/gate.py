@@ -124,6 +124,8 @@ class Gate:
         self.phase = Phase.POSE
         self.outcome: Outcome | None = None
         """How it ended; None until it has."""
+        self.gait_error: Exception | None = None
+        """What the gait raised, if it did; to be raised when the robot is at rest."""
         self.run_from: int | None = None
         """The tick at which the gait began; None before."""
         self.run_ticks = 0
@@ -138,6 +140,7 @@ class Gate:
         self._clamp: Clamp | None = None
         self._way: Ramp | Ending | None = None
         self._progress_s = 0.0
+        self._reported: GateFault | None = None
         self._said: set[str] = set()
         self._remarks: list[Remark] = []
 
@@ -177,13 +180,21 @@ class Gate:
         self._heed(tick, heard, clamp, stop, at_once=at_once)
         if self.phase is Phase.DONE:
             return self._quiet()
-        wanted, gait = self._wanted(tick, heard)
+        wanted, gait = self._wanted(tick, heard, clamp)
         pulled = self._yielding.apply(wanted, heard.status.angle, heard.status.current)
         given = clamp.apply(pulled)
         self._tell_changes(given)
         phase = self.phase
         self._end_in_time()
         return GateStep(phase, given.command, wanted, gait, tuple(self._remarks))
+
+    def report(self, fault: GateFault) -> None:
+        """Something beside the robot went wrong: the next step begins the ending.
+
+        Args:
+            fault: What it was.
+        """
+        self._reported = fault
 
     def lost(self, why: str) -> None:
         """The bus can't be used any more: nothing more is sent.
@@ -251,7 +262,7 @@ class Gate:
 
     # -- what is wanted --------------------------------------------------------------------
 
-    def _wanted(self, tick: int, heard: Heard) -> tuple[FloatArray, GaitTick | None]:
+    def _wanted(self, tick: int, heard: Heard, clamp: Clamp) -> tuple[FloatArray, GaitTick | None]:
         """What the phase wants to be commanded."""
         if self.phase is Phase.APPROACH and self._way is not None:
             self._progress_s += 1.0 / self._rate_hz  # also where it is late: no jump
@@ -265,7 +276,13 @@ class Gate:
         self.run_s = run_tick / self._rate_hz
         self.run_ticks += 1
         said, self._first = self._first, None
-        said = said or self._gait.step(self.run_s, heard.readings)
+        try:
+            said = said or self._gait.step(self.run_s, heard.readings)
+        except Exception as error:  # noqa: BLE001 (whatever it is, the joints come to rest)
+            self.gait_error = error
+            text = f"the gait failed: {type(error).__name__}: {error}"
+            self.report(GateFault(FaultKind.GAIT, text))
+            return clamp.last, None
         return said.command, said
 
     def _end_in_time(self) -> None:
@@ -296,8 +313,8 @@ class Gate:
             self._end(clamp, heard.status)
 
     def _trouble(self, tick: int, heard: Heard, clamp: Clamp) -> GateFault | None:
-        if heard.trouble is not None:
-            return heard.trouble
+        if heard.trouble is not None or self._reported is not None:
+            return heard.trouble or self._reported
         if heard.late_s > self._limits.late_s:
             text = (
                 f"a control tick was {heard.late_s:.2g} s late, more than {self._limits.late_s:g} s"

@@ -15,7 +15,7 @@ import pytest
 import undulog as front
 from capture import Session, SessionWriter, load_robot
 from capture.bus.encoding import BusEncoder
-from capture.errors import SourceError, UsageError
+from capture.errors import LogWriteError, SourceError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import DIR_TX
 from capture.robot import Direction, OnFault, Quantity
@@ -238,6 +238,31 @@ def test_asked_twice_nothing_more_is_sent(tmp_path):
     assert report.tally.sent == 25 * 26
     assert report.outcome.how is How.STOPPED
     assert report.outcome.ended.startswith("nothing more was sent")
+
+
+def test_a_session_that_can_not_be_written_brings_the_robot_to_rest_first(tmp_path):
+    path = tmp_path / "a.mcap"
+
+    def full(tick):
+        if tick.tick == 40:
+            raise LogWriteError(path, "no space left on device")
+
+    with alive(weak(9.0)) as (on, _):
+        port = int(on.rpartition("=")[2])
+        listener = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0")
+        plan = planned("weak-servo-pi3", on, path, duration_s=9.0)
+        with listener:
+            with pytest.raises(LogWriteError, match="no space left"):
+                drive_bus(plan, stop=StopRequest(), on_tick=full)
+            heard = {}
+            while (message := listener.recv(0.2)) is not None:
+                if 0x101 <= message.arbitration_id <= 0x119:
+                    heard.setdefault(message.arbitration_id, []).append(bytes(message.data))
+    raw = np.array([[int.from_bytes(d, "little", signed=True) for d in v] for v in heard.values()])
+    assert raw.shape[0] == 25
+    assert raw.shape[1] > 41 + 20
+    assert np.abs(raw[:, 40]).max() > 0
+    assert not raw[:, -1].any()
 
 
 def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):

@@ -271,6 +271,29 @@ def test_a_gait_that_says_nonsense_moves_nothing():
     assert len(said) == COUNT  # once a joint
 
 
+@pytest.mark.parametrize("from_the_gait", [True, False])
+def test_a_gait_that_fails_and_a_log_that_can_not_be_written_end_as_a_fault_does(from_the_gait):
+    class Failing(Wave):
+        def step(self, time_s, readings):
+            if from_the_gait and time_s > 0.5:
+                raise ZeroDivisionError("no range")
+            return super().step(time_s, readings)
+
+    bench = Bench(Failing(), duration_s=60.0)
+    bench.until(Phase.RUN)
+    if not from_the_gait:
+        bench.gate.report(GateFault(FaultKind.LOG, "the disk is full"))
+    bench.until(Phase.DONE)
+    np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
+    assert np.abs(np.diff(np.array(bench.sent), axis=0)).max() <= 4.0 / RATE_HZ
+    outcome = bench.gate.outcome
+    if from_the_gait:
+        assert isinstance(bench.gate.gait_error, ZeroDivisionError)
+        assert outcome.why == "the gait failed: ZeroDivisionError: no range"
+    else:
+        assert (outcome.how, outcome.why) == (How.FAULT, "the disk is full")
+
+
 def frames_of(*identifiers, way=0):
     frames = empty_frames(len(identifiers))
     frames["id_flags"] = identifiers
