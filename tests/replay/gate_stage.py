@@ -1,0 +1,362 @@
+"""What the tests of the armed gate share: a small robot, its process, a listener, and the checks.
+
+Robot, listener and controller are processes of their own. What was on the bus is judged by what the
+listener wrote, with python-can and cantools; sessions are read by the ``mcap`` package itself.
+"""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from capture import SessionWriter, load_robot
+
+UNDULOG = (sys.executable, "-m", "undulog")
+LISTENER = Path(__file__).with_name("bus_listener.py")
+RATE_HZ = 100
+STEP = math.radians(0.01)  # of a command on the bus
+JOINTS = ("joint01", "joint02", "joint03", "joint04")
+LIMIT, MAX_RATE, RAMP_RATE = math.radians(30.0), 4.0, 0.5
+EPOCH_NS = 1_735_689_600_000_000_000
+WAIT_S = 90
+FRAME = np.dtype(
+    [
+        *(("t_device_ns", "<u8"), ("t_host_ns", "<u8"), ("id_flags", "<u4")),
+        *(("dlc", "u1"), ("dir", "u1"), ("pad", "V2"), ("data", "u1", (8,))),
+    ]
+)
+
+SAFETY = {
+    "max_rate": MAX_RATE,
+    "ramp_rate": RAMP_RATE,
+    "max_tracking_error": 0.3,
+    "max_current": 1.4,
+    "max_temperature": 70.0,
+    "reply_timeout_s": 1.0,  # a busy machine must not look like a robot that is lost
+    "max_late_s": 1.5,
+    "fault_after_s": 0.5,
+    "on_fault": '"ramp-down"',
+}
+
+ROBOT = """
+name = "snake4"
+description = "Four joints of snake25, two a plane."
+clock = "device"
+joints = [
+  { name = "joint01", plane = "horizontal" },
+  { name = "joint02", plane = "vertical" },
+  { name = "joint03", plane = "horizontal" },
+  { name = "joint04", plane = "vertical" },
+]
+
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+
+[defaults.joint]
+lower = -0.5235987755982988
+upper = 0.5235987755982988
+
+[bus]
+databases = ["snake25.dbc"]
+bitrate = 1000000
+"""
+SIGNALS = (
+    ("command", "position", "tx", "command", "deg"),
+    ("state", "position", "rx", "position", "deg"),
+    ("state", "velocity", "rx", "velocity", "deg/s"),
+    ("state", "torque", "rx", "effort", "mN m"),
+    ("state", "current", "rx", "current", "mA"),
+)
+SCENARIO = """
+description = "Four joints on flat ground."
+robot = "{robot}"
+duration_s = 600.0
+[gait.horizontal]
+amplitude = 0.1
+frequency_hz = 0.5
+lag = 1.0
+"""
+
+
+def robot_files(folder, *, safety=SAFETY):
+    """Write the small robot and a scenario for it; returns (robot file, scenario file)."""
+    folder.mkdir(exist_ok=True)
+    (folder / "snake25.dbc").write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
+    text = ROBOT
+    for message, name, direction, quantity, unit in SIGNALS:
+        text += (
+            f'[[bus.signals]]\nmessage = "{{joint}}_{message}"\nsignal = "{name}"\n'
+            f'direction = "{direction}"\ntarget = "{{joint}}"\nquantity = "{quantity}"\n'
+            f'unit = "{unit}"\n'
+        )
+    if safety:
+        text += "[safety]\n" + "".join(f"{key} = {value}\n" for key, value in safety.items())
+    robot, scenario = folder / "snake4.toml", folder / "short.toml"
+    robot.write_text(text)
+    scenario.write_text(SCENARIO.format(robot=robot.name))
+    return robot, scenario
+
+
+def wave(times_s):
+    """What is recorded: four sines that do not begin at zero [rad], shape (n, 4)."""
+    turns = 0.25 * times_s[:, None] + np.array([0.2, 0.0, 0.6, 0.35])
+    return np.array([0.3, 0.15, 0.45, 0.1]) * np.sin(2 * np.pi * turns)
+
+
+def write_commands(path, robot, duration_s, *, names=JOINTS, commands=wave):
+    """A session of commands for a robot (its file, or none)."""
+    times_s = np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
+    given = commands(times_s)
+    with SessionWriter(
+        path,
+        session_id="recorded-before",
+        epoch_ns=EPOCH_NS,
+        robot=load_robot(robot) if robot is not None else None,
+        clock={"computer": "host"},
+    ) as writer:
+        channel = writer.joint_state("/joint_commands", names, unit="rad")
+        for time_s, row in zip(times_s, given, strict=True):
+            channel.write(EPOCH_NS + round(1e9 * time_s), row[: len(names)])
+        writer.set_verdict("good")
+    return path
+
+
+def undulog(*words, **options):
+    """Run a command to its end."""
+    return subprocess.run(
+        [*UNDULOG, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        **options,
+    )
+
+
+def until(condition, what, *, alive=()):
+    """Wait for a condition; the processes that must live meanwhile are told of if they don't."""
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        for one in alive:
+            assert one.poll() is None, (what, one.communicate())
+        assert time.monotonic() < deadline, what
+        time.sleep(0.01)
+
+
+@contextmanager
+def process(*words, **options):
+    """A process that is ended with the block."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    running = subprocess.Popen([str(word) for word in words], **pipes)
+    try:
+        yield running
+    finally:
+        if running.poll() is None:
+            running.send_signal(signal.SIGCONT)  # a stopped one would not end
+            running.terminate()
+        try:
+            running.communicate(timeout=20)
+        except subprocess.TimeoutExpired:
+            running.kill()
+            running.communicate(timeout=20)
+
+
+class Stage:
+    """A virtual robot and a listener on its bus.
+
+    Attributes:
+        on: Address of the bus.
+        port: Its port.
+        robot: The robot's process.
+    """
+
+    def __init__(self, robot, listener, on, port, heard):
+        self.robot, self.on, self.port = robot, on, port
+        self._listener, self._heard = listener, heard
+
+    @property
+    def lines(self):
+        """Everything that was heard by now."""
+        text = self._heard.read_text() if self._heard.exists() else ""
+        return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+
+    @property
+    def command_lines(self):
+        """The commands among it."""
+        return [one for one in self.lines if (one["name"] or "").endswith("_command")]
+
+    def words(self, session, output, *more):
+        """The command line of the controller, armed."""
+        return (*UNDULOG, "replay", session, "--on", self.on, "--arm", "-o", output, *more)
+
+    def replay(self, session, output, *more, **options):
+        """The controller, armed, as a process."""
+        return process(*self.words(session, output, *more), **options)
+
+    def wait_for_commands(self, controller, count=150):
+        """Until so many ticks were commanded."""
+        until(
+            lambda: len(self.command_lines) >= count * len(JOINTS),
+            "no commands on the bus",
+            alive=[controller],
+        )
+
+    def settle(self, quiet_s=1.0):
+        """Wait for a while in which something could still be sent; ends the listener."""
+        time.sleep(quiet_s)
+        self._listener.send_signal(signal.SIGTERM)
+        self._listener.wait(timeout=20)
+
+
+@contextmanager
+def staged(folder, scenario, *faults):
+    """A virtual robot with faults to come, and a listener on its bus.
+
+    Times of faults are after the robot's first tick.
+    """
+    ordered = [word for fault in faults for word in ("--fault", fault)]
+    database, heard = folder / "listened.dbc", folder / "heard.jsonl"
+    database.write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
+    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", "0", "--json", *ordered)
+    with process(*serve) as robot:
+        line = robot.stdout.readline()
+        assert line, robot.stderr.read()
+        ready = json.loads(line)
+        words = (sys.executable, LISTENER, ready["port"], ready["bus"], database, heard)
+        with process(*words) as listener:
+            assert listener.stdout.readline() == "listening\n", listener.stderr.read()
+            on = f"can:socketcand:{ready['bus']}?host=127.0.0.1&port={ready['port']}"
+            yield Stage(robot, listener, on, ready["port"], heard)
+
+
+# -- what was on the bus ------------------------------------------------------------------------
+
+
+def commands_of(lines):
+    """Each joint's commands: name to (monotonic times [s], angles [rad])."""
+    found = {}
+    for one in lines:
+        if (one["name"] or "").endswith("_command"):
+            name = one["name"].removesuffix("_command")
+            angle = math.radians(one["signals"]["position"])
+            found.setdefault(name, []).append((one["t_s"], angle))
+    return {name: tuple(np.array(rows).T) for name, rows in found.items()}
+
+
+def check_limits(lines, *, limit=LIMIT, max_rate=MAX_RATE, period_s=1 / RATE_HZ):
+    """No command beyond a limit, no step beyond the rate's: but for the bus's rounding.
+
+    A step is that from one command of a joint to its next, and may be as long as the rate allows
+    in one control period, however long it really took. The first command is a step from straight
+    joints, where the robot stands.
+    """
+    found = commands_of(lines)
+    assert found
+    for name, (_, angle) in found.items():
+        assert np.abs(angle).max() <= limit + STEP / 2, name
+        step = np.abs(np.diff(angle, prepend=0.0))
+        assert step.max() <= max_rate * period_s + STEP * (1 + 1e-6), (name, step.max())
+
+
+# -- the session of it --------------------------------------------------------------------------
+
+
+class Written:
+    """A session, read by the mcap package's own reader and decoder.
+
+    Attributes:
+        commands: ``/joint_commands``, a row a tick: (log time [s], joint to angle [rad]).
+        said: ``/rosout``: (log time [s], level, text).
+        sent: Raw command frames, in order: (identifier, data as hexadecimal).
+        metadata: All records, by name.
+    """
+
+    def __init__(self, path):
+        self.commands, self.said, self.sent = [], [], []
+        with path.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            self.metadata = {one.name: one.metadata for one in reader.iter_metadata()}
+            for _, channel, record, message in reader.iter_decoded_messages():
+                at_s = record.log_time * 1e-9
+                if channel.topic == "/joint_commands":
+                    row = zip(message.name, message.position, strict=True)
+                    self.commands.append((at_s, dict(row)))
+                elif channel.topic == "/rosout":
+                    self.said.append((at_s, message.level, message.msg))
+                elif channel.topic == "/can/can0":
+                    frames = np.frombuffer(bytes(message.data), FRAME)
+                    self.sent += [
+                        (int(one["id_flags"]), one["data"][: one["dlc"]].tobytes().hex())
+                        for one in frames
+                        if one["dir"]
+                    ]
+
+    def time_of(self, words):
+        """When the first event with these words was written [s]."""
+        found = [at_s for at_s, _, text in self.said if words in text]
+        assert found, (words, self.said)
+        return found[0]
+
+    def after(self, words):
+        """Commands from that event on, each joint's in a row: joint to angles [rad]."""
+        since_s = self.time_of(words)
+        rows = [row for at_s, row in self.commands if at_s >= since_s - 1e-9]
+        names = self.commands[0][1]
+        return {name: np.array([row[name] for row in rows]) for name in names}
+
+
+def check_session(path, lines):
+    """The session is whole, and its commands are those on the bus; returns what is written."""
+    written = Written(path)
+    heard = commands_of(lines)
+    for name, (_, angle) in heard.items():
+        given = np.array([row[name] for _, row in written.commands])
+        assert len(given) == len(angle), name
+        assert np.abs(given - angle).max(initial=0.0) <= STEP / 2 * (1 + 1e-6), name
+    on_bus = [(one["id"], one["data"]) for one in lines if (one["name"] or "").endswith("_command")]
+    assert written.sent == on_bus  # bit by bit, and so nothing came after the end
+    check_pace(np.array([at_s for at_s, _ in written.commands]))
+    return written
+
+
+def check_pace(times_s, late_s=0.02):
+    """Never more commands than deadlines have passed: what was late is not made up in a burst."""
+    ahead = np.arange(len(times_s)) / RATE_HZ - times_s
+    least = np.minimum.accumulate(ahead)
+    assert (ahead - least).max(initial=0.0) <= 1 / RATE_HZ + late_s
+
+
+def check_ramp_down(written, since, *, ramp_rate=RAMP_RATE, yields=()):
+    """From an event on: straight joints within a bound, no faster than the ramp allows.
+
+    A joint that yields to its current has no effort left to come straight: it ends where it is.
+    """
+    ending = written.after(since)
+    for name, angle in ending.items():
+        left = abs(angle[0]) + math.radians(2.0) if name in yields else STEP / 2
+        assert abs(angle[-1]) <= left, name
+        # 3 x^2 - 2 x^3 has a peak rate of 1.5; then the pose is told for a while.
+        assert len(angle) <= RATE_HZ * (1.5 * LIMIT / ramp_rate + 0.5), name
+        steps = np.abs(np.diff(angle))
+        # At first a joint that is away from its command is taken from where it is.
+        settled = steps[math.ceil(RATE_HZ * 2 * LIMIT / MAX_RATE) :]
+        assert settled.max(initial=0.0) <= ramp_rate / RATE_HZ + 1e-9, name
+
+
+def check_hold(written, since):
+    """From an event on: the pose of then, and soon nothing any more."""
+    ending = written.after(since)
+    for name, angle in ending.items():
+        assert len(angle) <= 0.5 * RATE_HZ, name
+        assert np.ptp(angle) <= 1e-9, name

@@ -1,0 +1,319 @@
+"""Ten faults to order: whatever goes wrong, no command beyond a limit, a safe end, and the truth.
+
+Robot, controller and listener are three processes. What was on the bus is judged by the listener,
+which has nothing of undulog: python-can's socketcand and cantools.
+"""
+
+import json
+import os
+import pty
+import re
+import runpy
+import signal
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+stage = runpy.run_path(str(Path(__file__).with_name("gate_stage.py")))
+staged, Written = stage["staged"], stage["Written"]
+SAFETY = stage["SAFETY"]
+FAULT_AT_S = 6.0  # of the robot's time: the controller has been at it for a while by then
+LONG_S = 60.0
+ERROR = 40  # of rcl_interfaces/msg/Log
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Robot file and scenario."""
+    return stage["robot_files"](tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="module")
+def session(small, tmp_path_factory):
+    """A minute of commands."""
+    path = tmp_path_factory.mktemp("session") / "wave.mcap"
+    return stage["write_commands"](path, small[0], LONG_S)
+
+
+def ended(on_stage, controller, path, *, code=1):
+    """Wait for the end, and look at all of it: (what the controller told, the new session)."""
+    out, err = controller.communicate(timeout=60)
+    assert controller.returncode == code, (out, err)
+    on_stage.settle()
+    lines = on_stage.lines
+    stage["check_limits"](lines)
+    return out, err, stage["check_session"](path, lines)
+
+
+def errors(written):
+    return [text for _, level, text in written.said if level >= ERROR]
+
+
+def check_told(written, reason):
+    """The fault is told when it is found and at the end, and no other one is."""
+    found, end = errors(written)
+    assert found.startswith(f"fault: {reason}")
+    assert end.startswith(f"fault: {reason}")
+    assert written.metadata["undulog.health"]["verdict"] == "bad"
+    assert json.loads(written.metadata["undulog.health"]["reasons"])[0].startswith(reason)
+
+
+# -- what the robot and its bus do --------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with (
+        staged(tmp_path, small[1], f"stuck:joint03@{FAULT_AT_S}") as on_stage,
+        on_stage.replay(session, path) as controller,
+    ):
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith("error: joint03: tracking error 0.")
+    assert "rad, more than 0.3 rad for 0.5 s; the joints were brought straight within " in err
+    check_told(written, "joint03: tracking error 0.")
+    stage["check_ramp_down"](written, "fault: ")
+
+
+@pytest.mark.slow
+def test_lost_replies_end_it_and_name_the_joint(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with (
+        staged(tmp_path, small[1], f"lost:joint02:1@{FAULT_AT_S}") as on_stage,
+        on_stage.replay(session, path) as controller,
+    ):
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith("error: joint02 is lost: no angle for more than 1 s; the joints were bro")
+    check_told(written, "joint02 is lost: no angle for more than 1 s")
+    stage["check_ramp_down"](written, "fault: ")
+
+
+@pytest.mark.slow
+def test_the_robots_file_can_say_that_joints_are_held(session, tmp_path):
+    path = tmp_path / "a.mcap"
+    robot, scenario = stage["robot_files"](
+        tmp_path / "holds", safety=SAFETY | {"on_fault": '"hold"'}
+    )
+    holding = stage["write_commands"](tmp_path / "holding.mcap", robot, LONG_S)
+    with (
+        staged(tmp_path, scenario, f"lost:1@{FAULT_AT_S}") as on_stage,
+        on_stage.replay(holding, path) as controller,
+    ):
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith(
+        "error: the robot is lost: no angle for more than 1 s; the joints were he"
+    )
+    stage["check_hold"](written, "fault: ")
+
+
+@pytest.mark.slow
+def test_after_bus_off_nothing_more_is_sent(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with (
+        staged(tmp_path, small[1], f"bus-off@{FAULT_AT_S}+2") as on_stage,
+        on_stage.replay(session, path) as controller,
+    ):
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith("error: bus-off: ")
+    assert "nothing more was sent" in err
+    check_told(written, "bus-off: ")
+    after = written.after("fault: ")
+    assert all(len(angle) == 0 for angle in after.values())
+
+
+@pytest.mark.slow
+def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with (
+        staged(tmp_path, small[1], f"over-current:joint02:1.5@{FAULT_AT_S}") as on_stage,
+        on_stage.replay(session, path) as controller,
+    ):
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith("error: joint02: current 1.5 A, more than 1.4 A for 0.")
+    check_told(written, "joint02: current 1.5 A")
+    yields = "gate: joint02: draws more than 1.4 A: its command gives way"
+    assert written.time_of(yields) < written.time_of("fault: ")
+    stage["check_ramp_down"](written, "fault: ", yields=["joint02"])
+
+
+@pytest.mark.slow
+def test_a_process_that_comes_late_does_not_jump(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
+        on_stage.wait_for_commands(controller)
+        controller.send_signal(signal.SIGSTOP)
+        time.sleep(2.2)
+        controller.send_signal(signal.SIGCONT)
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith("error: a control tick was 2.")
+    assert "s late, more than 1.5 s; the joints were brought straight within " in err
+    check_told(written, "a control tick was 2.")
+    stage["check_ramp_down"](written, "fault: ")
+
+
+# -- what is refused ----------------------------------------------------------------------------
+
+
+def test_what_does_not_fit_is_refused_and_nothing_is_sent(small, session, tmp_path):
+    robot, scenario = small
+    bare, _ = stage["robot_files"](tmp_path / "bare", safety=None)
+    write = stage["write_commands"]
+    sessions = {}
+    sessions["limits"] = write(tmp_path / "limits.mcap", bare, 1.0)
+    joints = ("joint01", "joint02", "joint03", "wheel")
+    sessions["foreign"] = write(tmp_path / "foreign.mcap", robot, 1.0, names=joints)
+    sessions["fewer"] = write(tmp_path / "fewer.mcap", robot, 1.0, names=joints[:3])
+    many = [f"joint{k + 1:02d}" for k in range(25)]
+    sessions["robot"] = write(
+        tmp_path / "robot.mcap",
+        "snake25",
+        1.0,
+        names=many,
+        commands=lambda t: np.full((len(t), 25), 0.1),
+    )
+    said = {}
+    with staged(tmp_path, scenario) as on_stage, ExitStack() as running:
+        started = {
+            name: running.enter_context(on_stage.replay(chosen, tmp_path / f"{name}-out.mcap"))
+            for name, chosen in sessions.items()
+        }
+        for name, controller in started.items():
+            _, said[name] = controller.communicate(timeout=60)
+            assert controller.returncode == 2, (name, said)
+            assert not (tmp_path / f"{name}-out.mcap").exists(), name
+        on_stage.settle()
+        assert on_stage.lines  # the robot spoke all the while
+        assert not on_stage.command_lines
+    assert said["limits"].startswith(
+        "error: snake4 can't be armed: its description lacks max_rate, ramp_rate, "
+        "max_tracking_error, reply_timeout_s, max_late_s, max_current in [safety]"
+    )
+    assert "\n[safety]\nmax_rate = " in said["limits"]
+    assert "joint01, joint02, joint03, wheel" in said["foreign"]
+    assert "joint01, joint02, joint03, joint04" in said["foreign"]
+    assert "it commands 3 joints: joint01, joint02, joint03\n" in said["fewer"]
+    assert "snake4 has 4: joint01, joint02, joint03, joint04" in said["fewer"]
+    assert " is snake4, and robot.mcap is for snake25; nothing was sent" in said["robot"]
+
+
+@pytest.mark.slow
+def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(
+    small, session, tmp_path
+):
+    folder = tmp_path / "moved"
+    _, scenario = stage["robot_files"](folder)
+    database = folder / "snake25.dbc"
+    moved = re.sub(  # messages and the names of their values, to other identifiers
+        r"^((?:BO|VAL)_ )(\d+)",
+        lambda found: f"{found[1]}{int(found[2]) + 1024}",
+        database.read_text(),
+        flags=re.MULTILINE,
+    )
+    database.write_text(moved)
+    path = tmp_path / "a.mcap"
+    with staged(tmp_path, scenario) as on_stage:
+        on_stage.on += "&plain=yes"
+        with on_stage.replay(session, path) as controller:
+            _, err = controller.communicate(timeout=60)
+        on_stage.settle()
+        lines = on_stage.lines
+    assert controller.returncode == 2, err
+    assert "nothing was sent: another robot is on this bus" in err
+    assert "0 are of snake4; others have the identifiers 601" in err
+    assert {one["id"] for one in lines} == {1537, 1538, 1539, 1540}  # the robot's own states
+
+
+# -- who is in charge goes ----------------------------------------------------------------------
+
+
+def test_ctrl_c_brings_the_joints_down(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
+        on_stage.wait_for_commands(controller, 60)
+        controller.send_signal(signal.SIGINT)
+        _, err, written = ended(on_stage, controller, path)
+    assert err.startswith("error: asked to stop (Ctrl-C); the joints were brought straight within ")
+    assert not errors(written)
+    stage["check_ramp_down"](written, "gate: ending, asked to stop (Ctrl-C)")
+
+
+@pytest.mark.slow
+def test_a_second_ctrl_c_ends_it_at_once(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
+        on_stage.wait_for_commands(controller)
+        controller.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+        controller.send_signal(signal.SIGINT)
+        _, err, written = ended(on_stage, controller, path)
+    assert "asked to stop (Ctrl-C)" in err
+    assert "nothing more was sent; the servos hold their last commands" in err
+    ending = written.after("gate: ending")
+    assert all(len(angle) <= 60 for angle in ending.values())  # the way down takes more
+    assert all(not len(angle) for angle in written.after("nothing is sent any more").values())
+
+
+IN_A_TERMINAL = """
+import fcntl, os, signal, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+if sys.argv[1] == "nohup":
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["hangup", "nohup"])
+def test_a_console_that_goes_brings_the_joints_down(kind, small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    master, slave = pty.openpty()
+    with staged(tmp_path, small[1]) as on_stage:
+        words = (sys.executable, "-c", IN_A_TERMINAL, kind, *on_stage.words(session, path))
+        streams = {"stdin": slave, "stdout": slave, "stderr": slave, "start_new_session": True}
+        with stage["process"](*words, **streams) as controller:
+            os.close(slave)
+            on_stage.wait_for_commands(controller, 60)
+            shown = os.read(master, 1 << 16).decode()
+            os.close(master)
+            _, _, written = ended(on_stage, controller, path)
+    assert "wave.mcap" in shown  # a progress bar was on it
+    stage["check_ramp_down"](written, "gate: ending, the console is gone")
+    assert not errors(written)
+
+
+@pytest.mark.slow
+def test_a_robot_that_is_gone_leaves_a_whole_session(small, session, tmp_path):
+    path = tmp_path / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
+        on_stage.wait_for_commands(controller)
+        on_stage.robot.kill()
+        _, err = controller.communicate(timeout=60)
+        on_stage.settle()
+        lines = on_stage.lines
+    assert controller.returncode == 1
+    assert err.startswith(f"error: {on_stage.on}: the robot ")
+    stage["check_limits"](lines)
+    written = Written(path)
+    assert written.metadata["undulog.health"]["verdict"] == "bad"
+    assert len(written.commands) >= 150
+
+
+# -- what is well -------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plain", [False, True])
+def test_without_a_fault_it_runs_to_its_end(plain, small, tmp_path):
+    path = tmp_path / "a.mcap"
+    short = stage["write_commands"](tmp_path / "short.mcap", small[0], 3.0)
+    with staged(tmp_path, small[1]) as on_stage:
+        if plain:  # python-can's own socketcand: the robot isn't asked who it is
+            on_stage.on += "&plain=yes"
+        with on_stage.replay(short, path) as controller:
+            _, err, written = ended(on_stage, controller, path, code=0)
+    assert "error" not in err
+    assert not errors(written)
