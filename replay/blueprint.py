@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from .content import Content
 from .mean_cycle import ENSEMBLE_CYCLE
-from .tabs import Tab
+from .single import Tab
 from .timeline import SESSION_TIME
 from .views import Views, build_views
 

@@ -15,7 +15,7 @@ from capture.errors import UsageError
 
 from .beside.options import BesideOptions
 from .clip_cli import ClipOptions, view_clip
-from .tabs import Tab
+from .single import SingleOptions
 
 if TYPE_CHECKING:
     from .rrd import Recording
@@ -27,8 +27,7 @@ def view(
     save: Path | None = None,
     web: bool = False,
     connect: str | None = None,
-    result: list[Path] | None = None,
-    tab: Tab = "session",
+    single: Annotated[SingleOptions | None, Parameter(name="*")] = None,
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
     beside: Annotated[BesideOptions | None, Parameter(name="*")] = None,
@@ -58,10 +57,7 @@ def view(
         web: Serve the viewer to a browser on this machine (127.0.0.1 only) until interrupted.
         connect: With `--live`: send to a Rerun viewer that runs already, by its address, e.g.
             `rerun+http://127.0.0.1:9876/proxy`.
-        result: Show what was found before instead of analysing now: `.json` of `undulog analyse`.
-            Results of an experiment or a comparison that the session is part of mark the modules
-            they name. May be given several times.
-        tab: The tab in front; the mean cycle's plays at once.
+        single: How one session is shown.
         clip: Write a moving picture of the body to this `.gif` or `.mp4` file instead of opening
             the viewer; it is drawn off screen.
         shot: How the clip is filmed.
@@ -73,8 +69,8 @@ def view(
     _check_usage(files, live, save=save, web=web, connect=connect, clip=clip, json=json)
     if beside is not None and len(files) < 2:
         raise UsageError(f"{', '.join(beside.given)}: needs two sessions or more, side by side")
-    if (result or tab != "session") and (len(files) != 1 or clip is not None):
-        raise UsageError("--result and --tab are of one session; give one file, without --clip")
+    if single is not None and (len(files) != 1 or clip is not None):
+        raise UsageError(f"{', '.join(single.given)}: needs one session, and no --clip")
     if shot is not None and clip is None:
         raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
     if clip is not None:
@@ -89,7 +85,7 @@ def view(
 
         view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1:
-        _view_file(files[0], result or [], tab, save=save, web=web, json=json)
+        _view_file(files[0], single or SingleOptions(), save=save, web=web, json=json)
     else:
         from .beside.cli import view_beside
 
@@ -123,10 +119,10 @@ def _check_usage(
 
 
 def _view_file(
-    file: Path, results: Sequence[Path], tab: Tab, *, save: Path | None, web: bool, json: bool
+    file: Path, single: SingleOptions, *, save: Path | None, web: bool, json: bool
 ) -> None:
     if save is not None:
-        recording, duration_s = _convert(file, save, results, tab)
+        recording, duration_s = _convert(file, save, single)
         _report(recording, duration_s, json=json)
         return
 
@@ -135,7 +131,7 @@ def _view_file(
     if not web:
         viewer.require_display()
     with tempfile.TemporaryDirectory(prefix="undulog-view-") as folder:
-        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd", results, tab)
+        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd", single)
         for warning in recording.warnings:
             print(f"note: {warning}")
         if web:
@@ -144,28 +140,37 @@ def _view_file(
             viewer.show(recording.path)
 
 
-def _convert(
-    file: Path, output: Path, results: Sequence[Path], tab: Tab
-) -> tuple[Recording, float]:
+def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording, float]:
+    from analysis.stretch import Options
     from capture import Session
 
     from .blueprint import build_blueprint
+    from .renamed import COMMANDS, STATES, RenamedSession
     from .results import computed, saved
     from .rrd import write_recording
 
+    command = single.command_topic or COMMANDS
+    response = single.response_topic or STATES
+    options = Options(command_topic=command, response_topic=response)
     with Session.open(file) as session, progress("view", total=2) as bar:
-        bar.update(0, note="results" if results else "analysis")
-        layer = saved(session, results) if results else computed(session)
+        bar.update(0, note="results" if single.result else "analysis")
+        if single.result:
+            layer = saved(session, single.result, options)
+        else:
+            layer = computed(session, options)
         bar.update(1, note="recording")
-        recording = write_recording(
-            session,
-            output,
-            analysis=layer.analysis,
-            steady=layer.steady,
-            named=layer.named,
-            notes=layer.notes,
-            layout=partial(build_blueprint, front=tab),
-        )
+        with RenamedSession.with_joints(
+            file, command_topic=command, response_topic=response
+        ) as shown:
+            recording = write_recording(
+                shown,
+                output,
+                analysis=layer.analysis,
+                steady=layer.steady,
+                named=layer.named,
+                notes=layer.notes,
+                layout=partial(build_blueprint, front=single.tab or "session"),
+            )
         return recording, session.duration_s
 
 

@@ -61,13 +61,17 @@ def markdown(
     told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
     if told:
         parts.append("\n".join(f"- {note}" for note in told))
-    parts.append(_legend(colors, content, has_cycles=has_cycles))
+    legend = _legend(colors, content, has_cycles=has_cycles)
+    if legend:
+        parts.append(legend)
     return "\n\n".join(parts) + "\n"
 
 
 def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
     """What lines, bars and timelines mean."""
-    words = [f"{colors}. Grey is commanded."]
+    words = [f"{colors}."] if content.start is not None else []
+    if content.commanded:
+        words.append("Grey is commanded.")
     if content.charts:
         words.append(
             "Coloured bars: the analysed stretch, a whisker to the far end of the 95 % interval."
@@ -95,7 +99,7 @@ def log_facts(rec: rr.RecordingStream, text: str) -> None:
 
 def _robot(session: Session) -> str:
     if session.robot is None:
-        return "no description in the session"
+        return "no robot description"
     count = len(session.robot.joints)
     return f"{session.robot.name}, {count} joint{'s' if count != 1 else ''}"
 

@@ -18,35 +18,42 @@ from analysis.notebook.files import load
 from analysis.null_model.result import ModelledAnalysis
 from analysis.result import Analysis
 from analysis.result_experiment import Experiment
+from analysis.stretch import Options
 from capture import Session
-from capture.errors import DataError, UndulogError
+from capture.errors import DataError, MissingChannelError, UndulogError
 
 from .layer import Layer, Named
 
 
-def computed(session: Session) -> Layer:
+def computed(session: Session, options: Options | None = None) -> Layer:
     """Analyse a session now; one without a gait can be seen too.
 
     Args:
         session: The session, open.
+        options: Where its joints are; None for the topics of the log contract.
 
     Returns:
         The layer, with a note where there are no numbers.
     """
     try:
-        measured = measure_session(session)
+        measured = measure_session(session, options)
+    except MissingChannelError as error:
+        # What is there is listed, and one of it may be what was looked for.
+        name = "name them with --command-topic and --response-topic"
+        return Layer(None, notes=(f"not analysed: {error}; {name}",))
     except UndulogError as error:
-        return Layer(None, notes=(f"no response bars: {error}",))
+        return Layer(None, notes=(f"not analysed: {error}",))
     analysis = measured.analysis
     return Layer(analysis, cycle_maps(measured) if analysis.over_time is None else None)
 
 
-def saved(session: Session, paths: Sequence[Path]) -> Layer:
+def saved(session: Session, paths: Sequence[Path], options: Options | None = None) -> Layer:
     """Read what was found of a session before.
 
     Args:
         session: The session, open.
         paths: Results, JSON: of the session, of an experiment or a comparison that it is part of.
+        options: As for :func:`computed`, where no result holds numbers.
 
     Returns:
         The layer; its numbers are computed now where no result holds them.
@@ -80,7 +87,7 @@ def saved(session: Session, paths: Sequence[Path]) -> Layer:
     found = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
     if analysis is not None:
         return Layer(analysis, named=found, notes=tuple(notes))
-    now = computed(session)
+    now = computed(session, options)
     return Layer(now.analysis, now.steady, found, (*notes, *now.notes))
 
 

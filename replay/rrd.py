@@ -33,6 +33,7 @@ from .heat_maps import heat_maps, log_maps
 from .layer import Layer, Named
 from .mean_cycle import Channels, Look, averaged_ns, log_mean_cycle
 from .motion import BODY_RATE_HZ, HeadPath, read_head
+from .other_topics import log_others, log_words
 from .plots import Plots
 from .quantities import DRAWN, quantities
 from .response import charts, log_charts, log_current
@@ -216,8 +217,16 @@ def _log(
         joint_power=plots.series(power.MECHANICAL),
         charts=found,
         modes=gait.log_mode(rec, clock, session, sources.warnings),
-        has_events=gait.log_events(rec, clock, session, sources.warnings),
-        signals=_signals(session, plots, palette),
+        has_events=any(
+            (
+                gait.log_events(rec, clock, session, sources.warnings),
+                log_words(rec, clock, session),
+            )
+        ),
+        signals=(
+            *_signals(session, plots, palette),
+            *log_others(rec, clock, session, sources.warnings),
+        ),
         cycles=log_cycles(rec, clock, tables, palette),
         maps=maps,
         mean=log_mean_cycle(

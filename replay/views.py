@@ -80,7 +80,7 @@ def build_views(content: Content) -> Views:
     """
     words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
     if content.has_events:
-        words.append(rrb.TextLogView(name="Events", contents=[gait.EVENTS]))
+        words.append(rrb.TextLogView(name="Events", contents=[f"{gait.EVENTS}/**"]))
     mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
     angles, effort = _angle_views(content), _effort_views(content)
     if content.live:  # nothing comes after the cursor

@@ -183,7 +183,7 @@ def test_results_and_tabs_are_of_one_session(session_file, tmp_path, capsys):
     for words in (["--result", tmp_path / "a.json"], ["--tab", "cycles"]):
         code, _, err = run(capsys, session_file, session_file, *words)
         assert code == 2
-        assert "--result and --tab are of one session" in err
+        assert f"{words[0]}: needs one session" in err
 
 
 def test_a_result_that_is_not_there_fails(session_file, tmp_path, capsys):
