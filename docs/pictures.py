@@ -1,32 +1,45 @@
 """The pictures of README and manual, from what ``make demo`` left.
 
-``python docs/pictures.py out/demo docs/images``: the replay as Rerun's viewer draws it off screen
-(needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), and the report's first figure as a
-picture of its own that follows the reader's light or dark scheme.
+``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
+screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), and the report's first figure
+as a picture of its own that follows the reader's light or dark scheme.
 """
 
 import io
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 from PIL import Image
 
+import undulog
 from replay.headless import HeadlessViewer
 
 SECONDS = 12.3
+DEGREES = 90
 TITLE_BAR = 36
 """Height of the viewer's own title bar [pixels]; it warns of the software driver."""
+SIZE = (1440, 900 + TITLE_BAR)
+TABS = {"session": "replay", "cycles": "replay-cycles", "mean-cycle": "replay-mean-cycle"}
 
 
-def replay_picture(recording: Path, target: Path) -> None:
-    """The viewer at one instant of the recording."""
-    with HeadlessViewer((1440, 900 + TITLE_BAR)) as viewer:
-        viewer.open(recording, SECONDS)
-        for complaint in viewer.complaints():
-            print(complaint)
-        picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
-    picture.crop((0, TITLE_BAR, *picture.size)).save(target, optimize=True)
+def replay_pictures(demo: Path, images: Path) -> None:
+    """The viewer at one instant of the session, each tab in front once."""
+    for tab, name in TABS.items():
+        with tempfile.TemporaryDirectory() as folder, HeadlessViewer(SIZE) as viewer:
+            recording = Path(folder) / "tab.rrd"
+            words = ["--result", demo / "result.json", "--tab", tab, "--save", recording]
+            if undulog.run(["view", *map(str, (demo / "session.mcap", *words))]):
+                sys.exit(f"no recording of {demo / 'session.mcap'}")
+            viewer.open(recording, SECONDS)
+            if tab == "mean-cycle":
+                viewer.seek_phase(DEGREES)
+            for complaint in viewer.complaints():
+                print(complaint)
+            picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
+        shown = picture.crop((0, TITLE_BAR, *picture.size))
+        shown.save(images / f"{name}.png", optimize=True)
 
 
 def response_picture(page: Path, target: Path) -> None:
@@ -47,9 +60,9 @@ def response_picture(page: Path, target: Path) -> None:
 
 
 def main(demo: Path, images: Path) -> None:
-    """Make both."""
+    """Make them all."""
     images.mkdir(parents=True, exist_ok=True)
-    replay_picture(demo / "replay.rrd", images / "replay.png")
+    replay_pictures(demo, images)
     response_picture(demo / "report.html", images / "response.svg")
     for path in sorted(images.iterdir()):
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

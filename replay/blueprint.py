@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from .content import Content
-from .mean_cycle import ENSEMBLE_CYCLE
 from .single import Tab
-from .timeline import SESSION_TIME
+from .timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .views import Views, build_views
 
 

@@ -14,7 +14,7 @@ from capture import Session
 
 from .content import Content
 from .layer import Named
-from .mean_cycle import ENSEMBLE_CYCLE
+from .timeline import ENSEMBLE_CYCLE
 
 FACTS = "/session"
 

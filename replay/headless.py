@@ -17,7 +17,7 @@ from rerun.experimental import View, ViewerClient
 
 from capture.errors import UndulogError
 
-from .timeline import SESSION_TIME
+from .timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .viewer import LOOPBACK, free_ports, viewer_binary
 
 _START_S = 60.0
@@ -102,6 +102,14 @@ class HeadlessViewer:
             seconds: Place on ``session_time`` [s].
         """
         self._client.set_time(SESSION_TIME, duration=seconds, play_state="paused")
+
+    def seek_phase(self, degrees: int) -> None:
+        """Stand still at a phase of the mean cycle.
+
+        Args:
+            degrees: Place on ``ensemble_cycle`` [degrees].
+        """
+        self._client.set_time(ENSEMBLE_CYCLE, sequence=degrees, play_state="paused")
 
     @property
     def views(self) -> dict[str, View]:

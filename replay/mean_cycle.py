@@ -24,10 +24,8 @@ from .body import capsule_columns, capsule_poses, segment_power
 from .colors import power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
 from .joints import GREY, Color, Places, Series
-from .timeline import Clock
+from .timeline import ENSEMBLE_CYCLE, Clock
 from .tracks import Track
-
-ENSEMBLE_CYCLE = "ensemble_cycle"
 
 ENSEMBLE = "/ensemble"
 BODY = f"{ENSEMBLE}/body"

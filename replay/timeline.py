@@ -1,9 +1,10 @@
-"""The two rulers of a replay: time since the session's start, and cycles of its gait.
+"""The rulers of a replay: time since the session's start, cycles of its gait, and one mean cycle.
 
 ``session_time`` counts from the first sample. ``gait_cycle`` is the gait's cumulative phase over
 2 pi, so that two runs at different frequencies can be scrubbed in step; Rerun has no timeline
-of real numbers, so one cycle is drawn as one second: ``+3.25s`` there reads 3.25 cycles. Samples
-are never folded into one cycle.
+of real numbers, so one cycle is drawn as one second: ``+3.25s`` there reads 3.25 cycles.
+``ensemble_cycle`` counts the degrees of a mean cycle (:mod:`replay.mean_cycle`), which is computed;
+samples are never folded into one cycle.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from .sampling import interpolate
 
 SESSION_TIME = "session_time"
 GAIT_CYCLE = "gait_cycle"
+ENSEMBLE_CYCLE = "ensemble_cycle"
 
 ROWS_PER_CHUNK = 4096
 """Rows sent at once: small enough to page through an hour, large enough to be columns."""

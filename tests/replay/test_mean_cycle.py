@@ -12,9 +12,9 @@ from analysis.cycles import cycle_maps
 from analysis.result_artefact import Artefact
 from capture import Session
 from replay.cycles import cycle_tables
-from replay.mean_cycle import ENSEMBLE_CYCLE
 from replay.results import computed
 from replay.rrd import write_recording
+from replay.timeline import ENSEMBLE_CYCLE
 
 CHAIN = """name = "chain5"
 description = "Five yaw joints."
