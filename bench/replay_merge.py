@@ -1,15 +1,17 @@
 """Time of bringing two converted sessions together, beside going row by row.
 
-``python bench/replay_merge.py [MINUTES]`` writes two sessions of 25 joints at 100 Hz as
-``bench/replay_convert.py`` does, converts both, and merges the two recordings three times as
-``undulog view A B`` does: chunks get their session's name in front, those of the second session are
-moved along both timelines, and all go into one file; then the whole of what that verb does once
-both are converted, with the differences. Beside it the same row by row, on a hundredth
-of the rows of every entity: each row is read from its recording and sent by itself. And Rerun's own
-``rerun rrd merge``, which puts no names in front and moves nothing. Ten minutes by default.
+``python bench/replay_merge.py [MINUTES]`` writes the session of ``hour_session.py`` (25 joints at
+100 Hz, each sampled at a time of its own, sensors, odometry and gait) twice, converts both, and
+merges the two recordings three times as ``undulog view A B`` does: chunks get their session's name
+in front, those of the second session are moved along both timelines, and all go into one file; then
+the whole of what that verb does once both are converted, with the differences. Beside it the same
+row by row, on a hundredth of the rows of every entity: each row is read from its recording and sent
+by itself. And Rerun's own ``rerun rrd merge``, which puts no names in front and moves nothing. Ten
+minutes by default.
 """
 
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,7 +21,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import rerun as rr
-from replay_convert import write_session
+from hour_session import write_session
 from rerun.chunk import Chunk, LazyChunkStream
 
 from capture import Session
@@ -75,8 +77,8 @@ def convert_both(folder: Path, minutes: float) -> list[Converted]:
     """Write two sessions and convert them."""
     with ExitStack() as stack:
         logs = [folder / "robot.mcap", folder / "twin.mcap"]
-        for log in logs:
-            write_session(log, minutes)
+        write_session(logs[0], round(minutes * 60), can=False)
+        shutil.copy(*logs)
         sessions = [stack.enter_context(Session.open(log)) for log in logs]
         sides = [read_side(session, session.path.stem) for session in sessions]
         return [

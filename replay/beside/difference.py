@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+import rerun as rr
+
+from ..joints import Series, log_table, part_entity
 from ..sampling import interpolate
-from ..tracks import Track
+from ..tracks import Track, brought_together
 from .alignment import Align, Aligned, counterparts
 
 
@@ -34,3 +38,38 @@ def _taken(a: Aligned, b: Aligned, how: Align, track: Track, other: Track) -> np
     values = np.full(track.t_ns.size, np.nan)
     values[known] = interpolate(other.t_ns, other.values, at_ns[known])
     return values
+
+
+def log_differences(
+    rec: rr.RecordingStream,
+    a: Aligned,
+    entity: str,
+    differences: Sequence[Track],
+    drawn: Sequence[Series],
+) -> tuple[Series, ...]:
+    """Write differences as the angles of the session that was subtracted are drawn.
+
+    Args:
+        rec: The recording.
+        a: The session that was subtracted.
+        entity: Where to.
+        differences: The differences [rad].
+        drawn: Its measured angles; joints of one series are drawn at common times.
+
+    Returns:
+        What was written.
+    """
+    known = {track.name: track for track in differences}
+    parts = [[known[name] for name in one.names if name in known] for one in drawn]
+    parts = [part for part in parts if part]
+    return tuple(
+        log_table(
+            rec,
+            a.clock,
+            entity if len(parts) == 1 else part_entity(entity, part[0].name),
+            brought_together(part),
+            a.side.palette,
+            degrees=True,
+        )
+        for part in parts
+    )

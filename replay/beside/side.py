@@ -20,10 +20,12 @@ from ..joints import Color
 from ..motion import HeadPath, read_head
 from ..rrd import Recording, palette_of, write_recording
 from ..timeline import Rhythm
-from ..tracks import Track, read_columns
+from ..tracks import Track, read_columns, wanted_fields
 
 COMPARED = "/compared"
 """Where everything goes that belongs to no single session."""
+
+_TOPICS = ("/joint_states", "/gait")
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ def read_side(session: Session, name: str) -> Side:
     Returns:
         The side.
     """
-    columns = read_columns(session)
+    wanted = {topic: ["position"] for topic in _TOPICS if topic in wanted_fields(session)}
+    columns = read_columns(session, wanted)
     measured = columns.get(("/joint_states", "position"), ())
     head = None
     if session.robot is not None and measured:

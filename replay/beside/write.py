@@ -17,14 +17,14 @@ from capture.errors import LogWriteError, UndulogError
 from capture.interruption import StopRequest
 from capture.part_file import check_stop, part_file
 
-from ..joints import log_angles, log_scalars
+from ..joints import log_scalars
 from ..rrd import APPLICATION, Recording, recording_id, require_whole
 from ..sampling import decimate
 from ..tracks import Track
 from ..views import body_title
 from . import bars, dress, lines, words
 from .alignment import Align, Aligned
-from .difference import angle_differences
+from .difference import angle_differences, log_differences
 from .layout import APART, Shown, build_blueprint
 from .merge import chunks_of
 from .placement import Placement, head_distance, placement, told_placed
@@ -271,7 +271,7 @@ def _log_other(
         content,
         content.start is not None,
         places,
-        log_angles(rec, a.clock, f"{b.side.own}{ANGLES}", angles, a.side.palette),
+        log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, first.recording.content.measured),
         apart=_log_apart(rec, a, b, how, pair),
         bars=() if comparison is None else bars.log_differences(rec, a.side, b.side, comparison),
     )

@@ -92,7 +92,7 @@ def chain(tmp_path_factory):
 def make(chain):
     """Writes a session of a wave."""
 
-    def write(path, wave, *, robot=True, gait=True, names=NAMES, noise=1e-4):
+    def write(path, wave, *, robot=True, gait=True, names=NAMES, noise=1e-4, polled_s=0.0):
         described = chain(len(names), "chain") if robot else None
         rng = np.random.default_rng(sum(path.name.encode()))
         with SessionWriter(
@@ -106,13 +106,17 @@ def make(chain):
             states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
             odometry = w.odometry("/odom", frame="world", child="link01")
             phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
+            offsets = w.joint_state("/joint_sample_offset", names, unit="s") if polled_s else None
             joints, zero = np.arange(len(names)), np.zeros(3)
             turned = np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)])
             for t in wave.t.tolist():
                 t_ns, cycles = wave.epoch_ns + round(t * 1e9), wave.cycles(t)
                 commands.write(t_ns, 0.4 * np.sin(2 * np.pi * cycles - joints * LAG))
-                angle = wave.angle(joints, cycles)
-                speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, cycles + 0.25)
+                polled = wave.cycles(t + polled_s * joints)
+                angle = wave.angle(joints, polled)
+                speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, polled + 0.25)
+                if offsets is not None:
+                    offsets.write(t_ns, polled_s * joints)
                 states.write(
                     t_ns, angle + noise * rng.standard_normal(angle.shape), speed, 0.1 * speed
                 )
@@ -250,6 +254,7 @@ def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     )
 
 
+@pytest.mark.slow
 def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path, capsys):
     path = tmp_path / "w.rrd"
     told = json.loads(view(capsys, *files, "--place", "world", "--save", path, "--json"))
@@ -353,6 +358,7 @@ def test_without_a_joint_in_common_there_is_no_difference(make, read_back, tmp_p
     assert "/compared/other/angles" not in read_back(tmp_path / "x.rrd").entities
 
 
+@pytest.mark.slow
 def test_three_sessions_are_each_held_against_the_first(files, still, read_back, tmp_path, capsys):
     path = tmp_path / "three.rrd"
     out = view(capsys, *files, still, "--names", "robot,twin,no gait", "--save", path)
@@ -384,6 +390,24 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     assert np.abs(rows[: at.size] - np.rad2deg(truth)).max() < 1e-4
 
 
+def test_servos_polled_in_turn_differ_at_times_of_the_first(make, read_back, tmp_path, capsys):
+    wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
+    a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
+    b = make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3)
+    view(capsys, a, b, "--save", tmp_path / "x.rrd")
+    found = read_back(tmp_path / "x.rrd")
+    entity, joints = "/compared/b/angles", np.arange(5)
+    at = found.times(entity) * 1e-9
+    np.testing.assert_array_equal(found.times(entity), found.times("/a/joints/measured"))
+    truth = np.rad2deg(
+        wave.angle(joints, wave.cycles(at)[:, None])
+        - ROBOT.angle(joints, ROBOT.cycles(at)[:, None])
+    )
+    inner = slice(2, -1)  # b begins later: nothing to subtract, and no line to the next sample
+    away = np.abs(degrees(found, entity) - truth)[inner].max()
+    assert away < chord(wave, 0.01) + chord(ROBOT, 0.01)
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -403,6 +427,7 @@ def test_one_session_has_nothing_to_be_aligned_with(files, tmp_path, capsys):
     assert "--align: needs two sessions or more" in said
 
 
+@pytest.mark.slow
 def test_files_of_one_name_are_told_apart(files, tmp_path, capsys):
     told = json.loads(view(capsys, files[0], files[0], "--save", tmp_path / "x.rrd", "--json"))
     assert [one["name"] for one in told["sessions"]] == ["a 1", "a 2"]
