@@ -1,8 +1,8 @@
 """The pictures of README and manual, from what ``make demo`` left.
 
 ``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
-screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), and the report's first figure
-as a picture of its own that follows the reader's light or dark scheme.
+screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), and the report's first
+figure as a picture of its own that follows the reader's light or dark scheme.
 """
 
 import io

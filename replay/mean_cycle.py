@@ -212,6 +212,11 @@ def _log_body(
         colors = power_colors(segment_power(power.ordered(names)), look.limit_w)
     solid = rr.Capsules3D.from_fields(fill_mode=FillMode.Solid)
     _log_shapes(rec, clock, ("measured", solid), robot, (moved.ordered(names), colors))
+    centre, _ = body_frame(robot, moved.ordered(names))
+    above = np.nanmean(centre[:, 0], axis=0)
+    above[2] += 4.0 * robot.links[0].radius
+    label = rr.Points3D([above], labels="head", show_labels=True, radii=rr.Radius.ui_points(0.5))
+    rec.log(f"{BODY}/head", label, static=True)
     if asked is not None:
         wire = rr.Capsules3D.from_fields(
             fill_mode=FillMode.MajorWireframe, line_radii=rr.Radius.ui_points(0.5)
