@@ -76,5 +76,5 @@ def run_dry(
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _UNLIMITED
         print("\n".join(told(run, width)))
         if run.verdict.fit:
-            print(f"\nTo drive it for real: the same with --arm, on {on}")
+            print(f"\nTo send it to {on}, the same with --arm and -o SESSION.mcap")
     return 0 if run.verdict.fit else 1

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from capture.robot.safety import safety_example
 
 from .dry_run import DryRun, Verdict
+from .dry_run_table import joint_table
 
 if TYPE_CHECKING:
     from .dry_run_tally import Demand, JointDemand
 
 _NAMED = 3
 _REMARKS = 6
-_NOTHING = "-"
-_TITLES = (
-    *("joint", "least °", "greatest °", "of limit", "rate °/s", "of max"),
-    *("error °", "of max", "peak N m", "of stall", "rms N m", "peak A", "of max"),
-    *("net J", "abs J", "el. J", "clamped", "accel. °/s²"),
-)
-_SPARE = ("rms N m", "abs J", "accel. °/s²")
-"""Columns that a narrow terminal goes without."""
-
 _SHOWN_AS = {  # of a demand: unit and how many of it are one of SI's
     "range": ("°", math.degrees(1.0)),
     "rate": ("°/s", math.degrees(1.0)),
@@ -53,13 +47,13 @@ def told(run: DryRun, width: int) -> Iterator[str]:
     seconds = max(run.duration_s, 1e-9)
     net, absolute, electrical = run.energy_j
     yield (
-        f"energy: {net:.3g} J mechanical ({absolute:.3g} J without sign), {electrical:.3g} J "
-        f"electrical; mean power {net / seconds:.3g} W and {electrical / seconds:.3g} W"
+        f"energy: mechanical {net:.3g} J net and {absolute:.3g} J absolute, electrical "
+        f"{electrical:.3g} J; mean power {net / seconds:.3g} W and {electrical / seconds:.3g} W"
     )
     if run.path is not None:
         yield f"session of the twin: {run.path}"
     yield ""
-    yield from _table(run.joints, width)
+    yield from joint_table(run.joints, width)
 
 
 def _answer(run: DryRun) -> Iterator[str]:
@@ -72,7 +66,7 @@ def _answer(run: DryRun) -> Iterator[str]:
         case Verdict.STOPS:
             when = f"at {run.duration_s:.2f} s" if run.started else "on the way to the first pose"
             why = run.fault.text if run.fault is not None else ""
-            yield f"{what} would stop {when}: {why}; {near}"
+            yield f"{what} would stop {when}: {why}"
         case Verdict.UNFINISHED:
             yield (
                 f"{what}: not known, the dry run was stopped at {run.duration_s:g} s of "
@@ -118,52 +112,16 @@ def _remarks(run: DryRun) -> Iterator[str]:
 
 
 def _approach(run: DryRun) -> str:
+    if np.isnan(run.first_pose).any():
+        return "first pose: not known"
     farthest = max(range(len(run.joints)), key=lambda i: abs(run.first_pose[i]))
     angle = math.degrees(run.first_pose[farthest])
     if run.approach_s == 0.0:
         return "first pose: straight joints"
-    how_long = (
-        "no ramp_rate says how fast"
-        if math.isnan(run.approach_s)
-        else (f"a ramp of {run.approach_s:.2f} s from straight joints")
-    )
+    how_long = f"a ramp of {run.approach_s:.2f} s from straight joints"
+    if math.isnan(run.approach_s):
+        how_long = "no ramp_rate says how fast to go there"
     return f"first pose: {run.joints[farthest].name} farthest, at {angle:.1f}°; {how_long}"
-
-
-def _table(joints: Sequence[JointDemand], width: int) -> Iterator[str]:
-    from capture.daemon.text_table import Column, table
-
-    columns = [
-        Column(title, len(title), left=not k, wide=title in _SPARE)
-        for k, title in enumerate(_TITLES)
-    ]
-    rows = [[(cell, "") for cell in _cells(joint)] for joint in joints]
-    yield from (line.plain for line in table(columns, rows, width))
-
-
-def _cells(joint: JointDemand) -> list[str]:
-    share = {demand.name: _share(demand) for demand in joint.demands}
-    energies = joint.energy_net_j, joint.energy_abs_j, joint.energy_el_j
-    return [
-        joint.name,
-        *(f"{math.degrees(angle):z.1f}" for angle in (joint.least, joint.greatest)),
-        share["range"],
-        *(_number(math.degrees(joint.rate), ".0f"), share["rate"]),
-        *(_number(math.degrees(joint.tracking_error), ".1f"), share["tracking error"]),
-        *(_number(joint.torque_peak, "z.3f"), share["torque"], _number(joint.torque_rms, "z.3f")),
-        *(_number(joint.current_peak, ".2f"), share["current"]),
-        *(_number(energy, "z.3f") for energy in energies),
-        f"{joint.clamped:.0%}" if joint.clamped else _NOTHING,
-        _number(math.degrees(joint.acceleration), ".0f"),
-    ]
-
-
-def _share(demand: Demand) -> str:
-    return _number(demand.share, ".0%")
-
-
-def _number(value: float, form: str) -> str:
-    return _NOTHING if math.isnan(value) else format(value, form)
 
 
 def reported(run: DryRun) -> dict[str, Any]:

@@ -109,9 +109,19 @@ def test_it_would_run_and_the_first_line_says_so(waved):
     )
     assert f"{joint}, {demand.name}" in lines[0]
     assert f"({demand.share:.0%})" in lines[0]
+
+
+@pytest.mark.parametrize("width", [WIDE, 120, 100, 80, 40])
+def test_the_table_is_aligned_and_narrow_terminals_go_without_columns(waved, width):
+    _, run, _ = waved
+    lines = list(told(run, width))
     head = next(k for k, line in enumerate(lines) if line.startswith("joint "))
     assert [line.split()[0] for line in lines[head + 1 :]] == [one.name for one in run.joints]
-    assert len({len(line) for line in lines[head:]}) == 1  # aligned: numbers end at one column
+    assert len({len(line) for line in lines[head:]}) == 1  # numbers end at one column
+    assert len(lines[head]) <= width
+    shares = [k for k, title in enumerate(lines[head].split()) if title == "%"]
+    assert len(shares) == 5  # they stay
+    assert ("too narrow" in lines[head - 1]) is (width < 110)
 
 
 def test_the_ramp_to_the_first_pose_is_as_long_as_its_peak_rate_allows(waved, robot):
