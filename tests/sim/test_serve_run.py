@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +18,14 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session
+from capture import Session, load_robot
 from capture.log.session_check import check_session
+from capture.sources.address import parse_address
+from capture.sources.events import Tally
+from sim.drive.driven import find_driven
+from sim.drive.link import find_virtual_robot
+from sim.drive.loop import CommandEncoder
+from sim.readings import Readings
 
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]
@@ -139,7 +145,23 @@ class Run:
     over_bus: dict[str, Path]
 
 
-def on_the_bus(folder, scenario, *words):
+def heedless(scenario, port, control):
+    """A controller in lockstep that looks at nothing, and so goes on whatever is wrong."""
+    del control
+    robot, gait = (
+        load_robot("snake25"),
+        find_driven(str(scenario)).make(load_robot("snake25"), None),
+    )
+    encoder, blind = CommandEncoder(robot), Readings.nothing(robot)
+    address = parse_address(f"can:socketcand:can0?host=127.0.0.1&port={port}")
+    link = find_virtual_robot(address, Tally(time.time_ns))
+    with closing(link):
+        for tick in range(round(DURATION_S * 100) + 1):
+            assert link.wait_tick(PATIENCE_S)[0] == tick
+            link.send(encoder.frames(gait.step(tick / 100, blind).command))
+
+
+def on_the_bus(folder, scenario, *words, controller=driven):
     """Robot, two recorders and a controller; returns what each said and wrote."""
     bus = folder / "bus.sock"
     over_bus = {way: folder / f"{way}.mcap" for way in ("tcp", "unix")}
@@ -148,7 +170,7 @@ def on_the_bus(folder, scenario, *words):
         tcp = f"can:socketcand:can0?port={ready['port']}"
         control = recorders.enter_context(recorder(tcp, over_bus["tcp"]))
         recorders.enter_context(recorder(f"unix:{bus}", over_bus["unix"]))
-        drive = driven(scenario, ready["port"], control)
+        drive = controller(scenario, ready["port"], control)
         out, _ = robot.communicate(timeout=PATIENCE_S)
         assert robot.returncode == 0
     return ready, json.loads(out), drive, over_bus
@@ -242,7 +264,7 @@ def test_times_over_the_bus_are_those_of_the_run(run):
 def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
     words = ("lost:joint07:0.2", "frozen:joint03@0.2", "noise:0.02", "bus-off@1.5+0.4")
     faults = [word for text in words for word in ("--fault", text)]
-    _, end, _, over_bus = on_the_bus(tmp_path, scenario, *faults)
+    _, end, _, over_bus = on_the_bus(tmp_path, scenario, *faults, controller=heedless)
     assert end["lost"] > 0
     assert end["hit"] > 0
     for path in over_bus.values():
