@@ -8,17 +8,15 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from capture import Session
 from capture.console import emit_json, progress
 from capture.interruption import interruptible
-from capture.part_file import check_stop
 
 from .. import viewer
 from . import words
-from .alignment import Align, align
+from .alignment import Align
 from .options import BesideOptions
-from .side import Side, convert, names_of, read_side
-from .write import Beside, Converted, Place, write_beside
+from .together import bring_together, steps
+from .write import Beside, Place
 
 
 def view_beside(
@@ -41,55 +39,35 @@ def view_beside(
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
-    names = names_of(files, None if options.names is None else options.names.split(","))
     how, place = Align(options.align or Align.TIME), Place(options.place or Place.START)
     if save is None and not web:
         viewer.require_display()
-    with tempfile.TemporaryDirectory(prefix="undulog-view-") as folder:
-        path = save or Path(folder) / "beside.rrd"
-        beside = _write(files, names, path, folder=Path(folder), how=how, place=place)
-        if save is not None:
-            _report(beside, how, place, json=json)
-            return
-        for warning in beside.warnings:
-            print(f"note: {warning}")
+    with ExitStack() as stack:
+        path = save or _in_passing(stack)
+        with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
+            beside = bring_together(
+                files,
+                path,
+                names=None if options.names is None else options.names.split(","),
+                how=how,
+                place=place,
+                on_step=bar.update,
+                stop=stop,
+            )
+        _report(beside, how, place, saved=save is not None, json=json)
         if web:
             viewer.serve(path, lambda address: print(address, flush=True))
-        else:
+        elif save is None:
             viewer.show(path)
 
 
-def _write(
-    files: Sequence[Path],
-    names: Sequence[str],
-    path: Path,
-    *,
-    folder: Path,
-    how: Align,
-    place: Place,
-) -> Beside:
-    with (
-        ExitStack() as stack,
-        interruptible() as stop,
-        progress("view", total=2 * len(files) + 1) as bar,
-    ):
-        sessions = [stack.enter_context(Session.open(file)) for file in files]
-        sides: list[Side] = []
-        for k, (session, name) in enumerate(zip(sessions, names, strict=True)):
-            check_stop(path, stop)
-            bar.update(k, note=name)
-            sides.append(read_side(session, name))
-        aligned = align(sides, how)  # before the long part, since it may refuse
-        converted: list[Converted] = []
-        for k, (session, one) in enumerate(zip(sessions, aligned, strict=True)):
-            check_stop(path, stop)
-            bar.update(len(files) + k, note=f"recording {one.side.name}")
-            converted.append(Converted(one, *convert(session, folder / f"{k}.rrd")))
-        bar.update(2 * len(files), note="side by side")
-        return write_beside(converted, path, how, place, stop)
+def _in_passing(stack: ExitStack) -> Path:
+    """Where a recording goes that is only looked at."""
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
+    return Path(folder) / "beside.rrd"
 
 
-def _report(beside: Beside, how: Align, place: Place, *, json: bool) -> None:
+def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool) -> None:
     size = beside.path.stat().st_size
     if json:
         emit_json(_facts(beside, how, place, size))
@@ -97,7 +75,8 @@ def _report(beside: Beside, how: Align, place: Place, *, json: bool) -> None:
     first, *others = [one.side for one in beside.shown]
     for other in others:
         print(f"{words.answer(first, other, beside.found[other.name])}.")
-    print(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
+    if saved:
+        print(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
     for warning in beside.warnings:
         print(f"note: {warning}")
 

@@ -29,7 +29,8 @@ NAME = f"{BODY}/name"
 
 _WHITE: Color = (236, 236, 240, 255)
 _TINTS: tuple[Color, ...] = (_WHITE, (240, 140, 200, 255), (176, 150, 250, 255))
-_MODES = (FillMode.MajorWireframe, FillMode.DenseWireframe)
+_WIRES = ((FillMode.MajorWireframe, 1.0), (FillMode.DenseWireframe, 0.4))
+"""Mesh and line radius [points] of the second body, the third, and so on in turn."""
 _NAME_RATE_HZ = 25.0
 _LIFT_RADII, _LIFT, _TIER = 5.0, 0.05, 0.08
 _MESH_OPACITY = 90
@@ -58,10 +59,9 @@ def log_look(rec: rr.RecordingStream, entity: str, place: int, robot: Robot | No
         place: Which session it is, 1 for the second.
         robot: Its robot.
     """
+    mesh, wire = _WIRES[(place - 1) % len(_WIRES)]
     look = rr.Capsules3D.from_fields(
-        fill_mode=_MODES[(place - 1) % len(_MODES)],
-        colors=tint(place),
-        line_radii=rr.Radius.ui_points(1.0),
+        fill_mode=mesh, colors=tint(place), line_radii=rr.Radius.ui_points(wire)
     )
     rec.log(f"{entity}{MEASURED}", look, static=True)
     rec.log(f"{entity}{TRAIL}", rr.LineStrips3D.from_fields(colors=tint(place)), static=True)
