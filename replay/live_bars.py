@@ -6,11 +6,14 @@ nothing has none. Power takes the place of the net energy: its mean over the cyc
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import rerun as rr
 from rerun.components import InterpolationMode
+
+from capture.arrays import FloatArray
 
 from .cycles import CYCLES, GAIN, LAG, Quantity
 from .heat_maps import POWER
@@ -32,12 +35,13 @@ class CycleBars:
         """Nothing has been drawn."""
         self._plots: dict[Quantity, LivePlot] = {}
         self._drawn: set[str] = set()
+        self._waiting: deque[tuple[Quantity, Cycle, FloatArray]] = deque()
 
     @property
     def charts(self) -> tuple[Chart, ...]:
         """The bar charts that have been written to."""
         return tuple(
-            Chart(quantity.key, f"{quantity.name}, last cycle [{quantity.unit}]", ())
+            Chart(quantity.key, f"{quantity.name} [{quantity.unit}]", ())
             for quantity in (GAIN, LAG, POWER)
             if quantity in self._plots
         )
@@ -51,36 +55,51 @@ class CycleBars:
             if quantity in self._plots
         )
 
-    def write(
-        self, rec: rr.RecordingStream, clock: Clock, cycle: Cycle, palette: Mapping[str, Color]
-    ) -> None:
-        """Draw a cycle, at the time at which it started.
+    def take(self, cycle: Cycle) -> None:
+        """Take a cycle, to be drawn a quantity at a time, so that no batch is late for it.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
             cycle: The cycle.
-            palette: Colour by joint name, head to tail.
         """
-        since = np.timedelta64(cycle.start_ns - clock.start_ns, "ns")
-        t_ns = np.array([cycle.start_ns], dtype=np.int64)
-        rec.set_time(SESSION_TIME, duration=since)
         for quantity, values in (
             (GAIN, 100.0 * (cycle.gain - 1.0)),
             (LAG, np.degrees(cycle.lag_rad)),
             (POWER, 1e3 * cycle.power_w),
         ):
-            if quantity not in self._plots:
-                if not np.isfinite(values).any():
-                    continue
-                self._plots[quantity] = LivePlot(f"{CYCLES}/{quantity.key}")
+            if quantity in self._plots or np.isfinite(values).any():
+                self._waiting.append((quantity, cycle, values))
+
+    def write(
+        self,
+        rec: rr.RecordingStream,
+        clock: Clock,
+        palette: Mapping[str, Color],
+        *,
+        everything: bool = False,
+    ) -> None:
+        """Draw what waits, at the time at which its cycle started.
+
+        Args:
+            rec: The recording.
+            clock: Its timelines.
+            palette: Colour by joint name, head to tail.
+            everything: Whether to draw all of it rather than one quantity of one cycle.
+        """
+        while self._waiting:
+            quantity, cycle, values = self._waiting.popleft()
+            t_ns = np.array([cycle.start_ns], dtype=np.int64)
             tracks = [Track(name, t_ns, values[i : i + 1]) for i, name in enumerate(cycle.names)]
+            rec.set_time(
+                SESSION_TIME, duration=np.timedelta64(cycle.start_ns - clock.start_ns, "ns")
+            )
             self._write_bars(rec, quantity, tracks, palette)
-            plot = self._plots[quantity]
+            rec.reset_time()
+            plot = self._plots.setdefault(quantity, LivePlot(f"{CYCLES}/{quantity.key}"))
             plot.write(rec, clock, tracks, palette)
             for one in plot.series:
                 rec.log(one.entity, _STEPS, static=True)
-        rec.reset_time()
+            if not everything:
+                return
 
     def _write_bars(
         self,

@@ -245,7 +245,7 @@ class CycleMeter:
             own = run.phase_name(joint, planes.get(joint, "")) or ""
             phase = Phase(run.t_s[near], _whole(run.values[own])[near])
             command, response = self._series(_COMMAND, joint), self._series(_POSITION, joint)
-            if command.count > 1 and response.count > 1:
+            if command.count > 1 and response.count > 1 and np.ptp(command.values) > 0.0:
                 asked, given = demodulate(command, response, phase, edges_s)
                 size = float(np.abs(asked[0]))
                 if np.isfinite(size):

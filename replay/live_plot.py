@@ -90,6 +90,7 @@ class LivePlot:
         self._titles, self._width = titles, width
         self._parts: list[tuple[str, ...]] = []
         self._last: dict[str, tuple[int, int]] = {}
+        self._looks: dict[str, tuple[tuple[str, ...], list[Color | None] | None]] = {}
 
     @property
     def series(self) -> tuple[Series, ...]:
@@ -125,7 +126,7 @@ class LivePlot:
                 (table,) = tables([by_name[name] for name in part])
                 path = self._path(part)
                 table = self._with_gap(path, table)
-                log_look(rec, path, part, palette, titles=self._titles, width=self._width)
+                self._say_look(rec, path, part, palette)
                 t_ns, values = mark_gaps(table.t_ns, table.values)
                 log_rows(
                     rec,
@@ -136,6 +137,19 @@ class LivePlot:
                     degrees=self._degrees,
                     component=self._component,
                 )
+
+    def _say_look(
+        self,
+        rec: rr.RecordingStream,
+        path: str,
+        part: tuple[str, ...],
+        palette: Mapping[str, Color] | None,
+    ) -> None:
+        """Say how the lines look, unless it has been said."""
+        look = part, None if palette is None else [palette.get(name) for name in part]
+        if self._looks.get(path) != look:
+            self._looks[path] = look
+            log_look(rec, path, part, palette, titles=self._titles, width=self._width)
 
     def _path(self, part: tuple[str, ...]) -> str:
         return self._entity if len(self._parts) == 1 else part_entity(self._entity, part[0])

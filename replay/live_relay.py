@@ -32,7 +32,7 @@ from .live_scene import LiveScene
 from .live_target import LiveViewer
 from .rrd import APPLICATION, recording_id, require_whole
 
-BATCH_S = 0.05
+BATCH_S = 0.03
 """How often what has come is drawn [s]."""
 SILENCE_S = 10.0
 """A feed that says nothing for so long has ended; a living one repeats its definitions [s]."""

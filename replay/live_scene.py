@@ -36,6 +36,7 @@ from .views import body_title
 
 _LAYOUT_EVERY_S = 1.0
 _FACTS_EVERY_S = 2.0
+_PLACES_EVERY_S = 0.2
 _TAIL_NS = round(1e9 / trail.TRAIL_RATE_HZ)
 _CLEARER = 2.0
 """Another plane's joints are plotted once they swing so many times as far."""
@@ -64,6 +65,7 @@ class LiveScene:
         self._joint_power = LivePlot(power.MECHANICAL)
         self._meter, self._bars = CycleMeter(epoch_ns), CycleBars()
         self._signals: dict[str, LivePlot] = {}
+        self._palette: dict[str, joints.Color] = {}
         self._of_joints: dict[str, bool] = {}
         self._places: joints.Places | None = None
         self._place_plots: dict[tuple[str, tuple[str, ...]], LivePlot] = {}
@@ -76,7 +78,7 @@ class LiveScene:
         self._has_events = self._has_power = False
         self._trail_end: tuple[int, FloatArray] | None = None
         self._laid_out: tuple[object, ...] = ()
-        self._layout_at = self._facts_at = 0.0
+        self._layout_at = self._facts_at = self._places_at = 0.0
 
     @property
     def content(self) -> Content:
@@ -126,7 +128,9 @@ class LiveScene:
         self._draw_words(batch)
         self._draw_body(palette)
         for cycle in self._meter.add(batch, self._log.robot):
-            self._bars.write(self._rec, self._clock, cycle, palette)
+            self._bars.take(cycle)
+        self._bars.write(self._rec, self._clock, palette)
+        self._palette = palette
         self._lay_out(dropped)
 
     def finish(self, dropped: int = 0) -> None:
@@ -135,6 +139,7 @@ class LiveScene:
         Args:
             dropped: Messages that could not be shown.
         """
+        self._bars.write(self._rec, self._clock, self._palette, everything=True)
         self._layout_at = self._facts_at = 0.0
         self._lay_out(dropped, ended=True)
 
@@ -180,6 +185,10 @@ class LiveScene:
 
     def _choose_places(self, moving: tuple[Track, ...]) -> None:
         """Head, middle and tail of the plane that moves, once it is clear which does."""
+        now = time.monotonic()
+        if self._places is not None and now < self._places_at:
+            return
+        self._places_at = now + _PLACES_EVERY_S
         found = joints.head_middle_tail(self._log.robot, moving)
         if found is None or found == self._places:
             return
