@@ -15,6 +15,7 @@ from .. import viewer
 from . import words
 from .alignment import Align
 from .options import BesideOptions
+from .side import names_of
 from .together import bring_together, steps
 from .write import Beside, Place
 
@@ -39,6 +40,7 @@ def view_beside(
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
+    names = names_of(files, None if options.names is None else options.names.split(","))
     how, place = Align(options.align or Align.TIME), Place(options.place or Place.START)
     if save is None and not web:
         viewer.require_display()
@@ -48,7 +50,7 @@ def view_beside(
             beside = bring_together(
                 files,
                 path,
-                names=None if options.names is None else options.names.split(","),
+                names=names,
                 how=how,
                 place=place,
                 on_step=bar.update,
