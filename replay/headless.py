@@ -84,15 +84,20 @@ class HeadlessViewer:
         self._scratch.cleanup()
 
     def open(self, recording: Path, seconds: float) -> None:
-        """Show a recording, standing still.
+        """Show a recording in its own layout, standing still, instead of what was shown before.
 
         Args:
             recording: The .rrd file.
             seconds: Place on ``session_time`` [s].
         """
+        again = bool(self._client.get_state().recordings)
+        if again:
+            self._client.close("all")
         self._client.open(str(recording.resolve()))
         while self._client.get_state().loading:
             time.sleep(_LOOK_AGAIN_S)
+        if again:  # it would keep the layout of the last one
+            self._client.run_command("recording.reset_blueprint_to_default")
         self.seek(seconds)
 
     def seek(self, seconds: float) -> None:
