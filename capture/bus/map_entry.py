@@ -105,7 +105,8 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
             f"the robot {robot.name} has no bus map; frames can't be encoded or decoded"
         )
     messages = database_messages(dict(robot.databases), Faults()) or {}
-    if missing := {signal.message for signal in robot.bus.signals} - set(messages):
+    named = {each.message for each in (*robot.bus.signals, *robot.bus.polls)}
+    if missing := named - set(messages):
         raise DataError(f"no database of {robot.name} has {', '.join(sorted(missing))}")
     return robot.bus, messages
 

@@ -2,6 +2,7 @@
 
 from .model import (
     Bus,
+    BusPoll,
     BusSignal,
     ClockDomain,
     Direction,
@@ -18,6 +19,7 @@ from .safety import OnFault, Safety
 
 __all__ = [
     "Bus",
+    "BusPoll",
     "BusSignal",
     "ClockDomain",
     "Direction",

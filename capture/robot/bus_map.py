@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import UsageError
 from ..strict_table import Faults, Table, listed
 from ..units import unit_for, valid_units
-from .model import Bus, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
+from .model import Bus, BusPoll, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -109,8 +109,37 @@ def read_bus(
             if signal in signals:
                 entry.fault("signal", "one entry a signal, target and quantity", "a repeated entry")
             signals[signal] = None
+    polls: dict[BusPoll, None] = {}
+    for values, where in table.tables("polls"):
+        for expanded in _expanded(values, joints):
+            entry = Table(expanded, where, table.faults)
+            polls[_poll(entry, messages, joints)] = None
+            entry.close()
     table.close()
-    return Bus(tuple(databases), bitrate, tuple(signals)), tuple(databases.items())
+    bus = Bus(tuple(databases), bitrate, tuple(signals), tuple(polls))
+    return bus, tuple(databases.items())
+
+
+def _poll(
+    entry: Table, messages: Mapping[str, Message] | None, joints: tuple[Joint, ...]
+) -> BusPoll:
+    """A request; its target, if it has one, only says which joint it is for."""
+    names = [joint.name for joint in joints]
+    if "target" in entry and (target := entry.text("target")) not in names:
+        entry.fault("target", listed([*names, _PLACEHOLDER], target))
+    message = entry.text("message")
+    if messages is not None and message and message not in messages:
+        entry.fault("message", listed(messages, message))
+    table = entry.table("signals")
+    if messages is None or message not in messages:
+        return BusPoll(message, ())
+    known = {each.name: each for each in messages[message].signals}
+    numbers = [(name, table.integer(name, at_least=0)) for name in known if name in table]
+    for name, number in numbers:
+        if number >> known[name].length:
+            table.fault(name, f"a raw number of {known[name].length} bits")
+    table.close()
+    return BusPoll(message, tuple(numbers))
 
 
 def _expanded(values: dict[str, Any], joints: tuple[Joint, ...]) -> list[dict[str, Any]]:

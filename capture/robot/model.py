@@ -219,6 +219,19 @@ class BusSignal:
 
 
 @dataclass(frozen=True)
+class BusPoll:
+    """A request that makes a servo or a sensor tell its state, and moves nothing.
+
+    Attributes:
+        message: DBC message name.
+        signals: Signal names with their raw numbers, before the DBC's scale; others are 0.
+    """
+
+    message: str
+    signals: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
 class Bus:
     """The robot's bus: databases and the map from signals to quantities.
 
@@ -226,11 +239,13 @@ class Bus:
         databases: DBC file names, relative to the robot TOML.
         bitrate: [bit/s].
         signals: The map.
+        polls: What has to be asked in each control tick; empty where the robot tells unasked.
     """
 
     databases: tuple[str, ...]
     bitrate: int
     signals: tuple[BusSignal, ...]
+    polls: tuple[BusPoll, ...] = ()
 
 
 @dataclass(frozen=True)

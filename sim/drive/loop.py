@@ -6,8 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
+
 from capture.arrays import FloatArray
 from capture.bus.encoding import BusEncoder, BusValue
+from capture.bus.polling import poll_frames
 from capture.errors import SourceError, UndulogError
 from capture.interruption import StopRequest
 from capture.log.frames import FrameArray, empty_frames
@@ -31,7 +34,7 @@ class BusTick(NamedTuple):
         tick: Its number, from 0.
         step: What the gate had done.
         received: Frames that came by then.
-        sent: The commands as frames; none where nothing was sent.
+        sent: What was sent: requests, then commands.
     """
 
     tick: int
@@ -53,6 +56,7 @@ class LoopTally:
         loop_s: Time of the last tick, from the first [s].
         overruns: Ticks left out because the one before took too long.
         sent: Frames sent.
+        commanded: Whether a command was among them.
         received: Frames that came.
         decoded: Frames of these with something that the robot's map names.
         late_s: How late each tick was [s], where the clock sets the pace.
@@ -61,6 +65,7 @@ class LoopTally:
     loop_s: float = 0.0
     overruns: int = 0
     sent: int = 0
+    commanded: bool = False
     received: int = 0
     decoded: int = 0
     late_s: list[float] = field(default_factory=list[float])
@@ -112,6 +117,7 @@ class ControlLoop:
         self._gate, self._link, self._pace = gate, link, pace
         self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
         self._presence = Presence(robot)
+        self._polls = poll_frames(robot)
 
     def run(
         self,
@@ -147,7 +153,7 @@ class ControlLoop:
                 )
                 sent = self._send(step)
             except SourceError as error:
-                if not self.tally.sent:
+                if not self.tally.commanded:
                     raise
                 self._gate.lost(str(error))
                 return
@@ -156,7 +162,7 @@ class ControlLoop:
                 try:
                     on_tick(BusTick(tick, step, received, sent))
                 except UndulogError as error:
-                    if not self.tally.sent:
+                    if not self.tally.commanded:
                         raise
                     unwritten = error
                     self._gate.report(GateFault(FaultKind.LOG, str(error)))
@@ -182,9 +188,14 @@ class ControlLoop:
         )
 
     def _send(self, step: GateStep) -> FrameArray:
-        if step.command is None:
+        """Send the commands, and ask for the state where the robot doesn't tell it unasked."""
+        if self._gate.phase is Phase.DONE and step.command is None:
             return empty_frames(0)
-        frames = self._encoder.frames(step.command)
-        self._link.send(frames)
-        self.tally.sent += len(frames)
+        frames = self._polls
+        if step.command is not None:
+            frames = np.concatenate([frames, self._encoder.frames(step.command)])
+            self.tally.commanded = True
+        if len(frames):
+            self._link.send(frames)
+            self.tally.sent += len(frames)
         return frames

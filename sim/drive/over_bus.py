@@ -13,7 +13,7 @@ from capture.daemon.clock import SessionClock
 from capture.errors import LogWriteError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import FrameArray
-from capture.robot import Robot
+from capture.robot import Direction, Quantity, Robot
 from capture.sources.address import parse_address
 from capture.sources.contract import SourceAddress
 from capture.sources.events import Tally
@@ -90,13 +90,15 @@ def bus_plan(
         The plan.
 
     Raises:
-        UsageError: If the address is none, the robot has no bus or lacks limits, the commands are
-            of other joints, or the duration can't be.
+        UsageError: If the address is none, the robot has no bus or lacks limits, a joint can't
+            be commanded or tells no angle, the commands are of other joints, or the duration
+            can't be.
     """
     address = bus_address(on)
     robot = robot or driven.robot
     if robot.bus is None:
         raise UsageError(f"{robot.name} has no bus map: {driven.name} can't be driven on one")
+    _check_map(robot)
     driven.check_fits(robot)
     limits = gate_limits(robot)
     length = driven.duration_s if duration_s is None else duration_s
@@ -105,6 +107,22 @@ def bus_plan(
             f"a duration of {length:g} s; it can be {1 / CONTROL_RATE_HZ:g} to {LONGEST_S:g} s"
         )
     return BusPlan(driven, robot, limits, address, length, output, recorder, force)
+
+
+def _check_map(robot: Robot) -> None:
+    """See that every joint can be commanded and tells its angle."""
+    signals = robot.bus.signals if robot.bus is not None else ()
+    for direction, quantity in (
+        (Direction.TX, Quantity.COMMAND),
+        (Direction.RX, Quantity.POSITION),
+    ):
+        there = {s.target for s in signals if (s.direction, s.quantity) == (direction, quantity)}
+        lacking = [name for name in robot.joint_names if name not in there]
+        if lacking:
+            raise UsageError(
+                f"the bus map of {robot.name} has no {quantity} ({direction}) of "
+                f"{', '.join(lacking)}: it can't be driven on a bus"
+            )
 
 
 def bus_address(on: str) -> SourceAddress:
@@ -269,7 +287,7 @@ class _Telling:
             self._teller.note(text)
 
     def tick(self, tick: BusTick) -> None:
-        if len(tick.sent) and not self.first_frames:
+        if tick.step.command is not None and not self.first_frames:
             self.first_frames = [_candump(frame) for frame in tick.sent]
         if self._simulated_ns is None:
             self._session.write(tick, self._clock.now_ns())

@@ -9,6 +9,7 @@ import pytest
 from capture import load_robot, robot_names
 from capture.errors import RobotFileError, UsageError
 from capture.robot import (
+    BusPoll,
     ClockDomain,
     Direction,
     OnFault,
@@ -477,3 +478,38 @@ max_rate = 1.0
     assert "safety_of.joint03: found an unknown key" in told
     alone = MINIMAL + "[safety_of.joint01]\nmax_rate = 1.0\n"
     assert "safety_of: found a table; valid: leave it out" in "\n".join(faults_of(alone))
+
+
+def test_requests_stand_in_the_bus_map():
+    dbc = DBC.replace(
+        "BO_ 291 state", 'BO_ 290 ask: 2 b\n SG_ what : 0|8@1+ (1,0) [0|0] "" a\n\nBO_ 291 state'
+    )
+    bus = """
+[bus]
+databases = ["worm.dbc"]
+bitrate = 500000
+"""
+    good = bus + 'polls = [{ message = "ask", signals = { what = 0x92 } }]\n'
+    robot = parse_robot(MINIMAL + good, "worm.toml", {"worm.dbc": dbc})
+    assert robot.bus.polls == (BusPoll("ask", (("what", 0x92),)),)
+    bad = (
+        bus
+        + """
+[[bus.polls]]
+message = "aks"
+
+[[bus.polls]]
+message = "ask"
+target = "joint09"
+signals = { what = 256, wat = 1 }
+"""
+    )
+    assert faults_of(MINIMAL + bad, {"worm.dbc": dbc})[1:] == [
+        '  bus.polls[0].message: found "aks"; valid: ask, state (did you mean ask?)',
+        (
+            '  bus.polls[1].target: found "joint09"; valid: joint01, joint02, {joint} '
+            "(did you mean joint02?)"
+        ),
+        "  bus.polls[1].signals.what: found 256; valid: a raw number of 8 bits",
+        "  bus.polls[1].signals.wat: found an unknown key; valid: what (did you mean what?)",
+    ]

@@ -1,0 +1,135 @@
+"""A servo that speaks only when it is spoken to: ArcSnake's RMD-X8, written from its manual."""
+
+import math
+import struct
+import threading
+from contextlib import contextmanager
+
+import can
+import numpy as np
+import pytest
+
+from capture import Session, SessionWriter
+from capture.bus.polling import poll_frames
+from capture.interruption import StopRequest
+from capture.log.frames import DIR_RX, DIR_TX
+from capture.robot.description import load_robot
+from sim.drive.driven import find_driven
+from sim.drive.over_bus import bus_plan, drive_bus
+from sim.gate.outcome import How
+
+SHIPPED = load_robot("arcsnake-joint")
+SAFETY = """
+[safety]
+max_rate = 4.0
+ramp_rate = 1.0
+max_tracking_error = 0.5
+max_current = 5.0
+max_temperature = 60.0
+reply_timeout_s = 0.25
+max_late_s = 0.5
+"""
+ADDRESS = 0x14B
+
+
+class Servo(threading.Thread):
+    """One motor at its bus: 0x92 asks for the angle, 0xA4 commands one, both are answered."""
+
+    def __init__(self, channel, degrees):
+        super().__init__()
+        self.degrees, self.temperature, self.heard = degrees, 30, []
+        self.ended = threading.Event()
+        self.bus = can.Bus(interface="virtual", channel=channel)
+
+    def run(self):
+        with self.bus:
+            while not self.ended.is_set():
+                if (message := self.bus.recv(0.05)) is not None:
+                    self.answer(bytes(message.data))
+
+    def answer(self, data):
+        self.heard.append(data)
+        if data[0] == 0x92:
+            raw = round(self.degrees * 100)
+            reply = bytes([0x92]) + raw.to_bytes(7, "little", signed=True)
+        elif data[0] == 0xA4:
+            self.degrees = struct.unpack("<i", data[4:])[0] / 100
+            reply = struct.pack("<BbhhH", 0xA4, self.temperature, 10, 0, 0)
+        else:
+            return
+        self.bus.send(can.Message(arbitration_id=ADDRESS, data=reply, is_extended_id=False))
+
+
+@contextmanager
+def servo(channel, degrees):
+    one = Servo(channel, degrees)
+    one.start()
+    try:
+        yield one
+    finally:
+        one.ended.set()
+        one.join()
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """The shipped joint, with limits."""
+    path = tmp_path / "arm.toml"
+    path.write_text(SHIPPED.toml + SAFETY)
+    for name, text in SHIPPED.databases:
+        (tmp_path / name).write_text(text)
+    return load_robot(path)
+
+
+def planned(tmp_path, robot, channel, angles):
+    recorded = tmp_path / "commands.mcap"
+    with SessionWriter(recorded, session_id="c", epoch_ns=10**18, robot=robot) as writer:
+        channel_of = writer.joint_state("/joint_commands", ["joint01"], unit="rad")
+        for k, angle in enumerate(angles):
+            channel_of.write(10**18 + k * 10_000_000, np.array([angle]))
+    return bus_plan(
+        find_driven(str(recorded)),
+        f"can:virtual:{channel}",
+        duration_s=None,
+        output=tmp_path / "a.mcap",
+        recorder=None,
+        force=False,
+    )
+
+
+def test_the_request_of_the_shipped_joint_is_the_one_of_its_manual():
+    (frame,) = poll_frames(SHIPPED)
+    assert int(frame["id_flags"]) == ADDRESS
+    assert bytes(frame["data"][: frame["dlc"]]) == bytes([0x92, 0, 0, 0, 0, 0, 0, 0])
+    assert frame["dir"] == DIR_TX
+    assert not len(poll_frames(load_robot("snake25")))  # it tells unasked
+
+
+def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
+    angles = 0.5 + 0.2 * np.sin(np.arange(41) / 10)
+    with servo("polled", math.degrees(0.3)) as one:
+        report = drive_bus(planned(tmp_path, robot, "polled", angles), stop=StopRequest())
+    assert report.outcome.how is How.COMPLETE, report.outcome
+    requests = [data for data in one.heard if data[0] == 0x92]
+    commands = [data for data in one.heard if data[0] == 0xA4]
+    assert len(requests) + len(commands) == report.tally.sent == len(one.heard)
+    assert one.heard[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
+    given = np.radians([struct.unpack("<i", data[4:])[0] / 100 for data in commands])
+    assert given[0] == pytest.approx(0.3, abs=0.011)
+    assert np.abs(np.diff(given)).max() <= 4.0 * 0.01 + 2e-4
+    assert given[-1] == pytest.approx(angles[-1], abs=1e-4)
+    with Session.open(tmp_path / "a.mcap") as session:
+        frames = session.frames("/can/polled")
+        assert (frames["dir"] == DIR_TX).sum() == len(one.heard)
+        assert (frames["dir"] == DIR_RX).sum() > 0
+        measured = session.joints("/joint_states").values[0]
+        assert np.nanmax(np.abs(measured - 0.3)) < 0.5
+
+
+def test_its_temperature_ends_the_drive(tmp_path, robot):
+    with servo("polled-hot", math.degrees(0.5)) as one:
+        one.temperature = 61
+        plan = planned(tmp_path, robot, "polled-hot", np.full(200, 0.5))
+        report = drive_bus(plan, stop=StopRequest())
+    assert report.outcome.why == "joint01: temperature 61 degC, more than 60 degC for 0.3 s"
+    assert abs(one.degrees) <= 0.005
