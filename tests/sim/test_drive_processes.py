@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from capture import Session
+from capture.log.frames import DIR_TX
 
 pytestmark = pytest.mark.slow
 
@@ -109,6 +110,23 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
         given = given[~np.isnan(given)]  # a tick's frames that came more than 0.1 s apart
         assert len(given) == report["ticks"]
         assert np.abs(given - meant).max() <= STEP / 2 * (1 + 1e-6)
+
+
+def test_the_virtual_robot_is_driven_as_any_other_through_python_can(tmp_path, alone):
+    path = tmp_path / "a.mcap"
+    with served("flat", "--duration", "60") as (on, _):
+        words = ("drive", "flat", "--on", f"{on}&plain=yes", "--arm", "--duration", "1")
+        drove = undulog(*words, "-o", str(path), "--json", env=alone)
+    assert (drove.returncode, drove.stderr) == (0, "")
+    report = json.loads(drove.stdout)
+    assert report["outcome"] == "complete"
+    assert report["approach_s"] >= 0.5  # whose bus it is has to be heard
+    assert report["lateness"]["ticks"] >= 100
+    with Session.open(path) as session:
+        sent = session.frames("/can/can0")
+        assert len(session.joints("/joint_commands").t_ns[0]) == report["sent"] / 25
+        assert (sent["dir"] == DIR_TX).sum() == report["sent"]
+        assert session.metadata["undulog"]["clock.can0"] == "host"
 
 
 def test_several_recorders_have_to_be_told_apart(tmp_path, alone):
