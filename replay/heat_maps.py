@@ -45,7 +45,7 @@ _FRAME = (255, 255, 255, 255)
 _DOT = rr.Radius.ui_points(0.5)
 _ROW_LABELS = 8
 _COLUMN_LABELS = 13
-_MOST_TOLD = 4000
+_MOST_TOLD = 1000
 _BAR = (120.0, 9.0)
 _BAR_TOP = SIZE[1] + 58.0
 
@@ -211,7 +211,8 @@ def _log_axes(rec: rr.RecordingStream, shown: HeatMap, named: Collection[str]) -
     points = [((i + 0.5) * width, SIZE[1] + 2.0) for i in column]
     texts = [str(shown.places[i]) for i in column]
     points += [(-22.0, k * height) for k in row]
-    texts += [f"{number(float(shown.table.start_s[k]), 1)} s" for k in row]
+    digits = 0 if shown.table.start_s[-1] >= 100.0 else 1
+    texts += [f"{number(float(shown.table.start_s[k]), digits)} s" for k in row]
     points.append((SIZE[0] / 2, SIZE[1] + 21.0))
     texts.append("joint, head to tail; a row is one cycle")
     _log_text(rec, f"{shown.entity}/axes", points, texts)

@@ -35,6 +35,7 @@ ABOUT = f"{ENSEMBLE}/about"
 MOST_S = 600.0
 """The mean cycle is taken of so much at most [s], so that an hour needs no more memory."""
 
+_WHITE = (255, 255, 255, 255)
 _FAINT = 110
 """Opacity of the lines at the ends of an interval."""
 
@@ -214,8 +215,14 @@ def _log_body(
     _log_shapes(rec, clock, ("measured", solid), robot, (moved.ordered(names), colors))
     centre, _ = body_frame(robot, moved.ordered(names))
     above = np.nanmean(centre[:, 0], axis=0)
-    above[2] += 4.0 * robot.links[0].radius
-    label = rr.Points3D([above], labels="head", show_labels=True, radii=rr.Radius.ui_points(0.5))
+    above[2] += 7.0 * robot.links[0].radius
+    label = rr.Points3D(
+        [above],
+        labels="head",
+        show_labels=True,
+        radii=rr.Radius.ui_points(0.5),
+        colors=_WHITE,
+    )
     rec.log(f"{BODY}/head", label, static=True)
     if asked is not None:
         wire = rr.Capsules3D.from_fields(

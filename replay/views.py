@@ -27,6 +27,8 @@ from .timeline import GAIT_CYCLE, SESSION_TIME
 BEFORE_CURSOR_S = 4.0
 AFTER_CURSOR_S = 2.0
 
+_ALL = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
+
 _BACKGROUND = rrb.Background(color=(16, 18, 22, 255))
 
 
@@ -322,6 +324,7 @@ def _whole_plot(
         contents=contents,
         overrides=overrides,
         plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=rrb.TimeAxis(view_range=_ALL),
     )
 
 
