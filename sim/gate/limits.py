@@ -21,7 +21,7 @@ class GateLimits:
         joint_names: The joints.
         lower: Lower limits of commands [rad].
         upper: Upper limits of commands [rad].
-        rate: Greatest rates of commands [rad/s].
+        rate: Greatest rates of commands [rad/s], at most those of the joints' servos.
         ramp_rate: Greatest rates on the way to the first pose and down [rad/s], at most ``rate``.
         tracking_error: Greatest distances of measured angles from their commands [rad].
         current: Greatest currents [A]; NaN where it isn't watched.
@@ -84,7 +84,8 @@ def gate_limits(robot: Robot) -> GateLimits:
         )
     lower, upper = robot.limits()
     names = robot.joint_names
-    rate = safety.values("max_rate", names)
+    servo_rate = np.array([joint.max_velocity for joint in robot.joints])
+    rate = frozen(np.minimum(safety.values("max_rate", names), servo_rate))
     return GateLimits(
         joint_names=names,
         lower=lower,

@@ -146,6 +146,16 @@ def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():
     assert command[1] == command[2] == 0.3  # untouched, bit by bit
 
 
+def test_no_rate_is_beyond_the_servos_own():
+    joints = list(ROBOT.joints)
+    joints[2] = dataclasses.replace(joints[2], max_velocity=0.3)
+    limits = gate_limits(dataclasses.replace(ROBOT, joints=tuple(joints)))
+    assert limits.rate[1:4].tolist() == [4.0, 0.3, 4.0]
+    assert limits.ramp_rate[1:4].tolist() == [0.5, 0.3, 0.5]
+    assert limits.facts()["temperature"] == "70.0"
+    assert limits.facts()["rate"].startswith("[4.0, 4.0, 0.3, 4.0, ")
+
+
 def test_limits_that_are_missing_are_named_with_an_example():
     bare = dataclasses.replace(ROBOT, safety=None)
     with pytest.raises(UsageError) as refused:
