@@ -13,6 +13,29 @@ from .mean_cycle import MeanCycle
 from .response import Chart
 
 
+_SHORT = {
+    "/joint_current": "Current",
+    "/joint_voltage": "Voltage",
+    "/joint_temperature": "Temperature",
+    "/joint_velocity": "Velocity",
+    "/energy_ledger": "Ledger",
+}
+_UNITS = {"degC": "°C"}
+
+
+def signal_title(topic: str, unit: str) -> str:
+    """A title short enough for a tab.
+
+    Args:
+        topic: A JointState topic.
+        unit: Of its values.
+
+    Returns:
+        For example ``Current [A]``; another make's topics keep their names.
+    """
+    return f"{_SHORT.get(topic, topic.lstrip('/'))} [{_UNITS.get(unit, unit)}]"
+
+
 @dataclass(frozen=True)
 class Signal:
     """A quantity of all joints that is shown as logged.

@@ -19,7 +19,7 @@ from capture.arrays import FloatArray, IntArray
 from . import body, gait, joints, markers, power, ranges, trail
 from .blueprint import build_blueprint
 from .colors import power_limit
-from .content import Content, Signal, Start
+from .content import Content, Signal, Start, signal_title
 from .facts import log_facts
 from .live_bars import CycleBars
 from .live_cycles import CycleMeter
@@ -99,7 +99,7 @@ class LiveScene:
             has_events=self._has_events,
             signals=tuple(
                 Signal(
-                    f"{topic.lstrip('/')} [{self._log.unit(topic)}]",
+                    signal_title(topic, self._log.unit(topic)),
                     plot.series,
                     self._of_joints[topic],
                 )

@@ -27,7 +27,7 @@ from capture.robot.kinematics import rotation_from_quaternion
 
 from . import facts, gait, joints, power
 from .blueprint import build_blueprint
-from .content import Content, Signal, Start
+from .content import Content, Signal, Start, signal_title
 from .cycles import cycle_tables, log_cycles
 from .heat_maps import heat_maps, log_maps
 from .layer import Layer, Named
@@ -294,7 +294,7 @@ def _signals(
     for topic, series in plots.signals.items():
         unit = session.channels[topic].metadata.get("unit", "rad")
         of_joints = any(name in palette for one in series for name in one.names)
-        found.append(Signal(f"{topic.lstrip('/')} [{unit}]", series, of_joints))
+        found.append(Signal(signal_title(topic, unit), series, of_joints))
     return tuple(found)
 
 
