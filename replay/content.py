@@ -12,7 +12,6 @@ from .joints import Places, Series
 from .mean_cycle import MeanCycle
 from .response import Chart
 
-
 _SHORT = {
     "/joint_current": "Current",
     "/joint_voltage": "Voltage",
