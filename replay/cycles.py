@@ -21,9 +21,10 @@ from analysis.result import Analysis
 from analysis.result_over_time import JointOverTime
 from capture.arrays import FloatArray, IntArray
 
-from .joints import Color, Series, log_scalars
+from .joints import GREY, Color, Series, log_rows, part_entity
 from .timeline import Clock
 from .tracks import Track
+from .tracks import tables as tables_of
 
 CYCLES = "/cycles"
 
@@ -144,7 +145,6 @@ def log_cycles(
         Each quantity with where it was written.
     """
     found: list[tuple[Quantity, tuple[Series, ...]]] = []
-    look = rr.SeriesLines.from_fields(interpolation_mode=InterpolationMode.StepAfter)
     for quantity in dict.fromkeys(table.quantity for table in tables):
         tracks = [
             track
@@ -152,10 +152,21 @@ def log_cycles(
             if table.quantity == quantity
             for track in _steps(table, clock.start_ns)
         ]
-        series = log_scalars(rec, clock, f"{CYCLES}/{quantity.key}", tracks, palette)
-        for one in series:
-            rec.log(one.entity, look, static=True)
-        found.append((quantity, series))
+        parts = tables_of(tracks)
+        series: list[Series] = []
+        for part in parts:
+            entity = f"{CYCLES}/{quantity.key}"
+            entity = entity if len(parts) == 1 else part_entity(entity, part.names[0])
+            look = rr.SeriesLines(
+                names=list(part.names),
+                colors=[palette.get(name, GREY) for name in part.names],
+                interpolation_mode=InterpolationMode.StepAfter,
+            )
+            rec.log(entity, look, static=True)
+            rec.flush()  # else what comes first in the file is chance
+            log_rows(rec, clock, entity, part.t_ns, part.values)
+            series.append(Series(entity, part.names))
+        found.append((quantity, tuple(series)))
     return tuple(found)
 
 

@@ -246,6 +246,7 @@ def _log_shapes(
     whole, still = f"{BODY}/{name}", f"{BODY}/on_session_time/{name}"
     for entity in (whole, still):
         rec.log(entity, look, static=True)
+    rec.flush()  # else what comes first in the file is chance
     rec.send_columns(whole, _times(), capsule_columns(robot, (origin, quaternion), colors))
     first = capsule_columns(robot, (origin[:1], quaternion[:1]), colors[:1])
     for _, times in clock.rows(np.array([clock.start_ns], dtype=np.int64)):
@@ -282,6 +283,7 @@ def _log_line(
     rec: rr.RecordingStream, entity: str, line: rr.SeriesLines, angle_rad: FloatArray
 ) -> None:
     rec.log(entity, line, static=True)
+    rec.flush()
     rec.send_columns(entity, _times(), rr.Scalars.columns(scalars=np.degrees(angle_rad)))
 
 
@@ -297,6 +299,7 @@ def _log_joints(
         return ()
     colors = [palette.get(name, GREY) for name in names]
     rec.log(entity, rr.SeriesLines(names=list(names), colors=colors), static=True)
+    rec.flush()
     size = np.full(DEGREES.size, len(names))
     columns = rr.Scalars.columns(scalars=values.ravel()).partition(size)
     rec.send_columns(entity, _times(), columns)

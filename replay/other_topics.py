@@ -77,6 +77,7 @@ def log_others(
             rr.escape_entity_path_part(part) for part in topic.strip("/").split("/")
         )
         log_look(rec, entity, lines, joint_palette(lines))
+        rec.flush()  # else what comes first in the file is chance
         for table in _tables(session, topic):
             known = [line for line in lines if line in table.columns]
             values = np.full((len(table), len(lines)), np.nan)
