@@ -67,10 +67,11 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/sources.py
 	$(BIN)/python bench/record_buses.py
 	$(BIN)/python bench/live_view.py
+	$(BIN)/python bench/live_lag.py
 	$(BIN)/python bench/one_hour.py
 	$(BIN)/python bench/analyse_hour.py
 	$(BIN)/python bench/twin_step.py
-	$(BIN)/python bench/replay_convert.py 5
+	$(BIN)/python bench/replay_convert.py --minutes 5
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html

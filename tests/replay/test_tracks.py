@@ -3,7 +3,14 @@
 import numpy as np
 
 from replay.sampling import hold, interpolate
-from replay.tracks import Track, resampled, tables, without_filler
+from replay.tracks import (
+    Track,
+    brought_together,
+    in_turn,
+    resampled,
+    tables,
+    without_filler,
+)
 
 T = np.arange(5, dtype=np.int64) * 10
 
@@ -43,3 +50,21 @@ def test_resampling_puts_columns_in_order_and_leaves_unknown_joints_nan():
     np.testing.assert_array_equal(
         resampled([track("b", T + 5)], ("b",), T[1:3], hold), [[0.0], [1.0]]
     )
+
+
+def test_joints_in_turn_have_one_sample_between_two_of_the_first():
+    t = 10 * np.arange(5, dtype=np.int64)
+    assert in_turn(t, t + 3)
+    assert in_turn(t, t - 3)
+    assert in_turn(t[[0, 1, 3, 4]], t[[0, 1, 3, 4]] + 3)  # a pause of both
+    assert not in_turn(t, t[::2] + 3)
+    assert not in_turn(t, np.sort(np.concatenate([t + 3, t + 6])))
+    assert not in_turn(t, t[:0])
+
+
+def test_joints_in_turn_are_brought_to_the_first_ones_times():
+    table = brought_together([track("a"), track("b", T - 4, 0.1 * (T - 4))])
+    assert table.names == ("a", "b")
+    np.testing.assert_array_equal(table.t_ns, T)
+    np.testing.assert_allclose(table.values[:-1, 1], 0.1 * T[:-1], atol=1e-12)
+    assert np.isnan(table.values[-1, 1])  # nothing comes after it

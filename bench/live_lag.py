@@ -1,0 +1,212 @@
+"""How late a live view is: from a sample's own time to its being in the viewer, end to end.
+
+A session of the twin (25 joints, all topics) goes in real time through the feed that a recorder
+has, to ``undulog view --live`` in a process of its own, and to Rerun's viewer in a third, which
+draws off screen. The viewer is asked, some sixty times a second, how far its data reach and where
+its time cursor stands; what that is behind the clock is the lag, the asking included (about 13 ms,
+printed). The first quarter is left out: the viewer builds its views then.
+
+The bar is held to the median and to nine of ten: beyond, one sees when the machine's scheduler let
+the three processes wait, of which the load average printed tells. On a machine without a graphics
+card the viewer draws in software and takes a core of its own.
+
+Run: python bench/live_lag.py [--scenario weak-servo-pi3] [--size 1440x900]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+from live_view import wait_for
+from mcap.reader import make_reader
+from mcap.records import Metadata
+from rerun.experimental import ViewerClient
+
+from capture.daemon.live_feed import LiveFeed
+from capture.log.sink import Description
+from replay.timeline import SESSION_TIME
+from replay.viewer import LOOPBACK, free_ports, viewer_binary
+
+LAG_MS = 150.0
+"""The bar."""
+TICK_NS = 5_000_000
+LOOK_S = 0.003
+
+Message = tuple[int, int, int, int, bytes]
+
+
+class Watch(threading.Thread):
+    """Asks the viewer how far it is."""
+
+    def __init__(self, client: ViewerClient, start_ns: int) -> None:
+        """Begin to ask.
+
+        Args:
+            client: The viewer.
+            start_ns: Monotonic time of the session's zero [ns].
+        """
+        super().__init__(daemon=True)
+        self._client, self._start_ns = client, start_ns
+        self.ending = threading.Event()
+        self.data_ms: list[float] = []
+        self.cursor_ms: list[float] = []
+        self.asking_ms: list[float] = []
+
+    def run(self) -> None:
+        """Ask until told to end."""
+        while not self.ending.wait(LOOK_S):
+            asked = time.monotonic_ns()
+            state = self._client.get_state()
+            now = time.monotonic_ns()
+            self.asking_ms.append((now - asked) / 1e6)
+            for recording in state.recordings:
+                for line in recording.timelines:
+                    if line.name == SESSION_TIME and line.end:
+                        self.data_ms.append((now - self._start_ns - line.end) / 1e6)
+                if recording.current_timeline == SESSION_TIME and recording.current_time:
+                    behind = now - self._start_ns - recording.current_time
+                    self.cursor_ms.append(behind / 1e6)
+
+
+def read(path: Path) -> tuple[list[Description], list[Message], int]:
+    """What explains a session, its messages, and the Unix time of its zero [ns]."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        assert summary is not None
+        facts = list(reader.iter_metadata())
+        definitions: list[Description] = [
+            *facts,
+            *summary.schemas.values(),
+            *summary.channels.values(),
+            *reader.iter_attachments(),
+        ]
+        messages = [
+            (m.channel_id, m.log_time, m.publish_time, m.sequence, m.data)
+            for _, _, m in reader.iter_messages()
+        ]
+    return definitions, messages, epoch_of(facts, messages[0][1])
+
+
+def epoch_of(facts: list[Metadata], first_ns: int) -> int:
+    """The Unix time of a session's zero [ns]."""
+    for one in facts:
+        if one.name == "undulog" and one.metadata.get("epoch_ns", "").isdecimal():
+            return int(one.metadata["epoch_ns"])
+    return first_ns
+
+
+def send(feed: LiveFeed, messages: list[Message], epoch_ns: int, start_ns: int) -> None:
+    """Offer messages when their time has come, in ticks of 5 ms as a recorder."""
+    sent = tick = 0
+    while sent < len(messages):
+        now_ns = time.monotonic_ns() - start_ns
+        while sent < len(messages) and messages[sent][1] - epoch_ns <= now_ns:
+            feed.offer(*messages[sent])
+            sent += 1
+        feed.pump()
+        tick += 1
+        time.sleep(max(start_ns + tick * TICK_NS - time.monotonic_ns(), 0) * 1e-9)
+
+
+def connected(address: str) -> ViewerClient:
+    """The viewer, once it answers."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            client = ViewerClient.connect(address)
+            client.get_state()
+        except (ConnectionError, RuntimeError, TimeoutError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
+        else:
+            return client
+
+
+def measure(session: Path, folder: Path, size: str) -> bool:
+    """Show a session as it is recorded, and print how late; whether the bar is met."""
+    (port,) = free_ports(1)
+    place = ["--bind", LOOPBACK, "--port", str(port)]
+    address = f"rerun+http://{LOOPBACK}:{port}/proxy"
+    viewer = subprocess.Popen(
+        [str(viewer_binary()), "--headless", "--window-size", size, *place],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    path = folder / "live.sock"
+    relay = subprocess.Popen(
+        [sys.executable, "-m", "undulog", "view", "--live", str(path), "--connect", address]
+    )
+    feed = LiveFeed(path)
+    try:
+        client = connected(address)
+        wait_for(path.is_socket)
+        definitions, messages, epoch_ns = read(session)
+        for one in definitions:
+            feed.define(one)
+
+        def found() -> bool:
+            feed.pump()
+            return feed.connected
+
+        wait_for(found)
+        start_ns = time.monotonic_ns() + 200_000_000
+        watch = Watch(client, start_ns)
+        watch.start()
+        send(feed, messages, epoch_ns, start_ns)
+        watch.ending.set()
+        watch.join()
+    finally:
+        feed.close()
+        relay.terminate()
+        relay.wait()
+        viewer.terminate()
+        viewer.wait()
+    return report(watch)
+
+
+def report(watch: Watch) -> bool:
+    """Print the lags; whether the bar is met."""
+    good: list[bool] = []
+    for what, values in (("in the viewer", watch.data_ms), ("at its cursor", watch.cursor_ms)):
+        p50, p90, p99 = np.percentile(values[len(values) // 4 :], [50, 90, 99])
+        met = p90 <= LAG_MS
+        good.append(bool(met))
+        print(
+            f"{'PASS' if met else 'FAIL'}  lag {what}: median {p50:.0f}, 90 % within {p90:.0f}, "
+            f"99 % within {p99:.0f} ms (bar: 90 % within {LAG_MS:g} ms)"
+        )
+    load, _, _ = os.getloadavg()
+    asking = np.median(watch.asking_ms)
+    print(f"      asking took {asking:.0f} ms; load average {load:.1f} on {os.cpu_count()} cores")
+    return all(good)
+
+
+def main() -> None:
+    """Record a session of the twin, show it, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenario", default="weak-servo-pi3")
+    parser.add_argument("--size", default="1440x900", help="of the viewer's window")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
+        session = Path(folder) / "run.mcap"
+        run = ["sim", "run", options.scenario, "-o", str(session)]
+        command = [sys.executable, "-m", "undulog", *run]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        good = measure(session, Path(folder), options.size)
+    sys.exit(0 if good else 1)
+
+
+if __name__ == "__main__":
+    main()
