@@ -32,6 +32,7 @@ from .ending import Ending
 from .faults import MUTE, FaultKind, GateFault
 from .limits import GateLimits
 from .outcome import How, Outcome
+from .pose import why_not_from
 from .ramp import Ramp
 from .status import JointStatus
 from .watch import Watch
@@ -39,8 +40,6 @@ from .yielding import Yielding
 
 POSE_S = 2.0
 """So long the gate waits for the pose of every joint [s]."""
-
-_SHOWN = 8
 
 
 class Phase(StrEnum):
@@ -214,35 +213,20 @@ class Gate:
         """Start from the pose, once it is known; None while it isn't."""
         waited_s = tick / self._rate_hz
         if heard.trouble is not None:
-            raise SourceError(self._place, f"nothing was sent: {heard.trouble.text}")
+            raise SourceError(self._place, f"no command was sent: {heard.trouble.text}")
         if stop:
-            self.outcome = Outcome(How.STOPPED, stop, "nothing was sent")
+            self.outcome = Outcome(How.STOPPED, stop, "no command was sent")
             self.phase = Phase.DONE
             return None
-        unknown = np.isnan(heard.status.angle)
         if waited_s < self._listen_s:
             return None
         if self._listen_s and heard.another_robot is not None:
-            raise UsageError(f"{self._place}: nothing was sent: {heard.another_robot}")
-        if unknown.any() and waited_s < POSE_S:
-            return None
-        names = self._limits.joint_names
-        if unknown.any():
-            silent = _listed(tuple(names[i] for i in np.flatnonzero(unknown)), len(names))
-            raise SourceError(
-                self._place,
-                f"nothing was sent: the pose is not known, {silent} told no angle within "
-                f"{waited_s:.2g} s; is the robot switched on, and does it report unasked?",
-            )
+            raise UsageError(f"{self._place}: no command was sent: {heard.another_robot}")
         angle, limits = heard.status.angle, self._limits
-        beyond = np.maximum(limits.lower - angle, angle - limits.upper)
-        worst = int(np.argmax(beyond - limits.tracking_error))
-        if beyond[worst] > limits.tracking_error[worst]:
-            raise SourceError(
-                self._place,
-                f"nothing was sent: {names[worst]} is at {angle[worst]:.3f} rad, "
-                f"{beyond[worst]:.3f} rad beyond its limits; bring it back by hand",
-            )
+        if np.isnan(angle).any() and waited_s < POSE_S:
+            return None
+        if (why := why_not_from(angle, limits, waited_s)) is not None:
+            raise SourceError(self._place, f"no command was sent: {why}")
         clamp = self._clamp = Clamp(limits, angle, 1.0 / self._rate_hz)
         first = self._first = self._gait.step(0.0, heard.readings)
         target = np.clip(first.command, limits.lower, limits.upper)
@@ -255,7 +239,7 @@ class Gate:
         joint = int(np.argmax(far))
         self._become(
             Phase.APPROACH,
-            f"{self._way.duration_s:.2g} s to the first pose, {names[joint]} has the longest way, "
+            f"{self._way.duration_s:.2g} s to the first pose, {limits.joint_names[joint]} has the longest way, "
             f"from {clamp.last[joint]:.3f} to {target[joint]:.3f} rad",
         )
         return clamp
@@ -306,7 +290,11 @@ class Gate:
         found = self._trouble(tick, heard, clamp)
         if found is not None and (self.phase is not Phase.ENDING or found.kind in MUTE):
             self._fail(found, clamp, heard.status)
-        elif at_once:
+            return
+        if found is not None and f"{found.kind} {found.joint}" not in self._said:
+            self._said.add(f"{found.kind} {found.joint}")
+            self._remark("error", f"fault while ending: {found.text}")
+        if at_once:
             self._halt(f"{stop}, twice")
         elif stop and self.phase is not Phase.ENDING:
             self.outcome = Outcome(How.STOPPED, stop, "")
@@ -323,6 +311,7 @@ class Gate:
         return self._watch.look(tick / self._rate_hz, heard.status, clamp.last)
 
     def _fail(self, fault: GateFault, clamp: Clamp, status: JointStatus) -> None:
+        self._said.add(f"{fault.kind} {fault.joint}")
         self._remark("error", f"fault: {fault.text}")
         if self.outcome is None or self.outcome.how is How.STOPPED:
             self.outcome = Outcome(How.FAULT, fault.text, "", fault)
@@ -385,10 +374,3 @@ class Gate:
                     self._said.add(f"{key} {names[i]}")
                     said = text.format(rate=limits.rate[i], current=limits.current[i])
                     self._remark("warn", f"gate: {names[i]}: {said}")
-
-
-def _listed(names: tuple[str, ...], of: int) -> str:
-    if len(names) == of:
-        return f"all {of} joints"
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

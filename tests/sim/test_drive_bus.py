@@ -386,7 +386,7 @@ def test_a_bus_of_another_robot_is_refused_before_anything_is_sent(capsys, tmp_p
     frame = can.Message(arbitration_id=0x14B, data=bytes(8), is_extended_id=False)
     code, said = refused("gate-other", lambda bus: bus.send(frame), capsys, tmp_path)
     assert code == 2
-    assert "nothing was sent: another robot is on this bus: of " in said
+    assert "no command was sent: another robot is on this bus: of " in said
     assert "frames heard 0 are of snake25; others have the identifiers 14B" in said
 
 
@@ -401,14 +401,14 @@ def test_joints_that_say_nothing_are_named(capsys, tmp_path):
 
     code, said = refused("gate-silent", say, capsys, tmp_path)
     assert code == 1
-    assert "nothing was sent: the pose is not known, joint07 told no angle within 2 s" in said
+    assert "no command was sent: the pose is not known, joint07 told no angle within 2 s" in said
 
 
 def test_somebody_who_commands_already_is_not_joined(capsys, tmp_path):
     frame = can.Message(arbitration_id=0x103, data=bytes(2), is_extended_id=False)
     code, said = refused("gate-two", lambda bus: bus.send(frame), capsys, tmp_path)
     assert code == 1
-    assert "nothing was sent: somebody else commands snake25 on this bus: frame 103" in said
+    assert "no command was sent: somebody else commands snake25 on this bus: frame 103" in said
 
 
 @contextmanager
@@ -512,7 +512,7 @@ def test_nobody_there_exits_1(capsys, tmp_path):
 
 def test_a_robot_that_says_nothing_is_sent_nothing(tmp_path):
     answers = SOCKETCAND | {"undulog": b"< undulog virtual-robot snake25 paced >"}
-    silent = pytest.raises(SourceError, match=r"nothing was sent: the pose is not known, all 25")
+    silent = pytest.raises(SourceError, match=r"no command was sent: the pose is not known, all 25")
     with plain_server(answers) as (on, heard), silent:
         drive_bus(planned("flat", on, tmp_path / "a.mcap", duration_s=5.0), stop=StopRequest())
     assert heard == ["undulog", "open", "rawmode"]

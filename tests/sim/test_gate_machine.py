@@ -129,11 +129,11 @@ def test_a_bus_that_has_to_be_listened_to_is():
 @pytest.mark.parametrize(
     ("more", "error", "told"),
     [
-        ({"another_robot": "another robot"}, UsageError, "nothing was sent: another robot"),
+        ({"another_robot": "another robot"}, UsageError, "no command was sent: another robot"),
         (
             {"trouble": GateFault(FaultKind.STRANGER, "somebody else commands")},
             SourceError,
-            "nothing was sent: somebody else commands",
+            "no command was sent: somebody else commands",
         ),
     ],
 )
@@ -249,11 +249,28 @@ def test_asked_to_stop_it_ends_and_asked_again_at_once():
     assert bench.gate.outcome.why == "asked, twice"
 
 
+def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
+    bench = Bench(duration_s=60.0)
+    bench.until(Phase.RUN)
+    for _ in range(50):
+        bench.step()
+    remarks = list(bench.step(stop="asked").remarks)
+    while bench.gate.phase is Phase.ENDING:
+        remarks += bench.step(stop="asked", temperature=99.0).remarks
+    said = [text for level, text in remarks if level == "error"]
+    assert said == ["fault while ending: joint01: temperature 99 degC, more than 70 degC for 0.3 s"]
+    assert bench.gate.outcome.how is How.STOPPED
+    np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
+
+
 def test_asked_to_stop_before_anything_was_sent_nothing_is():
     bench = Bench(listen_s=1.0)
     bench.step()
     assert bench.step(stop="asked").command is None
-    assert (bench.gate.outcome.how, bench.gate.outcome.ended) == (How.STOPPED, "nothing was sent")
+    assert (bench.gate.outcome.how, bench.gate.outcome.ended) == (
+        How.STOPPED,
+        "no command was sent",
+    )
 
 
 def test_a_gait_that_says_nonsense_moves_nothing():
