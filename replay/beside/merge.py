@@ -6,17 +6,22 @@ recording is moved along the timelines.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from ..timeline import GAIT_CYCLE, SESSION_TIME
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
+_AHEAD = 32
+"""Chunks that may wait to be written."""
+
 _PROPERTIES = "/__properties/**"
 
 
@@ -42,6 +47,28 @@ def chunks_of(
         return chunk if chunk.is_static or not moves else _moved(chunk, moves)
 
     return RrdReader(recording).stream().drop(content=_PROPERTIES).map(placed)
+
+
+def send(rec: rr.RecordingStream, streams: Sequence[LazyChunkStream]) -> None:
+    """Write chunks as they are read.
+
+    Left to itself the reader runs ahead of the writer, and hours of chunks, unpacked, wait in
+    between; so now and then it waits until all are written.
+
+    Args:
+        rec: The recording.
+        streams: The chunks.
+    """
+    count = 0
+
+    def waiting(chunk: Chunk) -> Chunk:
+        nonlocal count
+        count += 1
+        if count % _AHEAD == 0:
+            rec.flush()
+        return chunk
+
+    rec.send_chunks(LazyChunkStream.merge(*streams).map(waiting))
 
 
 def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:

@@ -26,7 +26,7 @@ from . import bars, dress, lines, words
 from .alignment import Align, Aligned
 from .difference import angle_differences, log_differences
 from .layout import APART, Shown, build_blueprint
-from .merge import chunks_of
+from .merge import chunks_of, send
 from .placement import Placement, head_distance, placement, told_placed
 from .words import Found
 
@@ -131,7 +131,7 @@ def write_beside(
             rec.send_recording_name(", ".join(names))
             rec.send_recording_start_time_nanos(sides[0].start_ns)
             check_stop(path, stop)
-            rec.send_chunks(merged(sessions))
+            send(rec, [_chunks(one) for one in sessions])
             check_stop(path, stop)
             shown = _log(rec, sessions, found, placements, how)
             quantities = bars.log_bars(
@@ -156,25 +156,15 @@ def write_beside(
     return Beside(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
 
 
-def merged(sessions: Sequence[Converted]) -> LazyChunkStream:
-    """The sessions' recordings as one stream, each under its name and on the common timelines.
-
-    Args:
-        sessions: The sessions.
-
-    Returns:
-        The stream, which reads when it is used.
-    """
-    streams = [
-        chunks_of(
-            one.recording.path,
-            one.aligned.side.entity,
-            later_ns=one.aligned.side.start_ns - one.aligned.ruler.zero_ns,
-            more_cycles=one.aligned.ruler.cycles,
-        )
-        for one in sessions
-    ]
-    return LazyChunkStream.merge(*streams)
+def _chunks(one: Converted) -> LazyChunkStream:
+    """A session's own recording under its name and on the common timelines."""
+    side, ruler = one.aligned.side, one.aligned.ruler
+    return chunks_of(
+        one.recording.path,
+        side.entity,
+        later_ns=side.start_ns - ruler.zero_ns,
+        more_cycles=ruler.cycles,
+    )
 
 
 @dataclass(frozen=True)
