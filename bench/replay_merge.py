@@ -116,7 +116,7 @@ def main(minutes: float) -> None:
         best, with_views = (min(wall for wall, _ in times) for times in (merges, whole))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         print(
-            f"bar {BAR_S:g} s: merge {best:.2f} s, with views {with_views:.2f} s, the best of three; "
+            f"bar {BAR_S:g} s: merge {best:.2f} s, with views {with_views:.2f} s, best of three; "
             f"peak memory {peak:.0f} MB, all in all"
         )
         part = folder / "rows.rrd"
