@@ -239,8 +239,8 @@ class Gate:
         joint = int(np.argmax(far))
         self._become(
             Phase.APPROACH,
-            f"{self._way.duration_s:.2g} s to the first pose, {limits.joint_names[joint]} has the longest way, "
-            f"from {clamp.last[joint]:.3f} to {target[joint]:.3f} rad",
+            f"{self._way.duration_s:.2g} s to the first pose, {limits.joint_names[joint]} has the "
+            f"longest way, from {clamp.last[joint]:.3f} to {target[joint]:.3f} rad",
         )
         return clamp
 
