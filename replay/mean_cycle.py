@@ -150,7 +150,9 @@ def log_mean_cycle(
         return None
     asked = mean_cycles(channels.commanded, pace)
     power = mean_cycles(channels.mechanical, pace)
-    rec.log(ABOUT, rr.TextDocument(_about(pace, moved), media_type="text/markdown"), static=True)
+    steady = analysis is None or analysis.gait.frequency_hz.value is not None
+    about = _about(pace, moved, steady=steady)
+    rec.log(ABOUT, rr.TextDocument(about, media_type="text/markdown"), static=True)
     error: tuple[Series, ...] = ()
     if asked is not None:
         both = tuple(name for name in moved.names if name in asked.names)
@@ -174,7 +176,7 @@ def _times() -> list[rr.TimeColumn]:
     return [rr.TimeColumn(ENSEMBLE_CYCLE, sequence=DEGREES)]
 
 
-def _about(pace: Pace, moved: MeanCycles) -> str:
+def _about(pace: Pace, moved: MeanCycles, *, steady: bool) -> str:
     fewest, most = int(moved.cycles.min()), int(moved.cycles.max())
     count = f"{fewest} to {most} cycles" if fewest < most else f"{most} cycle{'s' * (most > 1)}"
     zero = "at the crest of the first driven joint's command (no phase was logged)"
@@ -183,6 +185,8 @@ def _about(pace: Pace, moved: MeanCycles) -> str:
     interval = "One cycle has no scatter, so there is no interval."
     if most > 1:
         interval = "Thin lines are the 95 % interval of the mean."
+    if not steady:
+        interval += " No steady gait was found: what changes as it goes is mixed here."
     return (
         f"**To play it, choose `{ENSEMBLE_CYCLE}` in the time panel below** instead of "
         "`session_time`: 0 to 360 degrees of the gait's phase, looped at the gait's own speed.\n\n"

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import undulog
 from analysis.analyse import measure_session
 from analysis.cycles import cycle_maps
+from analysis.result import Estimate
 from analysis.result_artefact import Artefact
 from capture import Session
 from replay.cycles import cycle_tables
@@ -121,6 +122,16 @@ def test_one_cycle_has_no_interval_and_says_so(recording):
     words = recorded.static("/ensemble/about", "TextDocument:text")[0]
     assert "Mean of 1 cycle, 0.0 to 2.0 s" in words
     assert "there is no interval" in words
+
+
+def test_a_gait_that_changes_is_averaged_and_says_so(session_file, analysis, tmp_path, read_back):
+    none = dataclasses.replace(analysis.gait, frequency_hz=Estimate())
+    with Session.open(session_file) as session:
+        changing = dataclasses.replace(analysis, gait=none)
+        write_recording(session, tmp_path / "a.rrd", analysis=changing)
+    words = read_back(tmp_path / "a.rrd").static("/ensemble/about", "TextDocument:text")[0]
+    assert "No steady gait was found" in words
+    assert "0.0 to 3.0 s" in words  # all of the logged phase
 
 
 def test_the_twins_settled_motion_is_its_mean_cycle(twin):
