@@ -7,6 +7,7 @@ import pytest
 
 import undulog
 from analysis.compare.result import Comparison, NamedJoint
+from analysis.null_model.result import ModelledAnalysis, ModuleDeviation, NullModelResult
 from analysis.result import Coupling, Estimate, Provenance
 from analysis.result_experiment import Experiment, Reversal, Run, WeakModule
 from capture import Session
@@ -114,6 +115,34 @@ def test_a_comparison_names_what_differs_by_more_than_its_margins(
     assert layer.analysis == analysis
     assert [(one.joint, one.why) for one in layer.named] == [
         ("joint05", "answers differently in A and B, p < 0.001 (two.json)")
+    ]
+
+
+def test_a_session_held_to_a_model_names_the_module_that_deviates(session, analysis, tmp_path):
+    modules = (
+        ModuleDeviation("joint07", named=False, gain=1.0, p=0.6, relative={}),
+        ModuleDeviation("joint09", named=True, gain=40.0, p=0.0002, relative={}),
+    )
+    test = NullModelResult(
+        answer="joint09 deviates",
+        condition="conditional on the model",
+        file="null.json",
+        made_by="twin",
+        parameters=(),
+        fit=1.0,
+        fit_p=0.5,
+        p=0.0002,
+        modules=modules,
+        named=("joint09",),
+        rest_p=0.4,
+        draws=200,
+    )
+    values = {one.name: getattr(analysis, one.name) for one in dataclasses.fields(analysis)}
+    modelled = ModelledAnalysis(**values, null_model=test)
+    layer = saved(session, [modelled.save(tmp_path / "held.json")])
+    assert layer.analysis == modelled
+    assert [(one.joint, one.why) for one in layer.named] == [
+        ("joint09", "deviates from the others' model, p < 0.001 (held.json)")
     ]
 
 
