@@ -360,7 +360,10 @@ class LiveScene:
         parts = [f"**{'Recorded.' if ended else 'Recording.'}**", " · ".join(facts)]
         if notes:
             parts.append("\n".join(f"- {note}" for note in notes))
-        parts.append(f"{body_title(replace(content, live=False))}. Grey is commanded.")
+        legend = f"{body_title(replace(content, live=False))}. Grey is commanded."
+        if content.charts:
+            legend += " Bars are the last whole cycle of the gait."
+        parts.append(legend)
         return "\n\n".join(parts) + "\n"
 
 
