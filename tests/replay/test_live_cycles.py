@@ -1,6 +1,9 @@
 """Cycles computed while a session comes in are those of its analysis."""
 
+import os
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from replay.live_decode import LiveLog
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
 Recorder, Relay, EPOCH_NS = shared["Recorder"], shared["Relay"], shared["EPOCH_NS"]
 small_datagrams = shared["small_datagrams"]
+until, WAIT_S = shared["until"], shared["WAIT_S"]
 
 FREQUENCY_HZ = 0.8
 GAIN = 0.95
@@ -158,3 +162,44 @@ def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_pat
             np.testing.assert_allclose(
                 np.ravel(heights).astype(float), [of(cycle)[i] for cycle in expected], atol=1e-4
             )
+
+
+@pytest.mark.slow
+def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back):
+    """A recorder of the twin in real time, and a relay: two processes."""
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    environment.pop("RUNTIME_DIRECTORY", None)
+    session_file = tmp_path / "run.mcap"
+    words = ["record", "twin:weak-servo-pi3", "-o", str(session_file), "--duration", "12s"]
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "undulog", *words, "--quiet"], env=environment
+    )
+    try:
+        until(lambda: (tmp_path / "undulog").is_dir() or recorder.poll() is not None)
+        relay = Relay(tmp_path / "undulog" / "run.live", tmp_path / "live.rrd")
+        try:
+            report = relay.finish()
+        finally:
+            relay.process.kill()
+            relay.process.communicate()
+        assert recorder.wait(WAIT_S) == 0
+    finally:
+        recorder.kill()
+        recorder.wait()
+    assert report["dropped"] == report["unread"] == 0
+    drawn = read_back(tmp_path / "live.rrd")
+    with Session.open(session_file) as session:
+        joints = {one.name: one for one in analyse_session(session).over_time.joints}
+    names = drawn.static("/cycles/lag_degrees", "SeriesLines:names")
+    rows = drawn.column("/cycles/lag_degrees", "Scalars:scalars")
+    told = [
+        (name, lag)
+        for row in rows
+        for name, lag in zip(names, row, strict=True)
+        if np.isfinite(lag)
+    ]
+    assert len(told) >= 2 * 13
+    # A view that begins later counts its cycles from there; on a settled gait they are alike.
+    for name, lag in told:
+        known = [np.degrees(one) for one in joints[name].lag_rad if one is not None]
+        assert np.abs(np.array(known) - lag).min() < 0.05
