@@ -104,6 +104,29 @@ def build_blueprint(
     )
 
 
+def all_views(
+    shown: Sequence[Shown], bars: Sequence[Quantity], how: Align, title: str
+) -> rrb.Blueprint:
+    """Every view at once, none behind a tab: a layout to look for what isn't drawn.
+
+    Args:
+        shown: What was written of each session, the first one first.
+        bars: Quantities whose bars stand next to each other.
+        how: What happens at once.
+        title: Name of the bodies' view.
+
+    Returns:
+        The blueprint.
+    """
+    bodies = [one for one in shown if one.body]
+    views = [*([_scene(bodies, title)] if bodies else []), *_words(shown), *_both(shown)]
+    views += [*_differences(shown), *_bars(bars)]
+    for one in shown[1:]:
+        views += _bar_differences(one)
+    panel = rrb.TimePanel(state="collapsed", timeline=how.timeline)
+    return rrb.Blueprint(rrb.Grid(*views), panel, collapse_panels=True)
+
+
 def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
     """The first body's own view of the world, with all bodies in it."""
     first = bodies[0]

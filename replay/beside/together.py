@@ -67,7 +67,7 @@ def bring_together(
             step(f"recording of {name}")
             converted.append(Converted(one, *convert(session, folder / f"{k}.rrd")))
         step("side by side")
-        return write_beside(converted, path, how, place, stop)
+        return write_beside(converted, path, how, place=place, stop=stop)
 
 
 def steps(count: int) -> int:

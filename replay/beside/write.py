@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from rerun.chunk import LazyChunkStream
 
 from analysis.compare.compare import Choices, compare_seen
@@ -32,6 +33,8 @@ from .words import Found
 
 ANGLES = "/angles"
 """Differences of the measured angles, below a session's own path."""
+
+Layout = Callable[[Sequence[Shown], Sequence[bars.Quantity], Align, str], rrb.Blueprint]
 
 _APART_RATE_HZ = 25.0
 
@@ -86,8 +89,10 @@ def write_beside(
     sessions: Sequence[Converted],
     path: Path,
     how: Align,
+    *,
     place: Place = Place.START,
     stop: StopRequest | None = None,
+    layout: Layout = build_blueprint,
 ) -> Beside:
     """Bring converted sessions together.
 
@@ -97,6 +102,7 @@ def write_beside(
         how: What happens at once.
         place: Where the bodies are drawn.
         stop: Looked at now and then; once an end is asked for, nothing is written.
+        layout: Makes the blueprint from what was written.
 
     Returns:
         What was written.
@@ -148,7 +154,7 @@ def write_beside(
             )
             document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
             rec.log(words.FACTS, document, static=True)
-            rec.send_blueprint(build_blueprint(shown, quantities, how, title))
+            rec.send_blueprint(layout(shown, quantities, how, title))
         finally:
             rec.disconnect()
         require_whole(draft, path)
