@@ -249,9 +249,8 @@ class SocketcandServer:
                 del client.out[: client.sock.send(client.out)]
             except BlockingIOError:
                 pass
-            except OSError:
-                self._lose(client)
-                return
+            except OSError:  # it is gone; what it said before is still to be read, to its end
+                client.out.clear()
         self._watch(client)
 
     def _watch(self, client: BusClient) -> None:
