@@ -13,6 +13,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import can
 import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -22,9 +23,10 @@ from capture import SessionWriter, load_robot
 UNDULOG = (sys.executable, "-m", "undulog")
 LISTENER = Path(__file__).with_name("bus_listener.py")
 RATE_HZ = 100
+MARK = 0x7F0  # an identifier that nobody else uses
 STEP = math.radians(0.01)  # of a command on the bus
 JOINTS = ("joint01", "joint02", "joint03", "joint04")
-LIMIT, MAX_RATE, RAMP_RATE = math.radians(30.0), 4.0, 0.5
+LIMIT, MAX_RATE, RAMP_RATE = math.radians(30.0), 4.0, 1.0
 EPOCH_NS = 1_735_689_600_000_000_000
 WAIT_S = 90
 FRAME = np.dtype(
@@ -176,13 +178,15 @@ class Stage:
     """A virtual robot and a listener on its bus.
 
     Attributes:
-        on: Address of the bus.
-        port: Its port.
         robot: The robot's process.
+        bus: Name of the bus.
+        port: Its port.
+        on: Its address.
     """
 
-    def __init__(self, robot, listener, on, port, heard):
-        self.robot, self.on, self.port = robot, on, port
+    def __init__(self, robot, bus, port, listener, heard):
+        self.robot, self.bus, self.port = robot, bus, port
+        self.on = f"can:socketcand:{bus}?host=127.0.0.1&port={port}"
         self._listener, self._heard = listener, heard
 
     @property
@@ -212,9 +216,17 @@ class Stage:
             alive=[controller],
         )
 
-    def settle(self, quiet_s=1.0):
-        """Wait for a while in which something could still be sent; ends the listener."""
+    def settle(self, quiet_s=0.3):
+        """Wait for a while in which something could still be sent, and until all of it is heard.
+
+        A frame of our own is sent then: once the listener has it, it has all that came before.
+        """
         time.sleep(quiet_s)
+        if self.robot.poll() is None:
+            place = {"host": "127.0.0.1", "port": self.port, "channel": self.bus}
+            with can.Bus(interface="socketcand", **place) as bus:
+                bus.send(can.Message(arbitration_id=MARK, is_extended_id=False))
+                until(lambda: any(one["id"] == MARK for one in self.lines), "the mark is not heard")
         self._listener.send_signal(signal.SIGTERM)
         self._listener.wait(timeout=20)
 
@@ -223,12 +235,12 @@ class Stage:
 def staged(folder, scenario, *faults):
     """A virtual robot with faults to come, and a listener on its bus.
 
-    Times of faults are after the robot's first tick.
+    Times of faults are after the first command: the robot waits for it, and tells its pose.
     """
     ordered = [word for fault in faults for word in ("--fault", fault)]
     database, heard = folder / "listened.dbc", folder / "heard.jsonl"
     database.write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
-    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", "0", "--json", *ordered)
+    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", "0", "--wait", "--json", *ordered)
     with process(*serve) as robot:
         line = robot.stdout.readline()
         assert line, robot.stderr.read()
@@ -236,8 +248,7 @@ def staged(folder, scenario, *faults):
         words = (sys.executable, LISTENER, ready["port"], ready["bus"], database, heard)
         with process(*words) as listener:
             assert listener.stdout.readline() == "listening\n", listener.stderr.read()
-            on = f"can:socketcand:{ready['bus']}?host=127.0.0.1&port={ready['port']}"
-            yield Stage(robot, listener, on, ready["port"], heard)
+            yield Stage(robot, ready["bus"], ready["port"], listener, heard)
 
 
 # -- what was on the bus ------------------------------------------------------------------------
@@ -322,7 +333,7 @@ def check_session(path, lines):
     heard = commands_of(lines)
     for name, (_, angle) in heard.items():
         given = np.array([row[name] for _, row in written.commands])
-        assert len(given) == len(angle), name
+        assert len(given) == len(angle), (name, given[-5:], angle[-5:])
         assert np.abs(given - angle).max(initial=0.0) <= STEP / 2 * (1 + 1e-6), name
     on_bus = [(one["id"], one["data"]) for one in lines if (one["name"] or "").endswith("_command")]
     assert written.sent == on_bus  # bit by bit, and so nothing came after the end

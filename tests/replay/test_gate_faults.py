@@ -21,7 +21,7 @@ import pytest
 stage = runpy.run_path(str(Path(__file__).with_name("gate_stage.py")))
 staged, Written = stage["staged"], stage["Written"]
 SAFETY = stage["SAFETY"]
-FAULT_AT_S = 6.0  # of the robot's time: the controller has been at it for a while by then
+FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over by then
 LONG_S = 60.0
 ERROR = 40  # of rcl_interfaces/msg/Log
 
@@ -222,9 +222,10 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(
         on_stage.settle()
         lines = on_stage.lines
     assert controller.returncode == 2, err
-    assert "nothing was sent: another robot is on this bus" in err
+    assert "no command was sent: another robot is on this bus" in err
     assert "0 are of snake4; others have the identifiers 601" in err
-    assert {one["id"] for one in lines} == {1537, 1538, 1539, 1540}  # the robot's own states
+    states = {1537, 1538, 1539, 1540}
+    assert {one["id"] for one in lines} == {*states, stage["MARK"]}  # nobody else spoke
 
 
 # -- who is in charge goes ----------------------------------------------------------------------
