@@ -110,6 +110,7 @@ def _session(beside: Beside, place: int) -> dict[str, Any]:
     found, placed = beside.found[side.name], beside.placements.get(side.name)
     return facts | {
         "answer": words.answer(first, side, found),
+        "verdict": None if found.comparison is None else found.comparison.verdict,
         "changed": [{"name": c.name, "a": c.a, "b": c.b} for c in found.changed],
         "joints_compared": [name for series in one.differences for name in series.names],
         "placed": None

@@ -15,10 +15,11 @@ from capture import Session, SessionWriter, load_robot
 from capture.errors import LogWriteError
 from capture.interruption import StopRequest
 from capture.palette import joint_colors
-from replay.beside.alignment import Align, align
+from replay.beside.alignment import Align, align, times_of
 from replay.beside.layout import all_views
 from replay.beside.side import convert, read_side
 from replay.beside.write import Converted, write_beside
+from replay.timeline import Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
@@ -330,6 +331,24 @@ def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, tmp_p
     view(capsys, files[0], still, "--save", tmp_path / "x.rrd")
 
 
+def test_a_gait_that_runs_backwards_has_no_cycles_to_count(files, make, tmp_path, capsys):
+    back = make(tmp_path / "back.mcap", Wave(frequency_hz=-1.0, seconds=2.0))
+    words = ["--align", "phase", "--save", tmp_path / "x.rrd"]
+    assert "runs backwards in back" in view(capsys, files[0], back, *words, code=2)
+
+
+def test_a_phase_is_found_where_it_was_first_reached():
+    """A gait at 1 Hz that rests from 2 s to 3 s, and is not heard of from 5 s to 6 s."""
+    t = np.round(np.concatenate([np.arange(0, 5.005, 0.01), np.arange(6, 8.005, 0.01)]), 2)
+    cycles = np.where(t < 2, t, np.where(t < 3, 2.0, t - 1.0))
+    rhythm = Rhythm(np.round(t * 1e9).astype(np.int64), cycles)
+    wanted = np.array([-0.1, 0.0, 0.735, 2.0, 2.5, 3.9999, 4.0, 4.5, 5.0, 6.125, 7.0, 7.01, np.nan])
+    found, known = times_of(rhythm, wanted)
+    expected = [np.nan, 0.0, 0.735, 2.0, 3.5, 4.9999, 5.0, np.nan, 6.0, 7.125, 8.0, np.nan, np.nan]
+    np.testing.assert_array_equal(known, np.isfinite(expected))
+    np.testing.assert_allclose(found[known] * 1e-9, np.array(expected)[known], atol=1e-8)
+
+
 def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp_path, capsys):
     bare = make(tmp_path / "bare.mcap", Wave(seconds=2.0), robot=False)
     for pair in ((files[0], bare), (bare, files[0])):
@@ -433,6 +452,7 @@ def test_files_of_one_name_are_told_apart(files, tmp_path, capsys):
     told = json.loads(view(capsys, files[0], files[0], "--save", tmp_path / "x.rrd", "--json"))
     assert [one["name"] for one in told["sessions"]] == ["a 1", "a 2"]
     assert any("same content" in warning for warning in told["warnings"])
+    assert told["sessions"][1]["verdict"] == "same"
 
 
 @pytest.fixture(scope="module")
