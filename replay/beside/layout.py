@@ -13,7 +13,7 @@ from .. import gait, ranges
 from ..body import COMMANDED, MEASURED
 from ..content import Content
 from ..facts import FACTS as SESSION
-from ..joints import Places, Series
+from ..joints import Series
 from ..markers import LABELS, MARKERS
 from ..timeline import GAIT_CYCLE, SESSION_TIME
 from ..trail import TRAIL, TRAIL_SECONDS
@@ -39,7 +39,7 @@ class Shown:
         side: The session.
         content: Its own recording's.
         body: Whether its body is drawn.
-        places: Joints that stand for its body, or None.
+        lines: Whether its head, middle or tail was measured.
         differences: Its angles minus the first session's; none of the first.
         apart: Whether the distance of its head from the first one's was written.
         bars: Quantities that differ from the first session's.
@@ -48,7 +48,7 @@ class Shown:
     side: Side
     content: Content
     body: bool
-    places: Places | None
+    lines: bool
     differences: tuple[Series, ...] = ()
     apart: bool = False
     bars: tuple[Quantity, ...] = ()
@@ -159,7 +159,7 @@ def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
 
 def _both(shown: Sequence[Shown]) -> list[rrb.View]:
     found: list[rrb.View] = []
-    if any(one.places for one in shown):
+    if any(one.lines for one in shown):
         found.append(_plot("Head, middle, tail [°]", [f"{LINES}/**"]))
     powers = [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]
     if powers:

@@ -85,20 +85,23 @@ def places_in(other: Side, first: Places | None, own: Places | None) -> Places |
     return first if first is not None and set(first.names) <= known else own
 
 
-def log_lines(rec: rr.RecordingStream, one: Aligned, rank: int, places: Places) -> None:
+def log_lines(rec: rr.RecordingStream, one: Aligned, rank: int, places: Places | None) -> bool:
     """Write head, middle and tail of a session in degrees.
 
     Args:
         rec: The recording.
         one: The session.
         rank: Which session it is, 0 for the first, whose lines are solid.
-        places: The joints.
+        places: The joints, or None.
+
+    Returns:
+        Whether any of them was measured.
     """
     side, tracks = one.side, {track.name: track for track in one.side.measured}
-    for name, label in zip(places.names, places.labels, strict=True):
-        if name not in tracks:
-            continue
-        track = tracks[name]
+    named = () if places is None else zip(places.names, places.labels, strict=True)
+    measured = [(tracks[name], label) for name, label in named if name in tracks]
+    for track, label in measured:
+        name = track.name
         entity = f"{LINES}{side.entity}/{rr.escape_entity_path_part(label)}"
         title = f"{side.name}: {name}" if label == name else f"{side.name}: {name} {label}"
         log_look(rec, entity, [name], side.palette, titles={name: title}, width=_WIDTH)
@@ -106,6 +109,7 @@ def log_lines(rec: rr.RecordingStream, one: Aligned, rank: int, places: Places) 
         if rank:
             values = dashed(values, dashes_of(track.t_ns, rank))
         log_rows(rec, one.clock, entity, t_ns, values, degrees=True)
+    return bool(measured)
 
 
 def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None:

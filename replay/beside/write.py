@@ -236,9 +236,8 @@ def _log(
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     first = sessions[0]
     content = first.recording.content
-    if content.places is not None:
-        lines.log_lines(rec, first.aligned, 0, content.places)
-    shown = [Shown(first.aligned.side, content, content.start is not None, content.places)]
+    drawn = lines.log_lines(rec, first.aligned, 0, content.places)
+    shown = [Shown(first.aligned.side, content, content.start is not None, drawn)]
     for rank, one in enumerate(sessions[1:], start=1):
         name = one.aligned.side.name
         pair = _Pair(rank, found[name], placements.get(name))
@@ -258,15 +257,13 @@ def _log_other(
     a, b = first.aligned, one.aligned
     content = one.recording.content
     places = lines.places_in(b.side, first.recording.content.places, content.places)
-    if places is not None:
-        lines.log_lines(rec, b, pair.rank, places)
     comparison = pair.found.comparison
     angles = angle_differences(a, b, how)
     return Shown(
         b.side,
         content,
         content.start is not None,
-        places,
+        lines.log_lines(rec, b, pair.rank, places),
         log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, first.recording.content.measured),
         apart=_log_apart(rec, a, b, how, pair),
         bars=() if comparison is None else bars.log_differences(rec, a.side, b.side, comparison),
@@ -305,7 +302,7 @@ def _title(shown: Sequence[Shown]) -> str:
     """Name of the bodies' view: who is who."""
     first, *others = [one.side.name for one in shown if one.body] or [""]
     if not others:
-        return first
+        return f"{first}; the others have no body" if first else ""
     return f"{first} solid, {' and '.join(others)} as wireframe"
 
 

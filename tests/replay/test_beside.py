@@ -360,6 +360,21 @@ def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp
         assert not [e for e in found.entities if e.startswith("/bare/world")]
 
 
+def test_sessions_without_measured_angles_are_seen_too(chain, files, read_back, tmp_path, capsys):
+    with SessionWriter(tmp_path / "c.mcap", session_id="c", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
+        commands = w.joint_state("/joint_commands", NAMES, unit="rad")
+        for i in range(100):
+            commands.write(EPOCH_NS + i * 10_000_000, np.zeros(5))
+    out = view(capsys, tmp_path / "c.mcap", files[0], "--save", tmp_path / "x.rrd")
+    assert "note: c: no measured joint angles on /joint_states" in out
+    found = read_back(tmp_path / "x.rrd")
+    assert found.times("/c/joints/commanded").size == 100
+    assert {e for e in found.entities if e.startswith("/compared/places")} == {
+        f"/compared/places/a/{label}" for label in ("head", "middle", "tail")
+    }
+    assert "/compared/a/angles" not in found.entities
+
+
 def test_of_different_robots_the_joints_in_common_are_compared(make, read_back, tmp_path, capsys):
     long = make(tmp_path / "long.mcap", ROBOT)
     short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
