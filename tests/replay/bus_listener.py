@@ -44,7 +44,7 @@ def main():
                 "id": frame.arbitration_id,
                 "name": message.name if message else None,
                 "data": frame.data.hex(),
-                "signals": message.decode(frame.data) if message else {},
+                "signals": message.decode(frame.data, decode_choices=False) if message else {},
             }
             heard.write(json.dumps(told) + "\n")
 

@@ -117,14 +117,14 @@ def wave(times_s):
 
 
 def write_commands(path, robot, duration_s, *, names=JOINTS, commands=wave):
-    """A session of commands for a robot (its file, or none)."""
+    """A session of commands for a robot (its name or file)."""
     times_s = np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
     given = commands(times_s)
     with SessionWriter(
         path,
         session_id="recorded-before",
         epoch_ns=EPOCH_NS,
-        robot=load_robot(robot) if robot is not None else None,
+        robot=load_robot(robot),
         clock={"computer": "host"},
     ) as writer:
         channel = writer.joint_state("/joint_commands", names, unit="rad")
@@ -182,10 +182,11 @@ class Stage:
         bus: Name of the bus.
         port: Its port.
         on: Its address.
+        lockstep: Whether the robot waits for commands at each tick.
     """
 
-    def __init__(self, robot, bus, port, listener, heard):
-        self.robot, self.bus, self.port = robot, bus, port
+    def __init__(self, robot, bus, port, listener, heard, *, lockstep):
+        self.robot, self.bus, self.port, self.lockstep = robot, bus, port, lockstep
         self.on = f"can:socketcand:{bus}?host=127.0.0.1&port={port}"
         self._listener, self._heard = listener, heard
 
@@ -222,17 +223,22 @@ class Stage:
         A frame of our own is sent then: once the listener has it, it has all that came before.
         """
         time.sleep(quiet_s)
-        if self.robot.poll() is None:
+        if self.lockstep:  # the robot is silent where nobody commands it
+            heard = -1
+            while heard != (heard := len(self.lines)):
+                time.sleep(2.0)
+        elif self.robot.poll() is None:
             place = {"host": "127.0.0.1", "port": self.port, "channel": self.bus}
             with can.Bus(interface="socketcand", **place) as bus:
                 bus.send(can.Message(arbitration_id=MARK, is_extended_id=False))
                 until(lambda: any(one["id"] == MARK for one in self.lines), "the mark is not heard")
         self._listener.send_signal(signal.SIGTERM)
-        self._listener.wait(timeout=20)
+        _, complained = self._listener.communicate(timeout=20)
+        assert self._listener.returncode == 0, complained
 
 
 @contextmanager
-def staged(folder, scenario, *faults):
+def staged(folder, scenario, *faults, pace="--wait"):
     """A virtual robot with faults to come, and a listener on its bus.
 
     Times of faults are after the first command: the robot waits for it, and tells its pose.
@@ -240,7 +246,7 @@ def staged(folder, scenario, *faults):
     ordered = [word for fault in faults for word in ("--fault", fault)]
     database, heard = folder / "listened.dbc", folder / "heard.jsonl"
     database.write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
-    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", "0", "--wait", "--json", *ordered)
+    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", "0", pace, "--json", *ordered)
     with process(*serve) as robot:
         line = robot.stdout.readline()
         assert line, robot.stderr.read()
@@ -248,7 +254,8 @@ def staged(folder, scenario, *faults):
         words = (sys.executable, LISTENER, ready["port"], ready["bus"], database, heard)
         with process(*words) as listener:
             assert listener.stdout.readline() == "listening\n", listener.stderr.read()
-            yield Stage(robot, ready["bus"], ready["port"], listener, heard)
+            where = ready["bus"], ready["port"]
+            yield Stage(robot, *where, listener, heard, lockstep=pace == "--lockstep")
 
 
 # -- what was on the bus ------------------------------------------------------------------------

@@ -318,3 +318,32 @@ def test_without_a_fault_it_runs_to_its_end(plain, small, tmp_path):
             _, err, written = ended(on_stage, controller, path, code=0)
     assert "error" not in err
     assert not errors(written)
+
+
+@pytest.mark.slow
+def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
+    path = tmp_path / "a.mcap"
+    names = [f"joint{k + 1:02d}" for k in range(25)]
+
+    def wild(times_s):  # steps of all sizes, beyond the limits too
+        return np.random.default_rng(7).uniform(-0.8, 0.8, (len(times_s) // 20 + 1, 25))[
+            np.arange(len(times_s)) // 20
+        ]
+
+    steps = stage["write_commands"](
+        tmp_path / "steps.mcap", "snake25", 1.0, names=names, commands=wild
+    )
+    # In lockstep the robot waits for its commands: no machine is too slow for 25 joints.
+    with (
+        staged(tmp_path, "flat", pace="--lockstep") as on_stage,
+        on_stage.replay(steps, path) as controller,
+    ):
+        out, err = controller.communicate(timeout=120)
+        on_stage.settle()
+        lines = on_stage.lines
+    assert controller.returncode in {0, 1}, (out, err)  # such steps can be too much for the servos
+    stage["check_limits"](lines)
+    written = stage["check_session"](path, lines)
+    assert len(stage["commands_of"](lines)) == 25
+    cuts = [text for _, _, text in written.said if "command held back to 4 rad/s" in text]
+    assert cuts
