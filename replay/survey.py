@@ -76,6 +76,7 @@ def survey(session: Session, rate_hz: float) -> Survey:
     Returns:
         What it holds.
     """
+    session.forget()  # an hour's index, as pages of the file
     wanted = _carried(session)
     every = {topic: 1 + session.channels[topic].count // _KEPT for topic in wanted}
     thin = max(every.values(), default=1)
