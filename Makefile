@@ -11,7 +11,7 @@ DEMO   := out/demo
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow check format bench docs pictures lock clean
+.PHONY: help demo test slow check format bench docs pictures golden lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -72,6 +72,7 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/analyse_hour.py
 	$(BIN)/python bench/twin_step.py
 	$(BIN)/python bench/replay_convert.py --minutes 5
+	$(BIN)/python bench/first_picture.py 5
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
@@ -79,6 +80,9 @@ docs: $(READY)  ## the manual, as HTML under docs/_build/html
 pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
+
+golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
+	$(BIN)/python tests/replay/golden_pictures.py
 
 lock: $(READY)  ## renew requirements.lock (needs uv on the path)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \

@@ -1,8 +1,8 @@
 """The pictures of README and manual, from what ``make demo`` left.
 
 ``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
-screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), and the report's first
-figure as a picture of its own that follows the reader's light or dark scheme.
+screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the body's motion, and the
+report's first figure as a picture of its own that follows the reader's light or dark scheme.
 """
 
 import io
@@ -21,6 +21,8 @@ DEGREES = 90
 TITLE_BAR = 36
 """Height of the viewer's own title bar [pixels]; it warns of the software driver."""
 SIZE = (1440, 900 + TITLE_BAR)
+CLIP = ("--from", "12", "--to", "14", "--fps", "12", "--size", "720x406")
+"""One period of the gait, small enough for a page."""
 TABS = {"session": "replay", "cycles": "replay-cycles", "mean-cycle": "replay-mean-cycle"}
 
 
@@ -40,6 +42,13 @@ def replay_pictures(demo: Path, images: Path) -> None:
             picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
         shown = picture.crop((0, TITLE_BAR, *picture.size))
         shown.save(images / f"{name}.png", optimize=True)
+
+
+def clip(demo: Path, target: Path) -> None:
+    """The body's motion over one period."""
+    words = [demo / "session.mcap", "--clip", target, *CLIP, "--force"]
+    if undulog.run(["view", *map(str, words)]):
+        sys.exit(f"no clip of {demo / 'session.mcap'}")
 
 
 def response_picture(page: Path, target: Path) -> None:
@@ -63,6 +72,7 @@ def main(demo: Path, images: Path) -> None:
     """Make them all."""
     images.mkdir(parents=True, exist_ok=True)
     replay_pictures(demo, images)
+    clip(demo, images / "clip.gif")
     response_picture(demo / "report.html", images / "response.svg")
     for path in sorted(images.iterdir()):
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

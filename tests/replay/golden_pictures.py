@@ -95,27 +95,27 @@ def load(path):
         return np.asarray(picture.convert("RGB")).astype(int)
 
 
-def differing(found, golden):
-    """Which pixels of either picture have no like within a pixel in the other, shape (h, w)."""
-    return _lost(found, golden) | _lost(golden, found)
+def differing(found, golden, reach=1):
+    """Which pixels of either picture have no like within ``reach`` in the other, shape (h, w)."""
+    return _lost(found, golden, reach) | _lost(golden, found, reach)
 
 
-def _lost(one, other):
+def _lost(one, other, reach):
     height, width, _ = one.shape
-    around = np.pad(other, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    around = np.pad(other, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
     nearest = np.full((height, width), 255)
-    for down in range(3):
-        for right in range(3):
+    for down in range(2 * reach + 1):
+        for right in range(2 * reach + 1):
             there = around[down : down + height, right : right + width]
             nearest = np.minimum(nearest, np.abs(one - there).max(axis=-1))
     return nearest > FAR
 
 
-def worst_tile(found, golden):
+def worst_tile(found, golden, reach=1):
     """The most differing pixels in any tile; all of a tile's where the sizes differ."""
     if found.shape != golden.shape:
         return TILE * TILE
-    differs = differing(found, golden)
+    differs = differing(found, golden, reach)
     height, width = differs.shape
     padded = np.zeros((height + TILE, width + TILE), dtype=int)
     padded[:height, :width] = differs
