@@ -126,7 +126,7 @@ class BusReadings:
         quantity, axis = decoded.signals[0].quantity, decoded.signals[0].axis
         if quantity in self._joint_values:
             own = np.array([self._joints[signal.target] for signal in decoded.signals])
-            known = ~np.isnan(decoded.values)
+            known = np.isfinite(decoded.values)  # no servo is at infinity
             joints = own[decoded.member[known]]
             self._joint_values[quantity][joints] = decoded.values[known]
             self._joint_times[quantity][joints] = time_s

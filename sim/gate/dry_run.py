@@ -180,7 +180,7 @@ def dry_run(
     robot = planned.robot
     missing = missing_limits(robot)
     limits = gate_limits(_unlimited(robot, missing))
-    gait = GatedGait(driven.make(robot, planned), robot)
+    gait = GatedGait(driven.make(robot, planned), robot, limits)
     gate = Gate(
         gait.inner,
         limits,

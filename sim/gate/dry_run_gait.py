@@ -15,6 +15,7 @@ from ..sensing.contract import JointSample
 from ..twin import Sample, Twin
 from .dry_run_tally import DemandTally
 from .gate import Gate, Heard, Phase, Remark
+from .limits import GateLimits
 from .status import JointStatus
 
 _CHANGED = 1e-12  # rad; the same as the clamp's
@@ -72,15 +73,16 @@ class GatedGait:
         remarks: What the gate had to say.
     """
 
-    def __init__(self, gait: Gait, robot: Robot) -> None:
+    def __init__(self, gait: Gait, robot: Robot, limits: GateLimits) -> None:
         """Wrap a gait.
 
         Args:
             gait: Who commands.
             robot: Whose joints.
+            limits: What the gate keeps to.
         """
         self.inner = NotedGait(gait, robot)
-        self.tally = DemandTally(robot)
+        self.tally = DemandTally(robot, limits)
         self.remarks: list[Remark] = []
         self._told = 0
         self._command = np.clip(np.zeros(len(robot.joints)), *robot.limits())
@@ -100,7 +102,7 @@ class GatedGait:
     @property
     def done(self) -> bool:
         """Whether the last command was the last."""
-        return self._gate is not None and self._gate.phase is Phase.DONE
+        return self._gate is not None and self._gate.done
 
     def attach(self, gate: Gate, twin: Twin) -> None:
         """Say what it is between.

@@ -13,11 +13,11 @@ import numpy as np
 
 from capture.arrays import BoolArray, FloatArray
 from capture.robot import Robot
-from capture.robot.safety import Safety
 
 from ..physics.energy_flows import JOINT_TERMS
 from ..scenario import CONTROL_RATE_HZ
 from ..sensing.contract import JointSample, SensorSample
+from .limits import GateLimits
 
 _ENERGIES = tuple(
     JOINT_TERMS.index(term) for term in ("mechanical_net", "mechanical_abs", "electrical_net")
@@ -56,7 +56,7 @@ class JointDemand:
         least: Least command, before the gate [rad].
         greatest: Greatest command, before the gate [rad].
         rate: Greatest rate of the command, before the gate [rad/s].
-        max_rate: Its limit [rad/s], NaN where there is none.
+        max_rate: Its limit [rad/s], that of the file or that of the servo.
         acceleration: Greatest acceleration of the command, before the gate [rad/s^2]; nothing
             limits it.
         torque_peak: Greatest torque [N m].
@@ -123,14 +123,15 @@ class JointDemand:
 class DemandTally:
     """Adds up; :meth:`joints` says what came of it."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, limits: GateLimits) -> None:
         """Nothing is asked yet.
 
         Args:
             robot: Whose joints they are.
+            limits: What the gate keeps to; infinite where there is no limit.
         """
         count = len(robot.joints)
-        self._robot = robot
+        self._robot, self._limits = robot, limits
         self._ticks = 0
         self._wanted: list[FloatArray] = []  # the last two, for rates and accelerations
         self._least = np.full(count, np.inf)
@@ -192,13 +193,12 @@ class DemandTally:
 
     def joints(self) -> tuple[JointDemand, ...]:
         """What was asked of each joint, head to tail."""
-        robot = self._robot
-        safety, names = robot.safety or Safety(), robot.joint_names
+        robot, limits = self._robot, self._limits
         rate, error, current = (
-            safety.values(limit, names)
-            for limit in ("max_rate", "max_tracking_error", "max_current")
+            np.where(np.isfinite(limit), limit, np.nan)
+            for limit in (limits.rate, limits.tracking_error, limits.current)
         )
-        squares = np.full(len(names), np.nan)
+        squares = np.full(len(robot.joints), np.nan)
         np.divide(
             self._torque_squares, self._torque_count, out=squares, where=self._torque_count > 0
         )

@@ -144,6 +144,11 @@ class Gate:
         self._remarks: list[Remark] = []
 
     @property
+    def done(self) -> bool:
+        """Whether nothing is sent any more."""
+        return self.phase is Phase.DONE
+
+    @property
     def cuts(self) -> dict[str, int]:
         """How often commands of single joints were changed, by why."""
         return dict(self._clamp.cuts) if self._clamp is not None else {}
@@ -171,6 +176,8 @@ class Gate:
             UsageError: If another robot is there.
         """
         self._remarks = []
+        if self.done:
+            return self._quiet()
         if not tick:
             self._remark("info", f"gate: {Phase.POSE}")
         clamp = self._clamp or self._begin(tick, heard, stop)

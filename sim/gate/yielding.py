@@ -46,5 +46,7 @@ class Yielding:
         beyond = np.abs(current) > self._limit  # False for NaN
         grown = np.minimum(self._share + _MORE, 1.0)
         self._share = np.where(beyond, self._share * _LESS, grown)
-        pulled = angle + self._share * (wanted - angle)
-        return np.where(self.yields & ~np.isnan(angle), pulled, wanted)
+        pulls = self.yields & np.isfinite(angle)
+        pulled = np.where(pulls, angle, 0.0)
+        pulled += self._share * (wanted - pulled)
+        return np.where(pulls, pulled, wanted)
