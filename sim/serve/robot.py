@@ -38,7 +38,6 @@ _NS = 1_000_000_000
 PERIOD_NS = _NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
-_WAITING_NS = 40_000_000  # between two reports of a robot that waits for its first command
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
 
@@ -204,12 +203,12 @@ class VirtualRobot:
                 self._idle(_PATIENCE_S)
             self._pacer.start(self._pacer.now_ns())
         elif self._wait_for_commands:
-            said_ns = 0
-            while not self._latch.frames:
-                self._serve(_PATIENCE_S)
-                if (now_ns := self._pacer.now_ns()) >= said_ns:  # servos tell where they are
+            due_ns = self._pacer.now_ns()
+            while not self._latch.frames:  # until then the servos tell where they are
+                if (late_ns := self._pacer.now_ns() - due_ns) >= 0:
                     self._bus.send(self._at_rest())
-                    said_ns = now_ns + _WAITING_NS
+                    due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
+                self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / _NS))
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS // 2)
         else:
