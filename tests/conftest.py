@@ -26,6 +26,8 @@ FLAGS = (
     "--disable-sync",
     "--hide-scrollbars",
 )
+WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Drawing on the processor, for pages that take a graphics card."""
 
 
 @pytest.fixture(scope="session")
@@ -50,13 +52,13 @@ def chromium(display_tests_required):
 class Browser:
     """One headless Chromium, spoken to by the DevTools protocol over a pair of pipes."""
 
-    def __init__(self, path, profile, patience_s=60.0):
+    def __init__(self, path, profile, patience_s=60.0, flags=FLAGS):
         self.patience_s = patience_s
         self._ours, theirs = socket.socketpair()
         fd = theirs.fileno()
         # The protocol is spoken on descriptors 3 (to Chromium) and 4 (from it).
         shell = f'exec 3<&{fd} 4>&{fd}; exec "$@"'
-        arguments = [path, *FLAGS, "--remote-debugging-pipe", f"--user-data-dir={profile}"]
+        arguments = [path, *flags, "--remote-debugging-pipe", f"--user-data-dir={profile}"]
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "bash", *arguments, "about:blank"],
             pass_fds=(fd,),
@@ -163,5 +165,14 @@ class Browser:
 def browser(chromium, tmp_path_factory):
     """A running Chromium with its own empty profile."""
     started = Browser(chromium, Path(tmp_path_factory.mktemp("chromium")))
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def webgl_browser(chromium, tmp_path):
+    """A running Chromium that draws in three dimensions, by a renderer of its own."""
+    flags = [*(flag for flag in FLAGS if flag != "--disable-gpu"), *WEBGL, "--ignore-gpu-blocklist"]
+    started = Browser(chromium, tmp_path / "chromium", patience_s=120.0, flags=flags)
     yield started
     started.close()
