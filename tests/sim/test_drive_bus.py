@@ -390,6 +390,7 @@ def test_a_bus_of_another_robot_is_refused_before_anything_is_sent(capsys, tmp_p
     assert "frames heard 0 are of snake25; others have the identifiers 14B" in said
 
 
+@pytest.mark.slow
 def test_joints_that_say_nothing_are_named(capsys, tmp_path):
     robot = load_robot("snake25")
     keys = [(name, Quantity.POSITION, "") for name in robot.joint_names if name != "joint07"]

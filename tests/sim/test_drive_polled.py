@@ -126,6 +126,7 @@ def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
         assert np.nanmax(np.abs(measured - 0.3)) < 0.5
 
 
+@pytest.mark.slow
 def test_its_temperature_ends_the_drive(tmp_path, robot):
     with servo("polled-hot", math.degrees(0.5)) as one:
         one.temperature = 61
