@@ -158,41 +158,49 @@ def test_a_process_that_comes_late_does_not_jump(small, session, tmp_path):
 # -- what is refused ----------------------------------------------------------------------------
 
 
-def test_what_does_not_fit_is_refused_and_nothing_is_sent(small, session, tmp_path):
-    robot, scenario = small
-    bare, _ = stage["robot_files"](tmp_path / "bare", safety=None)
-    write = stage["write_commands"]
-    sessions = {}
-    sessions["limits"] = write(tmp_path / "limits.mcap", bare, 1.0)
-    joints = ("joint01", "joint02", "joint03", "wheel")
-    sessions["foreign"] = write(tmp_path / "foreign.mcap", robot, 1.0, names=joints)
-    sessions["fewer"] = write(tmp_path / "fewer.mcap", robot, 1.0, names=joints[:3])
-    many = [f"joint{k + 1:02d}" for k in range(25)]
-    sessions["robot"] = write(
-        tmp_path / "robot.mcap",
-        "snake25",
-        1.0,
-        names=many,
-        commands=lambda t: np.full((len(t), 25), 0.1),
-    )
+def refused(folder, scenario, sessions):
+    """What the controller says of sessions that it refuses, by name; nothing at all is sent."""
     said = {}
-    with staged(tmp_path, scenario) as on_stage, ExitStack() as running:
+    with staged(folder, scenario) as on_stage, ExitStack() as running:
         started = {
-            name: running.enter_context(on_stage.replay(chosen, tmp_path / f"{name}-out.mcap"))
+            name: running.enter_context(on_stage.replay(chosen, folder / f"{name}-out.mcap"))
             for name, chosen in sessions.items()
         }
         for name, controller in started.items():
             _, said[name] = controller.communicate(timeout=60)
             assert controller.returncode == 2, (name, said)
-            assert not (tmp_path / f"{name}-out.mcap").exists(), name
+            assert not (folder / f"{name}-out.mcap").exists(), name
         on_stage.settle()
         assert on_stage.lines  # the robot spoke all the while
         assert not on_stage.command_lines
-    assert said["limits"].startswith(
+    return said
+
+
+def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
+    bare, _ = stage["robot_files"](tmp_path / "bare", safety=None)
+    session = stage["write_commands"](tmp_path / "limits.mcap", bare, 1.0)
+    said = refused(tmp_path, small[1], {"limits": session})["limits"]
+    assert said.startswith(
         "error: snake4 can't be armed: its description lacks max_rate, ramp_rate, "
         "max_tracking_error, reply_timeout_s, max_late_s, max_current in [safety]"
     )
-    assert "\n[safety]\nmax_rate = " in said["limits"]
+    assert "\n[safety]\nmax_rate = " in said
+
+
+@pytest.mark.slow
+def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(small, tmp_path):
+    write, sessions = stage["write_commands"], {}
+    joints = ("joint01", "joint02", "joint03", "wheel")
+    sessions["foreign"] = write(tmp_path / "foreign.mcap", small[0], 1.0, names=joints)
+    sessions["fewer"] = write(tmp_path / "fewer.mcap", small[0], 1.0, names=joints[:3])
+    sessions["robot"] = write(
+        tmp_path / "robot.mcap",
+        "snake25",
+        1.0,
+        names=[f"joint{k + 1:02d}" for k in range(25)],
+        commands=lambda times_s: np.full((len(times_s), 25), 0.1),
+    )
+    said = refused(tmp_path, small[1], sessions)
     assert "joint01, joint02, joint03, wheel" in said["foreign"]
     assert "joint01, joint02, joint03, joint04" in said["foreign"]
     assert "it commands 3 joints: joint01, joint02, joint03\n" in said["fewer"]

@@ -77,7 +77,7 @@ def on_the_bus(command):
     return np.radians([one["position"] for one in told])
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     arrays(np.float64, COUNT, elements=st.floats(-0.7, 0.7), fill=st.just(0.0)),
     st.lists(moments, min_size=1, max_size=12),
