@@ -25,12 +25,17 @@ if TYPE_CHECKING:
     from .experiment.analyse import analyse_experiment
     from .notebook.files import load
     from .notebook.picture import Picture
-    from .result import Analysis, Estimate, Index, JointResult
-    from .result_coupling import LocalCoupling
-    from .result_experiment import Experiment, Reversal
-    from .result_sweep import LinearCoupling
+    from .results.analysis import (
+        Analysis,
+        Estimate,
+        Index,
+        JointResult,
+    )
+    from .results.coupling import LocalCoupling
+    from .results.experiment import Experiment, Reversal
+    from .results.sweep import LinearCoupling
     from .stretch import Options
-    from .table import render
+    from .text.table import render
 
 __all__ = [
     "Analysis",
@@ -54,24 +59,24 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Analysis": "result",
+    "Analysis": "results.analysis",
     "Choices": "compare.compare",
     "Comparison": "compare.result",
-    "Estimate": "result",
-    "Experiment": "result_experiment",
-    "Index": "result",
-    "JointResult": "result",
-    "LinearCoupling": "result_sweep",
-    "LocalCoupling": "result_coupling",
+    "Estimate": "results.analysis",
+    "Experiment": "results.experiment",
+    "Index": "results.analysis",
+    "JointResult": "results.analysis",
+    "LinearCoupling": "results.sweep",
+    "LocalCoupling": "results.coupling",
     "Margins": "compare.decisions",
     "Options": "stretch",
     "Picture": "notebook.picture",
-    "Reversal": "result_experiment",
+    "Reversal": "results.experiment",
     "analyse_experiment": "experiment.analyse",
     "analyse_session": "analyse",
     "compare_sessions": "compare.compare",
     "load": "notebook.files",
-    "render": "table",
+    "render": "text.table",
 }
 
 

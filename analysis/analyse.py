@@ -13,13 +13,14 @@ from capture import Session
 from capture.environment import base_versions
 from capture.log.signals import Signal
 
-from .artefact_words import warn_flags, within
 from .body.motion import body_motion
 from .coupling import one_gait_coupling
 from .demodulation_session import response_over_time
 from .energy.cycles import energy_result
 from .energy.ledger import check_ledger
 from .energy.transport import transport
+from .estimators.series import Series, clean
+from .estimators.spectrum import BINS_PER_SIDE
 from .fitting import GaitFit, fit_gait
 from .flags import find_artefacts
 from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
@@ -28,7 +29,7 @@ from .joints import Energies, Span, joint_energies, joint_results
 from .oscillators.session import session_couplings
 from .reading import Warn, by_plane, drag_ratio, read_columns, settle_time_s
 from .response import CONFIDENCE, around, t_factor
-from .result import (
+from .results.analysis import (
     Analysis,
     Estimate,
     GaitFacts,
@@ -36,10 +37,9 @@ from .result import (
     SessionFacts,
     Window,
 )
-from .result_artefact import flags_by_joint
-from .series import Series, clean
-from .spectrum import BINS_PER_SIDE
+from .results.artefact import flags_by_joint
 from .stretch import Options, choose_stretch
+from .text.artefacts import warn_flags, within
 from .windows import Stretch, whole_cycles
 
 _NS = 1e9

@@ -14,8 +14,8 @@ from capture.errors import UsageError
 from .command_line import check_output, chosen, opened, show
 
 if TYPE_CHECKING:
-    from .result import Analysis
-    from .result_experiment import Experiment
+    from .results.analysis import Analysis
+    from .results.experiment import Experiment
     from .stretch import Options
 
 
@@ -66,8 +66,8 @@ def analyse(
     if json:
         emit_json(result.to_dict())
         return
-    from .result import Analysis
-    from .table import render
+    from .results.analysis import Analysis
+    from .text.table import render
 
     def text(width: int, color: bool) -> str:
         if isinstance(result, Analysis):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .result import Coupling
+from .results.analysis import Coupling
 
 
 def one_gait_coupling(joints: int) -> Coupling:

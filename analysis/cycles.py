@@ -18,9 +18,9 @@ import numpy as np
 from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
 
 from .analyse import Measured
-from .cycle_sums import cycle_sums, weigh
-from .rotation import cos_sin
-from .series import Series
+from .estimators.cycle_sums import cycle_sums, weigh
+from .estimators.rotation import cos_sin
+from .estimators.series import Series
 
 LEAST_COVERED = 0.9
 """A cycle with samples over less of its length is missing."""

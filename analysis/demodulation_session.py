@@ -13,14 +13,24 @@ from capture import Session
 from capture.arrays import BoolArray, ComplexArray, FloatArray
 from capture.errors import DataError, LogError
 
-from .demodulation import Cycles, Phase, cycles_of, demodulate
+from .estimators.demodulation import (
+    Cycles,
+    Phase,
+    cycles_of,
+    demodulate,
+)
+from .estimators.series import GAP_FACTOR, Series, clean
+from .estimators.threads import in_threads
 from .reading import Columns, Warn, planes_of, settle_time_s
 from .response import t_factor
-from .result_artefact import Artefact, Span
-from .result_over_time import Intervals, JointOverTime, Maybe, ResponseOverTime
-from .series import GAP_FACTOR, Series, clean
+from .results.artefact import Artefact, Span
+from .results.over_time import (
+    Intervals,
+    JointOverTime,
+    Maybe,
+    ResponseOverTime,
+)
 from .stretch import GAIT_TOPIC
-from .threads import in_threads
 
 _Value = TypeVar("_Value")
 

@@ -7,6 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .estimators.harmonic import HarmonicFit, fit_at, fit_shared
+from .estimators.series import Series
+from .estimators.settling import worst_drift
+from .estimators.spectrum import Noise, omega_variance, residual_noise
 from .gait import (
     MIN_CYCLES,
     MIN_EXPLAINED,
@@ -17,12 +21,8 @@ from .gait import (
     driven,
     find_rhythm,
 )
-from .harmonic import HarmonicFit, fit_at, fit_shared
 from .reading import Warn
 from .response import Response, respond
-from .series import Series
-from .settling import worst_drift
-from .spectrum import Noise, omega_variance, residual_noise
 
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""

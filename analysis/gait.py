@@ -17,8 +17,13 @@ import numpy as np
 from capture.arrays import BoolArray, ComplexArray
 from capture.errors import DataError
 
-from .harmonic import HarmonicFit, HarmonicModel, fit_at, fit_shared
-from .series import Series
+from .estimators.harmonic import (
+    HarmonicFit,
+    HarmonicModel,
+    fit_at,
+    fit_shared,
+)
+from .estimators.series import Series
 
 MIN_CYCLES = 3.0
 MIN_EXPLAINED = 0.8

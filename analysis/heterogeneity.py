@@ -18,9 +18,9 @@ from scipy.special import chdtr, chndtrinc, fdtrc, ndtri, stdtr
 
 from capture.arrays import FloatArray
 
-from .equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
+from .estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from .response import CONFIDENCE, Response, around, t_factor
-from .result import Index, Interval
+from .results.analysis import Index, Interval
 
 ENDS = 2
 MIDDLE = 5

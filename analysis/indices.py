@@ -12,7 +12,7 @@ from .fitting import GaitFit
 from .heterogeneity import ENDS, KINDS, MIDDLE, energy_indices, index, response_indices
 from .joints import Energies
 from .reading import Warn, by_plane
-from .result import Index, JointResult
+from .results.analysis import Index, JointResult
 
 
 def heterogeneity_indices(

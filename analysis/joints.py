@@ -11,13 +11,13 @@ from capture.arrays import FloatArray
 from capture.robot import Robot
 
 from .energy.joint import Energy, integrate, power_of
+from .estimators.series import Series, coverage
+from .estimators.threads import in_threads
 from .fitting import GaitFit
 from .reading import Columns, Warn, planes_of
 from .response import gain_estimate, lag_estimate
-from .result import Estimate, JointResult
-from .result_artefact import Artefact
-from .series import Series, coverage
-from .threads import in_threads
+from .results.analysis import Estimate, JointResult
+from .results.artefact import Artefact
 
 GAP_SHARE = 0.01
 """More of the window without samples is worth a flag, or of power a warning."""

@@ -15,8 +15,8 @@ from scipy.special import stdtrit
 
 from capture.arrays import ComplexArray, FloatArray
 
-from .result import Estimate, Interval
-from .spectrum import Noise
+from .estimators.spectrum import Noise
+from .results.analysis import Estimate, Interval
 
 CONFIDENCE = 0.95
 

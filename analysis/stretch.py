@@ -10,9 +10,9 @@ import numpy as np
 from capture import Session
 from capture.errors import DataError, LogError, UsageError
 
+from .estimators.series import clean
 from .gait import MIN_CYCLES
 from .reading import COMMAND_TOPIC, RESPONSE_TOPIC, Columns, Warn, settle_time_s
-from .series import clean
 from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
 
 GAIT_TOPIC = "/gait"

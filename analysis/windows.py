@@ -16,8 +16,8 @@ import numpy as np
 
 from capture.arrays import BoolArray, FloatArray, IntArray
 
+from .estimators.series import Series
 from .gait import MIN_CYCLES
-from .series import Series
 
 _NS = 1e9
 _STEADY = ("A", "omega", "lag", "offset")

@@ -10,10 +10,10 @@ import time
 import numpy as np
 from scipy.signal import correlate, correlation_lags, hilbert, lfilter
 
-from analysis.harmonic import fit_shared
+from analysis.estimators.harmonic import fit_shared
+from analysis.estimators.series import Series
+from analysis.estimators.spectrum import Noise, residual_noise
 from analysis.response import respond, t_factor
-from analysis.series import Series
-from analysis.spectrum import Noise, residual_noise
 
 GAIN, LAG = 0.9, 0.2
 """Truth: gain, and lag [rad]."""

@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 from analysis import analyse_session
-from analysis.result import Analysis, BodyPoint, Estimate
+from analysis.results.analysis import Analysis, BodyPoint, Estimate
 from capture import Session
 from capture.arrays import FloatArray
 from capture.palette import joint_hex

@@ -17,8 +17,8 @@ import rerun as rr
 from rerun.components import InterpolationMode
 
 from analysis.cycles import LEAST_COVERED, CycleMaps
-from analysis.result import Analysis
-from analysis.result_over_time import JointOverTime
+from analysis.results.analysis import Analysis
+from analysis.results.over_time import JointOverTime
 from capture.arrays import FloatArray, IntArray
 
 from .joints import GREY, Color, Series, log_rows, part_entity

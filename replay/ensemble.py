@@ -15,11 +15,11 @@ import numpy as np
 
 from analysis.compare.differences import from_runs
 from analysis.compare.waveform import PHASES, cycles_by_phase, phases_rad
+from analysis.estimators.harmonic import fit_at
+from analysis.estimators.series import Series, clean
 from analysis.gait import allowed_model
-from analysis.harmonic import fit_at
 from analysis.response import t_factor
-from analysis.result import Analysis
-from analysis.series import Series, clean
+from analysis.results.analysis import Analysis
 from capture.arrays import BoolArray, FloatArray, IntArray
 from capture.robot import Robot
 from capture.robot.kinematics import link_poses

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import rerun as rr
 
-from analysis.answer import answer
-from analysis.formats import utc
-from analysis.result import Analysis
+from analysis.results.analysis import Analysis
+from analysis.text.answer import answer
+from analysis.text.formats import utc
 from capture import Session
 
 from .content import Content

@@ -16,8 +16,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from analysis.formats import decimals_for_values, number
-from analysis.result import Analysis
+from analysis.results.analysis import Analysis
+from analysis.text.formats import decimals_for_values, number
 from capture.arrays import FloatArray
 from capture.palette import joint_colors
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from analysis.cycles import CycleMaps
-from analysis.result import Analysis
+from analysis.results.analysis import Analysis
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Gain, lag and power of each joint in each cycle of a gait, while it is recorded.
 
-The estimator is the analysis's own (:mod:`analysis.demodulation`), on cycles that start where its
-do: half a turn after the logged phase began to run evenly. It looks half a cycle to either side, so
-a cycle is known half a cycle after its end.
+The estimator is the analysis's own (:mod:`analysis.estimators.demodulation`), on cycles that
+start where its do: half a turn after the logged phase began to run evenly. It looks half a cycle to
+either side, so a cycle is known half a cycle after its end.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.cycle_sums import weigh
 from analysis.cycles import LEAST_COVERED
-from analysis.demodulation import DRIVEN_SHARE, Phase, demodulate
 from analysis.demodulation_session import LoggedGait
+from analysis.estimators.cycle_sums import weigh
+from analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
+from analysis.estimators.series import Series, clean
 from analysis.reading import planes_of
-from analysis.series import Series, clean
 from capture.arrays import FloatArray, IntArray
 from capture.robot import Robot
 

@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.components import FillMode
 
-from analysis.result import Analysis
+from analysis.results.analysis import Analysis
 from capture.arrays import FloatArray
 from capture.palette import joint_colors
 from capture.robot import Robot

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from analysis.result import Analysis, Estimate
+from analysis.results.analysis import Analysis, Estimate
 
 from .colors import NAMED
 from .cycles import ENERGY, GAIN, LAG, CycleTable, cycle_times_ns, together

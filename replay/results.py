@@ -13,12 +13,12 @@ from pathlib import Path
 from analysis.analyse import measure_session
 from analysis.compare.result import Comparison
 from analysis.cycles import cycle_maps
-from analysis.formats import p_value
 from analysis.notebook.files import load
 from analysis.null_model.result import ModelledAnalysis
-from analysis.result import Analysis
-from analysis.result_experiment import Experiment
+from analysis.results.analysis import Analysis
+from analysis.results.experiment import Experiment
 from analysis.stretch import Options
+from analysis.text.formats import p_value
 from capture import Session
 from capture.errors import DataError, MissingChannelError, UndulogError
 

@@ -18,7 +18,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from analysis.cycles import CycleMaps
-from analysis.result import Analysis
+from analysis.results.analysis import Analysis
 from capture import Session
 from capture.errors import DataError, LogWriteError
 from capture.part_file import part_file

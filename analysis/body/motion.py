@@ -11,11 +11,11 @@ from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from capture.errors import DataError, LogError
 from capture.robot import Plane, Robot
 
+from ..estimators.series import Series
 from ..fitting import GaitFit
 from ..joints import Span
 from ..reading import Warn, by_plane, drag_ratio
-from ..result import BodyResult
-from ..series import Series
+from ..results.analysis import BodyResult
 from .places import observed, perfect_tracking, track
 
 ODOMETRY_TOPIC = "/odom"

@@ -11,12 +11,12 @@ from capture.arrays import ComplexArray, FloatArray
 from capture.robot import Plane, Robot
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
+from ..estimators.harmonic import HarmonicFit, HarmonicModel, fit_at
+from ..estimators.series import Series
+from ..estimators.spectrum import residual_noise
 from ..gait import allowed_model
-from ..harmonic import HarmonicFit, HarmonicModel, fit_at
 from ..response import around, t_factor
-from ..result import BodyPoint, Estimate
-from ..series import Series
-from ..spectrum import residual_noise
+from ..results.analysis import BodyPoint, Estimate
 from .null import DRAG_RATIO, free_chain, one_cycle, places, viscous_chain
 
 PLACES = ("head", "middle", "tail")

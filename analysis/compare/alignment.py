@@ -9,13 +9,13 @@ import numpy as np
 
 from capture.errors import DataError
 
-from .. import formats
 from ..experiment.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
     GaitRun,
     command_change,
 )
+from ..text import formats
 
 
 @dataclass(frozen=True)

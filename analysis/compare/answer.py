@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from .. import formats
-from ..result import Estimate
+from ..results.analysis import Estimate
+from ..text import formats
 from .decisions import SIGNIFICANT, Decided
 from .result import BODY, Difference
 

@@ -14,7 +14,7 @@ from capture.errors import UsageError
 
 from ..reading import Warn
 from ..response import CONFIDENCE, around, t_factor
-from ..result import Estimate, Provenance
+from ..results.analysis import Estimate, Provenance
 from ..stretch import Options
 from .alignment import Alignment, align
 from .answer import answer_of

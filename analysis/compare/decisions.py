@@ -9,9 +9,9 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
-from ..equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
+from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response import around
-from ..result import Estimate
+from ..results.analysis import Estimate
 from .differences import Differences, Quantities, from_runs, holm, independent, paired
 from .result import BODY, Difference, Equivalence, NamedJoint
 from .side import Key, Seen

@@ -14,9 +14,9 @@ from capture.robot import Robot
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from ..body.motion import ODOMETRY_TOPIC, head_poses
+from ..estimators.series import Series
 from ..joints import Span
 from ..reading import Warn
-from ..series import Series
 
 GRAVITY = 9.80665
 """Standard gravity [m/s^2] (3rd CGPM, 1901)."""

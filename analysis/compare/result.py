@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..notebook.shown import Shown
-from ..result import Estimate, Provenance, SessionFacts
+from ..results.analysis import Estimate, Provenance, SessionFacts
 
 BODY = "body"
 """Where a difference is that belongs to no joint."""

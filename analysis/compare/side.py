@@ -14,7 +14,7 @@ from capture.arrays import FloatArray
 from ..analyse import Measured, measure_session
 from ..experiment.runs import GaitRun, gait_run
 from ..reading import Warn
-from ..result import Analysis
+from ..results.analysis import Analysis
 from ..stretch import Options
 from .changes import facts_of
 from .differences import Quantities, from_runs

@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import formats
 from ..command_line import UNLIMITED
-from ..table import put, sheet
+from ..text import formats
+from ..text.table import put, sheet
 from .answer import WORDS, in_people_units, signed
 from .decisions import SIGNIFICANT
 from .result import BODY, Change, Comparison, Difference, Equivalence

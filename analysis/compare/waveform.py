@@ -10,8 +10,8 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
-from ..harmonic import HarmonicFit
-from ..series import GAP_FACTOR, Series
+from ..estimators.harmonic import HarmonicFit
+from ..estimators.series import GAP_FACTOR, Series
 
 PHASES = 72
 """Phases at which a mean cycle is told, every 5 degrees."""

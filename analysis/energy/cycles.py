@@ -11,7 +11,7 @@ from capture.arrays import FloatArray
 
 from ..joints import Energies, Span
 from ..reading import Columns, Warn
-from ..result_energy import (
+from ..results.energy import (
     Closure,
     Each,
     EnergyResult,

@@ -3,7 +3,7 @@
 E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
 can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
 times motor current, signed and clipped. Gaps are not bridged: the weights of
-:func:`analysis.series.sample_weights` count no time inside them.
+:func:`analysis.estimators.series.sample_weights` count no time inside them.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from capture.arrays import FloatArray, IntArray
 from capture.log.signals import Signal
 
-from ..cycle_sums import Weighed, cycle_sums, weigh
-from ..series import Series, clean
+from ..estimators.cycle_sums import Weighed, cycle_sums, weigh
+from ..estimators.series import Series, clean
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ import numpy as np
 from capture import Session
 from capture.errors import DataError, LogError
 
+from ..estimators.series import clean
 from ..joints import Energies, Span
 from ..reading import Warn
-from ..result_energy import Closure
-from ..series import clean
+from ..results.energy import Closure
 
 LEDGER_TOPIC = "/energy_ledger"
 TOLERANCE = 0.05

@@ -11,12 +11,12 @@ from capture.arrays import FloatArray
 from capture.robot import Robot
 
 from ..compare.motion import GRAVITY, body_steps
+from ..estimators.series import Series
 from ..joints import Energies, Span
 from ..reading import Warn
 from ..response import around, t_factor
-from ..result import Estimate
-from ..result_energy import Transport
-from ..series import Series
+from ..results.analysis import Estimate
+from ..results.energy import Transport
 from .joint import Energy
 
 LEAST_WAY = 0.01

@@ -16,7 +16,7 @@ from capture.robot import Robot
 
 from ..analyse import Examined, examine_session
 from ..coupling import one_gait_coupling
-from ..equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
+from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..kicks.answer import kick_answer
 from ..kicks.coupling import ROW_TOLERANCE, kick_coupling
 from ..kicks.experiment import find_kicks
@@ -24,9 +24,9 @@ from ..kicks.runs import MOST_KICK, MOST_PATTERN, SAME
 from ..oscillators.body import body_oscillators
 from ..reading import Warn
 from ..response import CONFIDENCE
-from ..result import Analysis, Provenance
-from ..result_coupling import LocalCoupling
-from ..result_experiment import Experiment, Reversal, Run
+from ..results.analysis import Analysis, Provenance
+from ..results.coupling import LocalCoupling
+from ..results.experiment import Experiment, Reversal, Run
 from ..reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
 from ..reversal.modules import SIGNIFICANT, reversal_of
 from ..reversal.shares import RESAMPLES

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from .. import formats
-from ..result import Estimate
-from ..result_experiment import Reversal
+from ..results.analysis import Estimate
+from ..results.experiment import Reversal
 from ..reversal.modules import SIGNIFICANT
+from ..text import formats
 from .runs import Role
 
 

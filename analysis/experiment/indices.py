@@ -9,8 +9,8 @@ import numpy as np
 from capture.arrays import ComplexArray
 
 from ..heterogeneity import spread
-from ..result import Index, Interval
-from ..result_experiment import Reversal
+from ..results.analysis import Index, Interval
+from ..results.experiment import Reversal
 from ..reversal.mirror import MIN_RUNS, parts
 
 

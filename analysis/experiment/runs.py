@@ -16,11 +16,11 @@ import numpy as np
 from capture.arrays import ComplexArray, FloatArray
 from capture.robot import Robot
 
-from .. import formats
 from ..fitting import GaitFit
 from ..gait import phase_step, wave_name
 from ..reading import by_plane
-from ..result import Analysis
+from ..results.analysis import Analysis
+from ..text import formats
 
 SAME_COMMAND = 0.01
 """Largest deviation of a command, over its amplitude, that is the same gait still."""

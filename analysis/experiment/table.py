@@ -6,17 +6,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import formats
 from ..command_line import UNLIMITED
 from ..kicks.answer import kick_detail
 from ..oscillators.text import body_detail
-from ..result import Estimate
-from ..result_coupling import LocalCoupling
-from ..result_experiment import Experiment, Reversal
-from ..result_sweep import LinearCoupling
+from ..results.analysis import Estimate
+from ..results.coupling import LocalCoupling
+from ..results.experiment import Experiment, Reversal
+from ..results.sweep import LinearCoupling
 from ..reversal.modules import SIGNIFICANT
 from ..sweep.answer import sweep_detail, sweep_method
-from ..table import put, sheet
+from ..text import formats
+from ..text.table import put, sheet
 from .answer import percent, told_p
 
 if TYPE_CHECKING:

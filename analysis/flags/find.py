@@ -12,11 +12,11 @@ from capture import Session
 from capture.arrays import FloatArray
 from capture.log.signals import Signal
 
+from ..estimators.series import Series, clean_together
+from ..estimators.threads import in_threads
 from ..gait import DRIVEN_SHARE
 from ..reading import QUANTITIES, Columns
-from ..result_artefact import FALSIFYING, Artefact, Span
-from ..series import Series, clean_together
-from ..threads import in_threads
+from ..results.artefact import FALSIFYING, Artefact, Span
 from .holds import clipped, frozen, stale
 from .jumps import find_jumps
 from .limits import AT_LIMIT, AT_LIMIT_RAD, Limits, limits_of, saturated, stalled

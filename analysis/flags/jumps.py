@@ -13,8 +13,8 @@ import numpy as np
 
 from capture.arrays import BoolArray, FloatArray, IntArray
 
-from ..result_artefact import Span
-from ..series import Series
+from ..estimators.series import Series
+from ..results.artefact import Span
 from .spans import inside, spans_of
 
 ABOVE_NEIGHBOURS = 8.0

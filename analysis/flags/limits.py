@@ -14,8 +14,8 @@ from capture import Session
 from capture.arrays import FloatArray
 from capture.robot import Joint, Servo
 
-from ..result_artefact import Span
-from ..series import Series
+from ..estimators.series import Series
+from ..results.artefact import Span
 from .spans import spans_of
 
 AT_LIMIT_RAD = 1e-4

@@ -8,8 +8,8 @@ import numpy as np
 
 from capture.arrays import BoolArray, FloatArray, IntArray
 
-from ..result_artefact import Span
-from ..series import GAP_FACTOR
+from ..estimators.series import GAP_FACTOR
+from ..results.artefact import Span
 
 
 def runs(marked: BoolArray) -> tuple[IntArray, IntArray]:

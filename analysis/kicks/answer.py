@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from .. import formats
-from ..result import Coupling, Estimate
-from ..result_coupling import LocalCoupling, RowCheck
+from ..results.analysis import Coupling, Estimate
+from ..results.coupling import LocalCoupling, RowCheck
+from ..text import formats
 
 
 def kick_answer(coupling: Coupling) -> str:

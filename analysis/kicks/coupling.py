@@ -11,8 +11,8 @@ from capture.arrays import ComplexArray, FloatArray
 
 from ..reading import Warn
 from ..response import CONFIDENCE
-from ..result import Coupling, Estimate
-from ..result_coupling import (
+from ..results.analysis import Coupling, Estimate
+from ..results.coupling import (
     LTI_LABEL,
     HeldOut,
     LocalCoupling,

@@ -26,9 +26,9 @@ from scipy.special import stdtrit
 from capture.arrays import ComplexArray, FloatArray
 from capture.errors import UsageError
 
-from ..norm_ratio import noise_draws, norm_ratio
+from ..estimators.norm_ratio import noise_draws, norm_ratio
 from ..response import CONFIDENCE, welch_satterthwaite
-from ..result import Estimate
+from ..results.analysis import Estimate
 from .runs import Kick, Kind
 
 
@@ -171,7 +171,7 @@ def nonlinearity(P: Measured, R: Measured, G: Measured, S: Measured, seed: int =
 
     Returns:
         ||(G - P, S + R)|| / ||(P, R)|| (Frobenius), with what noise adds taken off; interval by
-        :func:`analysis.norm_ratio.norm_ratio`.
+        :func:`analysis.estimators.norm_ratio.norm_ratio`.
     """
     noise = [noise_draws(one, seed + k) for k, one in enumerate((P, R, G, S))]
     return norm_ratio(

@@ -14,8 +14,8 @@ import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray
 
-from ..norm_ratio import noise_draws, norm_ratio
-from ..result import Estimate
+from ..estimators.norm_ratio import noise_draws, norm_ratio
+from ..results.analysis import Estimate
 from .local import Measured
 
 BANDS = (1, 2, 3)

@@ -13,19 +13,26 @@ from capture.console import refuse_existing
 from capture.errors import DataError, LogError, MissingExtraError
 from capture.part_file import part_file, write_text
 
-from .. import result_energy, result_over_time, result_sweep
 from ..command_line import check_output
 from ..compare.result import Comparison
 from ..oscillators import result as oscillators
-from ..result import Analysis, Coupling, Estimate, interval_key
-from ..result_coupling import LocalCoupling
-from ..result_experiment import Experiment, Reversal
+from ..results import energy as result_energy
+from ..results import over_time as result_over_time
+from ..results import sweep as result_sweep
+from ..results.analysis import (
+    Analysis,
+    Coupling,
+    Estimate,
+    interval_key,
+)
+from ..results.coupling import LocalCoupling
+from ..results.experiment import Experiment, Reversal
 
 if TYPE_CHECKING:
     from .shown import Shown
 
 _NAMES = {**vars(oscillators), **vars(result_energy), **vars(result_over_time)}
-"""Types that :mod:`analysis.result` names for type checkers only."""
+"""Types that :mod:`analysis.results.analysis` names for type checkers only."""
 
 _KINDS: tuple[type[Shown], ...] = (
     Analysis,

@@ -10,11 +10,28 @@ import pandas as pd
 
 from ..compare.result import Change, Comparison, Difference, Equivalence, NamedJoint
 from ..oscillators.result import ChainCoupling, Link, Mode, Rate
-from ..result import Analysis, BodyPoint, Coupling, Index, JointResult
-from ..result_artefact import Artefact, Span
-from ..result_coupling import HeldOut, LocalCoupling, Matrix, RowCheck
-from ..result_experiment import Experiment, MirrorJoint, Reversal, Run, WeakModule
-from ..result_sweep import LinearCoupling, ToneCoupling
+from ..results.analysis import (
+    Analysis,
+    BodyPoint,
+    Coupling,
+    Index,
+    JointResult,
+)
+from ..results.artefact import Artefact, Span
+from ..results.coupling import (
+    HeldOut,
+    LocalCoupling,
+    Matrix,
+    RowCheck,
+)
+from ..results.experiment import (
+    Experiment,
+    MirrorJoint,
+    Reversal,
+    Run,
+    WeakModule,
+)
+from ..results.sweep import LinearCoupling, ToneCoupling
 from .rows import named, row_of, table
 
 Frames = dict[str, pd.DataFrame]

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from capture.errors import MissingExtraError, UsageError
 
 from ..compare.result import Comparison
-from ..formats import degrees, relative
-from ..result import Analysis, Coupling
-from ..result_experiment import Experiment, Reversal
+from ..results.analysis import Analysis, Coupling
+from ..results.experiment import Experiment, Reversal
+from ..text.formats import degrees, relative
 from .picture import Picture, of
 
 if TYPE_CHECKING:

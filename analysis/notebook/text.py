@@ -7,19 +7,19 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..answer import answer
 from ..compare.result import Comparison
 from ..compare.table import render_comparison
 from ..experiment.answer import told_p
 from ..experiment.table import render_experiment, reversal_detail
-from ..formats import plain
 from ..kicks.answer import kick_answer, kick_detail
-from ..result import Analysis, Coupling
-from ..result_coupling import LocalCoupling
-from ..result_experiment import Experiment, Reversal
-from ..result_sweep import LinearCoupling
+from ..results.analysis import Analysis, Coupling
+from ..results.coupling import LocalCoupling
+from ..results.experiment import Experiment, Reversal
+from ..results.sweep import LinearCoupling
 from ..sweep.answer import sweep_answer, sweep_detail
-from ..table import render
+from ..text.answer import answer
+from ..text.formats import plain
+from ..text.table import render
 
 MOST_ROWS = 40
 """Rows of a table that a notebook shows."""

@@ -17,7 +17,7 @@ from ..analyse import Measured, measure_session
 from ..experiment.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..fitting import GaitFit
 from ..response import Response, t_factor
-from ..result import Analysis, Estimate, Provenance
+from ..results.analysis import Analysis, Estimate, Provenance
 from ..stretch import Options
 from .deviation import DRAWS, NullTest, null_test
 from .result import (

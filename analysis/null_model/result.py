@@ -7,9 +7,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from .. import formats
 from ..experiment.answer import told_p
-from ..result import Analysis, Estimate
+from ..results.analysis import Analysis, Estimate
+from ..text import formats
 from .deviation import SIGNIFICANT
 
 

@@ -9,11 +9,11 @@ from scipy.special import stdtridf
 
 from capture.arrays import FloatArray
 
-from .. import formats
-from ..norm_ratio import noise_draws
+from ..estimators.norm_ratio import noise_draws
 from ..response import CONFIDENCE
-from ..result import Estimate
-from ..result_coupling import LocalCoupling
+from ..results.analysis import Estimate
+from ..results.coupling import LocalCoupling
+from ..text import formats
 from .comparator import explicit_coupling, homogeneous
 from .entrainment import entrainment
 from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, spectrum

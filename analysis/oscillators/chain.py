@@ -11,7 +11,7 @@ from scipy.special import fdtrc
 from capture.arrays import BoolArray, FloatArray
 
 from ..response import CONFIDENCE, around, t_factor
-from ..result import Estimate
+from ..results.analysis import Estimate
 from .pieces import between_kicks
 from .result import ChainCoupling, Link, Rate
 from .weak_form import OscillatorFit, fit_oscillator, window_length

@@ -20,7 +20,7 @@ from scipy.special import stdtrit
 
 from capture.arrays import FloatArray
 
-from ..norm_ratio import Noisy
+from ..estimators.norm_ratio import Noisy
 from ..response import CONFIDENCE
 
 MOST_CONDITION = 1e6

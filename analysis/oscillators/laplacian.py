@@ -26,9 +26,9 @@ from scipy.optimize import linear_sum_assignment
 
 from capture.arrays import ComplexArray, FloatArray
 
-from ..norm_ratio import Noisy, noise_draws
+from ..estimators.norm_ratio import Noisy, noise_draws
 from ..response import CONFIDENCE
-from ..result import Estimate
+from ..results.analysis import Estimate
 
 STRONG = 0.1
 """A rate of I - P above this counts as strong: the body brings such a pattern back in 10/eps."""

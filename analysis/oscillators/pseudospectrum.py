@@ -14,7 +14,7 @@ import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray
 
-from ..norm_ratio import Noisy, noise_draws
+from ..estimators.norm_ratio import Noisy, noise_draws
 from ..response import CONFIDENCE
 from .laplacian import of_deviations
 

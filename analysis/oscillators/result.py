@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..result import Estimate
+from ..results.analysis import Estimate
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .. import formats
+from ..text import formats
 from .result import BodyOscillators, ChainCoupling, Link
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from .. import formats
-from ..result import Analysis, JointResult
-from ..result_artefact import KINDS, Artefact, Span
+from ..results.analysis import Analysis, JointResult
+from ..results.artefact import KINDS, Artefact, Span
+from ..text import formats
 from .markup import element
 
 MOST_SPANS = 4

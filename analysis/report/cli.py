@@ -15,7 +15,7 @@ from capture.part_file import write_text
 from ..command_line import PAGES, check_output, chosen
 
 if TYPE_CHECKING:
-    from ..result import Analysis
+    from ..results.analysis import Analysis
     from ..stretch import Options
 
 
@@ -98,7 +98,7 @@ def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, An
 
 
 def _told(analysis: Analysis) -> dict[str, Any]:
-    from ..answer import answer
+    from ..text.answer import answer
 
     told = answer(analysis)
     return {

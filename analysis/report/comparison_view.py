@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from capture.palette import joint_hex
 
-from .. import formats
 from ..compare.answer import WORDS, in_people_units, signed
 from ..compare.decisions import SIGNIFICANT
 from ..compare.result import BODY, Comparison, Difference, Waveform
 from ..compare.table import cells, margin_told, method
-from ..formats import degrees, scaled
-from ..result import Estimate, SessionFacts
+from ..results.analysis import Estimate, SessionFacts
+from ..text import formats
+from ..text.formats import degrees, scaled
 from .differences import Panel, differences_drawing
 from .drawn import Drawing
 from .tables import Fact

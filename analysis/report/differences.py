@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from capture.palette import joint_hex
 
-from ..result import Estimate
+from ..results.analysis import Estimate
 from .drawn import WIDTH_IN, Drawing, joint_ticks, key, legend
 from .svg import INK, REFERENCE, Axes, drawing, inline_svg, new_figure
 

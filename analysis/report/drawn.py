@@ -13,7 +13,7 @@ from typing import Any
 
 from matplotlib import lines
 
-from ..formats import short
+from ..text.formats import short
 from .svg import Axes, Figure, Handle
 
 WIDTH_IN = 8.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..result import JointResult
+from ..results.analysis import JointResult
 
 STILL_RAD = 1e-6
 """A command with less amplitude than this holds its joint still [rad]."""

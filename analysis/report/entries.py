@@ -8,10 +8,10 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
-from ..formats import decimals_for_values, number
-from ..result import Coupling
-from ..result_coupling import LocalCoupling, Matrix
-from ..result_sweep import ComplexMatrix, LinearCoupling
+from ..results.analysis import Coupling
+from ..results.coupling import LocalCoupling, Matrix
+from ..results.sweep import ComplexMatrix, LinearCoupling
+from ..text.formats import decimals_for_values, number
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,21 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from .. import formats
-from ..answer import answer
 from ..experiment.answer import percent
 from ..experiment.table import by_warning, method, reversal_detail
 from ..kicks.answer import kick_checks
-from ..result import Analysis, Coupling, Estimate, JointResult
-from ..result_coupling import LocalCoupling
-from ..result_experiment import Experiment, Run
-from ..result_sweep import LinearCoupling
+from ..results.analysis import (
+    Analysis,
+    Coupling,
+    Estimate,
+    JointResult,
+)
+from ..results.coupling import LocalCoupling
+from ..results.experiment import Experiment, Run
+from ..results.sweep import LinearCoupling
 from ..sweep.answer import sweep_checks
+from ..text import formats
+from ..text.answer import answer
 from .drawn import Drawing
 from .entries import Entries, entries_of
 from .matrix import matrix_picture

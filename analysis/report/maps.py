@@ -16,7 +16,7 @@ from markupsafe import Markup
 from capture.arrays import BoolArray, FloatArray
 
 from ..cycles import CycleMaps
-from ..formats import decimals_for_values, number, short
+from ..text.formats import decimals_for_values, number, short
 from .drawn import Drawing
 from .markup import element
 

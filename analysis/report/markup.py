@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from markupsafe import Markup, escape
 
-from ..formats import plain
+from ..text.formats import plain
 
 
 def element(name: str, *children: object, **attributes: object) -> Markup:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from ..formats import decimals_for_values, number, short
+from ..text.formats import decimals_for_values, number, short
 from .drawn import Drawing
 from .entries import Entries
 from .markup import element, joined

@@ -11,9 +11,14 @@ import numpy as np
 from capture.arrays import FloatArray, frozen
 from capture.palette import joint_hex
 
-from ..formats import degrees, estimate, relative, short
-from ..result import Estimate
-from ..result_experiment import Experiment, Reversal
+from ..results.analysis import Estimate
+from ..results.experiment import Experiment, Reversal
+from ..text.formats import (
+    degrees,
+    estimate,
+    relative,
+    short,
+)
 from .drawn import WIDTH_IN, Drawing, joint_ticks, key, legend
 from .svg import INK, MUTED, REFERENCE, Axes, drawing, inline_svg, new_figure
 

@@ -7,8 +7,13 @@ import numpy as np
 from capture.arrays import FloatArray
 from capture.palette import joint_hex
 
-from ..formats import degrees, estimate, scaled, short
-from ..result import BodyPoint, BodyResult
+from ..results.analysis import BodyPoint, BodyResult
+from ..text.formats import (
+    degrees,
+    estimate,
+    scaled,
+    short,
+)
 from .drawn import WIDTH_IN, Drawing, key, legend
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
 

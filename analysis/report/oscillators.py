@@ -9,10 +9,10 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
-from .. import formats
 from ..oscillators.result import BodyOscillators, ChainCoupling
 from ..oscillators.text import chain_detail
-from ..result import Estimate
+from ..results.analysis import Estimate
+from ..text import formats
 from .drawn import WIDTH_IN, Drawing, key, legend
 from .entries import Entries
 from .matrix import matrix_picture

@@ -16,11 +16,17 @@ from capture import Session
 from capture.errors import UsageError
 from capture.palette import joint_hex
 
-from .. import formats
 from ..compare.result import Comparison
 from ..cycles import CycleMaps
-from ..result import Analysis, BodyPoint, Estimate, Index, Provenance
-from ..result_experiment import Experiment
+from ..results.analysis import (
+    Analysis,
+    BodyPoint,
+    Estimate,
+    Index,
+    Provenance,
+)
+from ..results.experiment import Experiment
+from ..text import formats
 from .comparison_view import comparison_view
 from .driven import is_driven
 from .experiment_view import experiment_view

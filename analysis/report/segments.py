@@ -9,8 +9,8 @@ import numpy as np
 
 from capture.palette import joint_hex
 
-from ..formats import degrees, estimate, number
-from ..result import Estimate, JointResult
+from ..results.analysis import Estimate, JointResult
+from ..text.formats import degrees, estimate, number
 from .drawn import WIDTH_IN, Drawing, key, legend, marker
 from .driven import is_driven
 from .svg import INK, MUTED, PAPER, REFERENCE, Axes, Figure, Handle, drawing, inline_svg, new_figure

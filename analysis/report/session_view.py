@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from capture import Session
 from capture.palette import joint_hex
 
-from .. import formats
-from ..answer import Answer, answer
 from ..cycles import CycleMaps
-from ..result import Analysis, JointResult
+from ..results.analysis import Analysis, JointResult
+from ..text import formats
+from ..text.answer import Answer, answer
 from .artefacts import ArtefactRow, artefact_rows, flagged_joints
 from .drawn import Drawing
 from .driven import is_driven

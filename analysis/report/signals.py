@@ -12,8 +12,8 @@ from capture.arrays import FloatArray, frozen
 from capture.errors import DataError, MissingChannelError
 from capture.palette import joint_hex
 
-from ..formats import degrees, estimate, short
-from ..result import Analysis, JointResult
+from ..results.analysis import Analysis, JointResult
+from ..text.formats import degrees, estimate, short
 from .drawn import WIDTH_IN, Drawing, key, legend
 from .driven import is_driven
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure

@@ -19,7 +19,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as _Figure
 
-from ..formats import plain
+from ..text.formats import plain
 
 Figure: TypeAlias = Any
 Axes: TypeAlias = Any

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..experiment.answer import percent
-from ..result_sweep import LinearCoupling
+from ..results.sweep import LinearCoupling
 from ..sweep.coupling import NONLINEAR
 from .tables import Fact
 from .trials import Trial

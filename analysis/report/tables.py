@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from .. import formats
-from ..result import Analysis, Estimate, JointResult
+from ..results.analysis import Analysis, Estimate, JointResult
+from ..text import formats
 from .driven import is_driven
 
 

@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from .. import formats
-from ..answer import find
-from ..result import Coupling, Estimate, Index
-from ..result_coupling import LocalCoupling, RowCheck
-from ..result_experiment import Experiment, Reversal
+from ..results.analysis import Coupling, Estimate, Index
+from ..results.coupling import LocalCoupling, RowCheck
+from ..results.experiment import Experiment, Reversal
 from ..reversal.modules import SIGNIFICANT
+from ..text import formats
+from ..text.answer import find
 
 LEVEL_NOTE = (
     f"Each test stands by itself at a level of {100 * SIGNIFICANT:g} %; those that look at several "

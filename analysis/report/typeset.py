@@ -6,7 +6,7 @@ import re
 
 from markupsafe import Markup, escape
 
-from .. import formats
+from ..text import formats
 
 NO_BREAK = "\N{NO-BREAK SPACE}"
 

@@ -7,7 +7,7 @@ import numpy as np
 from capture.palette import joint_hex
 
 from ..compare.result import Comparison
-from ..formats import short
+from ..text.formats import short
 from .drawn import WIDTH_IN, Drawing, key, legend
 from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray
 
-from ..equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
+from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response import around
-from ..result import Estimate
-from ..result_experiment import MirrorJoint, Reversal, WeakModule
+from ..results.analysis import Estimate
+from ..results.experiment import MirrorJoint, Reversal, WeakModule
 from .mirror import MirrorTest, mirror_test
 from .shares import variance_shares
 

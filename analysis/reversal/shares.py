@@ -20,7 +20,7 @@ import numpy as np
 from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from ..response import CONFIDENCE
-from ..result import Estimate, Interval
+from ..results.analysis import Estimate, Interval
 
 RESAMPLES = 2_000
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .. import formats
 from ..experiment.answer import percent
-from ..result import Coupling
-from ..result_sweep import LinearCoupling, Route, ToneCoupling
+from ..results.analysis import Coupling
+from ..results.sweep import LinearCoupling, Route, ToneCoupling
+from ..text import formats
 
 _TOLD = {
     Route.TORQUE: "Z from torques",

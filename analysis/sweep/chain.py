@@ -33,7 +33,7 @@ from scipy.special import stdtrit
 from capture.arrays import ComplexArray, FloatArray
 from capture.robot import Servo
 
-from ..norm_ratio import DRAWS
+from ..estimators.norm_ratio import DRAWS
 from ..response import CONFIDENCE, welch_satterthwaite
 
 

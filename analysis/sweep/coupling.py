@@ -14,9 +14,9 @@ from capture.robot import Servo
 from ..as_run import robot_as_run
 from ..kicks.lti_reading import SINGULAR, reciprocity
 from ..reading import Warn
-from ..result import Coupling, Estimate
-from ..result_coupling import Rows
-from ..result_sweep import (
+from ..results.analysis import Coupling, Estimate
+from ..results.coupling import Rows
+from ..results.sweep import (
     ComplexMatrix,
     LinearCoupling,
     Route,

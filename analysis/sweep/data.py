@@ -16,9 +16,9 @@ from capture.errors import DataError
 from capture.robot import Robot
 
 from ..as_run import physics_step_s, scenario_of, touches
+from ..estimators.series import Series
+from ..estimators.settling import DRIFT_PER_CYCLE, SIGNIFICANT
 from ..gait import NYQUIST_SHARE
-from ..series import Series
-from ..settling import DRIFT_PER_CYCLE, SIGNIFICANT
 from ..stretch import Options
 from .chain import Phasors
 from .distortion import Beside

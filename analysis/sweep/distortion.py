@@ -14,9 +14,9 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
+from ..estimators.norm_ratio import norm_ratio
 from ..kicks.lti_reading import squared
-from ..norm_ratio import norm_ratio
-from ..result import Estimate
+from ..results.analysis import Estimate
 from .chain import Phasors
 
 _NEAREST = 6

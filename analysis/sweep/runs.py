@@ -16,10 +16,10 @@ from capture import Session
 from capture.arrays import BoolArray, ComplexArray, FloatArray
 
 from ..analyse import Examined
+from ..estimators.series import Series, clean
 from ..experiment.runs import SAME_FREQUENCY
 from ..gait import DRIVEN_SHARE
 from ..reading import read_columns
-from ..series import Series, clean
 from ..stretch import Options, choose_stretch
 from .tone_finder import find_tones
 from .tones import fit_tones

@@ -13,8 +13,8 @@ import numpy as np
 
 from capture.arrays import FloatArray
 
+from ..estimators.series import Series
 from ..gait import NYQUIST_SHARE
-from ..series import Series
 
 MOST_TONES = 12
 EXPLAINED = 0.98

@@ -17,7 +17,7 @@ import rerun as rr
 from analysis.compare.result import BODY, Comparison
 from analysis.compare.side import Known, Seen
 from analysis.response import around, t_factor
-from analysis.result import Estimate
+from analysis.results.analysis import Estimate
 
 from ..joints import GREY
 from .side import COMPARED, Side

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from analysis.compare.changes import changes
 from analysis.compare.result import Change, Comparison
-from analysis.formats import short, utc
+from analysis.text.formats import short, utc
 
 from .alignment import Align
 from .side import COMPARED, Side

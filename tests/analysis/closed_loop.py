@@ -15,7 +15,7 @@ import numpy as np
 from analysis import analyse_experiment
 from analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
 from analysis.oscillators.phase_log import read_phases
-from analysis.result_experiment import Experiment
+from analysis.results.experiment import Experiment
 from capture import Session
 from sim import GaitTick, load_scenario
 from sim.physics.engine import Kernels

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
 
-from analysis.result import (
+from analysis.results.analysis import (
     Analysis,
     BodyPoint,
     BodyResult,

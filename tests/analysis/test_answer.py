@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from analysis.answer import Verdict, answer
-from analysis.result import Index
+from analysis.results.analysis import Index
+from analysis.text.answer import Verdict, answer
 
 
 def with_indices(analysis, **indices):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from analysis.analyse import measure_session
-from analysis.cycle_sums import starts_of
 from analysis.cycles import amplitudes, cycle_maps
-from analysis.series import Series
+from analysis.estimators.cycle_sums import starts_of
+from analysis.estimators.series import Series
 from capture import Session, SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from analysis.demodulation import Phase, cycles_of, demodulate
 from analysis.demodulation_session import response_over_time
+from analysis.estimators.demodulation import Phase, cycles_of, demodulate
+from analysis.estimators.series import Series
 from analysis.reading import read_columns
 from analysis.response import t_factor
-from analysis.series import Series
 from capture import Session, SessionWriter
 
 T = np.arange(6000) / 100

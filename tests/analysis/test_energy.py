@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from analysis.energy.joint import integrate, power_of
-from analysis.series import Series, clean, coverage, sample_weights
+from analysis.estimators.series import (
+    Series,
+    clean,
+    coverage,
+    sample_weights,
+)
 from capture.log.signals import Signal
 
 SECOND = 10**9

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis import formats
-from analysis.result import Estimate
+from analysis.results.analysis import Estimate
+from analysis.text import formats
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from analysis.estimators.harmonic import fit_at, fit_shared
+from analysis.estimators.series import Series
+from analysis.estimators.settling import worst_drift
 from analysis.fitting import fit_gait
 from analysis.gait import driven, find_rhythm, phase_step, wave_name
-from analysis.harmonic import fit_at, fit_shared
-from analysis.series import Series
-from analysis.settling import worst_drift
 from analysis.windows import Stretch, covered, settled, steady_runs, whole_cycles
 
 

@@ -9,7 +9,7 @@ import pytest
 import undulog
 from analysis import analyse_experiment
 from analysis.experiment.table import render_experiment
-from analysis.result_coupling import LocalCoupling
+from analysis.results.coupling import LocalCoupling
 from capture import Session, SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000

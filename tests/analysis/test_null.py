@@ -18,7 +18,7 @@ from analysis.body.places import (
     place_links,
     track,
 )
-from analysis.series import Series
+from analysis.estimators.series import Series
 from capture import load_robot
 from capture.robot import ClockDomain, Joint, Link, Plane, Robot
 from capture.robot.kinematics import quaternion_from_rotation

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from analysis.series import Series
+from analysis.estimators.series import Series
 from analysis.sweep.chain import (
     Phasors,
     impedance,

@@ -10,7 +10,7 @@ import undulog
 from analysis import analyse_experiment
 from analysis.experiment.table import render_experiment
 from analysis.plan.sweep_designs import tones
-from analysis.result_sweep import LinearCoupling, Route
+from analysis.results.sweep import LinearCoupling, Route
 from analysis.sweep.chain import servo_side
 from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane

@@ -7,8 +7,8 @@ import re
 
 import pytest
 
-from analysis.answer import answer
-from analysis.table import render
+from analysis.text.answer import answer
+from analysis.text.table import render
 
 
 def test_the_answer_stands_first_and_the_method_last(snake):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.result import (
+from analysis.results.analysis import (
     Analysis,
     Coupling,
     Estimate,

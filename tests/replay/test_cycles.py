@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from analysis.cycles import CycleMaps
-from analysis.result import Estimate
-from analysis.result_energy import EnergyResult, JointCycles, Transport
-from analysis.result_over_time import JointOverTime, ResponseOverTime
+from analysis.results.analysis import Estimate
+from analysis.results.energy import EnergyResult, JointCycles, Transport
+from analysis.results.over_time import JointOverTime, ResponseOverTime
 from capture import Session
 from capture.palette import joint_colors
 from replay.colors import power_colors

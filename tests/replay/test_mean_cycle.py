@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import undulog
 from analysis.analyse import measure_session
 from analysis.cycles import cycle_maps
-from analysis.result import Estimate
-from analysis.result_artefact import Artefact
+from analysis.results.analysis import Estimate
+from analysis.results.artefact import Artefact
 from capture import Session
 from replay.cycles import cycle_tables
 from replay.results import computed

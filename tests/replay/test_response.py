@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from analysis.result import Estimate
+from analysis.results.analysis import Estimate
 from replay.response import charts
 
 

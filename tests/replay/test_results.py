@@ -8,8 +8,13 @@ import pytest
 import undulog
 from analysis.compare.result import Comparison, NamedJoint
 from analysis.null_model.result import ModelledAnalysis, ModuleDeviation, NullModelResult
-from analysis.result import Coupling, Estimate, Provenance
-from analysis.result_experiment import Experiment, Reversal, Run, WeakModule
+from analysis.results.analysis import Coupling, Estimate, Provenance
+from analysis.results.experiment import (
+    Experiment,
+    Reversal,
+    Run,
+    WeakModule,
+)
 from capture import Session
 from capture.errors import DataError
 from capture.robot.kinematics import link_poses

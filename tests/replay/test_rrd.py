@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.answer import answer
+from analysis.text.answer import answer
 from capture import Session, SessionWriter
 from capture.errors import DataError, LogWriteError
 from capture.palette import joint_colors

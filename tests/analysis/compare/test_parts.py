@@ -9,8 +9,8 @@ from analysis.compare.motion import GRAVITY, Steps, centre_of_mass, cost_of_tran
 from analysis.compare.result import Change
 from analysis.compare.side import turned
 from analysis.compare.waveform import cycles_by_phase, phases_rad
-from analysis.harmonic import HarmonicModel, fit_at
-from analysis.series import Series
+from analysis.estimators.harmonic import HarmonicModel, fit_at
+from analysis.estimators.series import Series
 from capture import load_robot
 from capture.robot.kinematics import quaternion_from_rotation
 

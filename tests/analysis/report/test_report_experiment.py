@@ -8,14 +8,14 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from analysis.formats import sentence
 from analysis.report import render, typeset
 from analysis.report.artefacts import artefact_rows, told_times
 from analysis.report.entries import Entries, entries_of
 from analysis.report.matrix import matrix_picture
 from analysis.report.mirror import profiles
 from analysis.report.trials import experiment_trials, session_trials
-from analysis.result_artefact import Artefact
+from analysis.results.artefact import Artefact
+from analysis.text.formats import sentence
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from analysis.report import render
-from analysis.result import Coupling, Estimate
+from analysis.results.analysis import Coupling, Estimate
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 NAMES = ["snake", "still", "single", "hostile"]

@@ -10,9 +10,14 @@ import pytest
 
 from analysis import Choices, Experiment, compare_sessions, load
 from analysis.oscillators.result import ChainCoupling, Link, Rate
-from analysis.result import Estimate
-from analysis.result_artefact import Artefact
-from analysis.result_sweep import ComplexMatrix, LinearCoupling, Route, ToneCoupling
+from analysis.results.analysis import Estimate
+from analysis.results.artefact import Artefact
+from analysis.results.sweep import (
+    ComplexMatrix,
+    LinearCoupling,
+    Route,
+    ToneCoupling,
+)
 from capture import Session
 from capture.errors import DataError, LogError, OutputExistsError, UsageError
 

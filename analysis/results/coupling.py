@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .result import Coupling, Estimate
+from .analysis import Coupling, Estimate
 
 Rows = tuple[tuple[float, ...], ...]
 

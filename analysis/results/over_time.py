@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .result_artefact import Span
+from .artefact import Span
 
 Maybe = tuple[float | None, ...]
 Intervals = tuple[tuple[float, float] | None, ...]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from ..results.analysis import Analysis, Estimate
+from ..results.energy import EnergyResult
 from . import formats
-from .result import Analysis, Estimate
-from .result_energy import EnergyResult
 
 _ABOUT = {
     "sensor": "Artefact of the sensor",

@@ -11,13 +11,13 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from .notebook.shown import Shown
-from .result_artefact import Artefact
+from ..notebook.shown import Shown
+from .artefact import Artefact
 
 if TYPE_CHECKING:
-    from .oscillators.result import ChainCoupling
-    from .result_energy import EnergyResult
-    from .result_over_time import ResponseOverTime
+    from ..oscillators.result import ChainCoupling
+    from .energy import EnergyResult
+    from .over_time import ResponseOverTime
 
 Interval = tuple[float, float]
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
 
-from .result import Estimate, Interval
+from ..results.analysis import Estimate, Interval
 
 MISSING = "\N{EN DASH}"
 """Printed where a value could not be computed."""

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 
 from capture import Session
 
-from .fitting import GaitFit
-from .reading import Warn
-from .result import JointResult
-from .result_artefact import KINDS, Artefact
-from .windows import Stretch
+from ..fitting import GaitFit
+from ..reading import Warn
+from ..results.analysis import JointResult
+from ..results.artefact import KINDS, Artefact
+from ..windows import Stretch
 
 _NS = 1e9
 

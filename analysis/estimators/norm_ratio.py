@@ -14,8 +14,8 @@ import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray
 
-from .response import CONFIDENCE
-from .result import Estimate
+from ..response import CONFIDENCE
+from ..results.analysis import Estimate
 
 DRAWS = 400
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from .result import Coupling, Estimate
-from .result_coupling import Rows
+from .analysis import Coupling, Estimate
+from .coupling import Rows
 
 
 class Route(StrEnum):

@@ -12,8 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from ..results.analysis import (
+    Analysis,
+    Estimate,
+    Index,
+    JointResult,
+)
 from . import formats
-from .result import Analysis, Estimate, Index, JointResult
 
 SIGNIFICANT = 0.05
 """Family-wise level of the sentence."""

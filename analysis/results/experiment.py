@@ -1,7 +1,8 @@
 """What several sessions of one experiment say together.
 
 ``Experiment.to_dict`` is the object that ``undulog analyse A.mcap B.mcap ... --json`` prints. As in
-:mod:`analysis.result`, what could not be computed is None (null), and ``warnings`` says why.
+:mod:`analysis.results.analysis`, what could not be computed is None (null), and ``warnings`` says
+why.
 """
 
 from __future__ import annotations
@@ -10,9 +11,15 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from .notebook.shown import Shown
-from .oscillators.result import BodyOscillators
-from .result import Analysis, Coupling, Estimate, Index, Provenance
+from ..notebook.shown import Shown
+from ..oscillators.result import BodyOscillators
+from .analysis import (
+    Analysis,
+    Coupling,
+    Estimate,
+    Index,
+    Provenance,
+)
 
 BLIND = (
     "blind to what is alike at both joints of a mirror pair and to the middle joint of an odd "
@@ -141,8 +148,8 @@ class Experiment(Shown):
         heterogeneity: Index name to index, from all runs together.
         reversal: None where it can't be tested; a warning says why.
         coupling: Identifiable or not; from kicks around one gait a
-            :class:`analysis.result_coupling.LocalCoupling`, from a sweep without contact a
-            :class:`analysis.result_sweep.LinearCoupling`.
+            :class:`analysis.results.coupling.LocalCoupling`, from a sweep without contact a
+            :class:`analysis.results.sweep.LinearCoupling`.
         warnings: One sentence each.
         provenance: How it was made.
         oscillators: From kicks around one gait: how oscillators that feel their servos would

@@ -8,13 +8,19 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..command_line import UNLIMITED
+from ..null_model.result import ModelledAnalysis, told_null
+from ..oscillators.text import chain_detail
+from ..results.analysis import (
+    Analysis,
+    BodyResult,
+    Estimate,
+    Index,
+    JointResult,
+)
 from . import formats
 from .answer import answer
-from .command_line import UNLIMITED
-from .null_model.result import ModelledAnalysis, told_null
-from .oscillators.text import chain_detail
-from .result import Analysis, BodyResult, Estimate, Index, JointResult
-from .table_lines import more_lines
+from .lines import more_lines
 
 _SPARE: list[tuple[str, ...]] = [
     (name,) for name in ("plane", "cover", "E_net J", "E_el J", "command°", "E_abs J")

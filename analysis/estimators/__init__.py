@@ -1,0 +1,1 @@
+"""Estimators on plain arrays: harmonic fits, demodulation, spectra, ratios of noisy matrices."""
