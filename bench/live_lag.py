@@ -32,7 +32,7 @@ from rerun.experimental import ViewerClient
 
 from capture.daemon.live_feed import LiveFeed
 from capture.log.sink import Description
-from replay.timeline import SESSION_TIME
+from replay.samples.timeline import SESSION_TIME
 from replay.viewer import LOOPBACK, free_ports, viewer_binary
 
 LAG_MS = 150.0

@@ -32,10 +32,10 @@ import rerun as rr
 from analyse_hour import cost, verdict
 
 from capture import Session
-from replay.body import capsule_poses, capsule_shape
-from replay.motion import assemble, frames_of, read_head
-from replay.quantities import quantities
-from replay.tracks import read_columns, wanted_fields
+from replay.samples.quantities import quantities
+from replay.samples.tracks import read_columns, wanted_fields
+from replay.scene.body import capsule_poses, capsule_shape
+from replay.scene.motion import assemble, frames_of, read_head
 
 HOUR_S = 3600
 CONVERT_S, SIZE_MB, PEAK_MB = 30.0, 350.0, 500.0

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from .content import Content
+from .samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .single import Tab
-from .timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .views import Views, build_views
 
 

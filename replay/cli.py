@@ -14,7 +14,7 @@ from capture.console import emit_json, progress, refuse_existing
 from capture.errors import UsageError
 
 from .beside.options import BesideOptions
-from .clip_cli import ClipOptions, view_clip
+from .clip.cli import ClipOptions, view_clip
 from .single import SingleOptions
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def view(
             raise UsageError(f"{save}: a Rerun recording; end its name in .rrd")
         refuse_existing(save, force=force)
     if live is not None:
-        from .live_cli import view_live
+        from .live.cli import view_live
 
         view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1:
@@ -145,9 +145,9 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     from capture import Session
 
     from .blueprint import build_blueprint
-    from .renamed import COMMANDS, STATES, RenamedSession
     from .results import computed, saved
     from .rrd import write_recording
+    from .samples.renamed import COMMANDS, STATES, RenamedSession
 
     command = single.command_topic or COMMANDS
     response = single.response_topic or STATES

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from capture.robot import Robot
 
-from .cycles import Quantity
-from .heat_maps import HeatMap
-from .joints import Places, Series
-from .mean_cycle import MeanCycle
-from .response import Chart
+from .cycles.heat_maps import HeatMap
+from .cycles.mean_cycle import MeanCycle
+from .cycles.steps import Quantity
+from .plots.joints import Places, Series
+from .plots.response import Chart
 
 _SHORT = {
     "/joint_current": "Current",

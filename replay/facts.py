@@ -14,7 +14,7 @@ from capture import Session
 
 from .content import Content
 from .layer import Named
-from .timeline import ENSEMBLE_CYCLE
+from .samples.timeline import ENSEMBLE_CYCLE
 
 FACTS = "/session"
 

@@ -17,7 +17,7 @@ from rerun.experimental import View, ViewerClient
 
 from capture.errors import UndulogError
 
-from .timeline import ENSEMBLE_CYCLE, SESSION_TIME
+from .samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .viewer import LOOPBACK, free_ports, viewer_binary
 
 _START_S = 60.0

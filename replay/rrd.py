@@ -25,23 +25,29 @@ from capture.part_file import part_file
 from capture.robot import Robot
 from capture.robot.kinematics import rotation_from_quaternion
 
-from . import facts, gait, joints, power
+from . import facts
 from .blueprint import build_blueprint
 from .content import Content, Signal, Start, signal_title
-from .cycles import cycle_tables, log_cycles
-from .heat_maps import heat_maps, log_maps
+from .cycles.heat_maps import heat_maps, log_maps
+from .cycles.mean_cycle import (
+    Channels,
+    Look,
+    averaged_ns,
+    log_mean_cycle,
+)
+from .cycles.steps import cycle_tables, log_cycles
 from .layer import Layer, Named
-from .mean_cycle import Channels, Look, averaged_ns, log_mean_cycle
-from .motion import BODY_RATE_HZ, HeadPath, read_head
-from .other_topics import log_others, log_words
-from .plots import Plots
-from .quantities import DRAWN, quantities
-from .response import charts, log_charts, log_current
-from .scene import Scene
-from .stretches import stretches
-from .survey import GAIT, Survey, survey
-from .timeline import Clock
-from .tracks import Track, read_columns
+from .plots import gait, joints, power
+from .plots.other_topics import log_others, log_words
+from .plots.response import charts, log_charts, log_current
+from .plots.write import Plots
+from .samples.quantities import DRAWN, quantities
+from .samples.stretches import stretches
+from .samples.survey import GAIT, Survey, survey
+from .samples.timeline import Clock
+from .samples.tracks import Track, read_columns
+from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
+from .scene.stage import Scene
 from .views import body_title
 
 APPLICATION = "undulog"

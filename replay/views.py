@@ -17,12 +17,15 @@ from rerun.encodings import EntityPathLike
 
 from capture.robot import Plane, Robot
 
-from . import body, facts, gait, joints, mean_cycle, power, trail
+from . import facts
 from .content import Content, Start
-from .heat_maps import VISIBLE
-from .joints import Series
-from .response import SEGMENTS
-from .timeline import GAIT_CYCLE, SESSION_TIME
+from .cycles import mean_cycle
+from .cycles.heat_maps import VISIBLE
+from .plots import gait, joints, power
+from .plots.joints import Series
+from .plots.response import SEGMENTS
+from .samples.timeline import GAIT_CYCLE, SESSION_TIME
+from .scene import body, trail
 
 BEFORE_CURSOR_S = 4.0
 AFTER_CURSOR_S = 2.0

@@ -17,8 +17,13 @@ import numpy as np
 from capture.arrays import BoolArray, FloatArray, IntArray
 from capture.errors import UsageError
 
-from ..sampling import gaps, interpolate
-from ..timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm
+from ..samples.sampling import gaps, interpolate
+from ..samples.timeline import (
+    GAIT_CYCLE,
+    SESSION_TIME,
+    Clock,
+    Rhythm,
+)
 from .side import Side
 
 

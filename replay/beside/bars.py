@@ -19,7 +19,7 @@ from analysis.compare.side import Known, Seen
 from analysis.response import around, t_factor
 from analysis.results.analysis import Estimate
 
-from ..joints import GREY
+from ..plots.joints import GREY
 from .side import COMPARED, Side
 
 BARS = f"{COMPARED}/segments"

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from ..joints import Series, log_table, part_entity
-from ..sampling import interpolate
-from ..tracks import Track, brought_together
+from ..plots.joints import Series, log_table, part_entity
+from ..samples.sampling import interpolate
+from ..samples.tracks import Track, brought_together
 from .alignment import Align, Aligned, counterparts
 
 

@@ -14,13 +14,13 @@ from rerun.components import FillMode
 
 from capture.robot import Robot
 
-from ..body import MEASURED
-from ..joints import Color
-from ..meshes import MESHES, meshed
-from ..motion import HeadPath
-from ..sampling import decimate
-from ..timeline import GAIT_CYCLE, SESSION_TIME
-from ..trail import TRAIL
+from ..plots.joints import Color
+from ..samples.sampling import decimate
+from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
+from ..scene.body import MEASURED
+from ..scene.meshes import MESHES, meshed
+from ..scene.motion import HeadPath
+from ..scene.trail import TRAIL
 from .alignment import Aligned
 from .placement import Placement
 

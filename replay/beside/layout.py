@@ -9,14 +9,15 @@ from typing import Any, cast
 import rerun.blueprint as rrb
 from rerun.encodings import EntityPathLike
 
-from .. import gait, ranges
-from ..body import COMMANDED, MEASURED
 from ..content import Content
 from ..facts import FACTS as SESSION
-from ..joints import Series
-from ..markers import LABELS, MARKERS
-from ..timeline import GAIT_CYCLE, SESSION_TIME
-from ..trail import TRAIL, TRAIL_SECONDS
+from ..plots import gait
+from ..plots.joints import Series
+from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
+from ..scene import ranges
+from ..scene.body import COMMANDED, MEASURED
+from ..scene.markers import LABELS, MARKERS
+from ..scene.trail import TRAIL, TRAIL_SECONDS
 from ..views import AFTER_CURSOR_S, BEFORE_CURSOR_S, build_views
 from .alignment import Align
 from .bars import BARS, DIFFERENCES, Quantity

@@ -14,9 +14,9 @@ import rerun as rr
 
 from capture.arrays import FloatArray, IntArray
 
-from ..joints import Places, log_look, log_rows
-from ..power import TOTAL
-from ..sampling import mark_gaps, typical_step_ns
+from ..plots.joints import Places, log_look, log_rows
+from ..plots.power import TOTAL
+from ..samples.sampling import mark_gaps, typical_step_ns
 from .alignment import Aligned
 from .dress import tint
 from .side import COMPARED, Side

@@ -15,7 +15,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from ..timeline import GAIT_CYCLE, SESSION_TIME
+from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk

@@ -17,8 +17,8 @@ import numpy as np
 from capture.arrays import FloatArray, IntArray
 from capture.robot.kinematics import link_poses, rotation_from_quaternion
 
-from ..sampling import interpolate
-from ..tracks import resampled
+from ..samples.sampling import interpolate
+from ..samples.tracks import resampled
 from .alignment import Align, Aligned, counterparts, times_of
 from .side import Side
 

@@ -15,12 +15,12 @@ from capture import Session
 from capture.errors import UndulogError, UsageError
 from capture.robot import Robot
 
-from ..gait import rhythm_of
-from ..joints import Color
-from ..motion import HeadPath, read_head
+from ..plots.gait import rhythm_of
+from ..plots.joints import Color
 from ..rrd import Recording, palette_of, write_recording
-from ..timeline import Rhythm
-from ..tracks import Track, read_columns, wanted_fields
+from ..samples.timeline import Rhythm
+from ..samples.tracks import Track, read_columns, wanted_fields
+from ..scene.motion import HeadPath, read_head
 
 COMPARED = "/compared"
 """Where everything goes that belongs to no single session."""

@@ -18,10 +18,10 @@ from capture.errors import LogWriteError, UndulogError
 from capture.interruption import StopRequest
 from capture.part_file import check_stop, part_file
 
-from ..joints import log_scalars
+from ..plots.joints import log_scalars
 from ..rrd import APPLICATION, Recording, recording_id, require_whole
-from ..sampling import decimate
-from ..tracks import Track
+from ..samples.sampling import decimate
+from ..samples.tracks import Track
 from ..views import body_title
 from . import bars, dress, lines, words
 from .alignment import Align, Aligned

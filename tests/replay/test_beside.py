@@ -19,7 +19,7 @@ from replay.beside.alignment import Align, align, times_of
 from replay.beside.layout import all_views
 from replay.beside.side import convert, read_side
 from replay.beside.write import Converted, write_beside
-from replay.timeline import Rhythm
+from replay.samples.timeline import Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.robot.kinematics import link_poses
-from replay.body import (
+from replay.samples.tracks import Track
+from replay.scene.body import (
     ROUNDING,
     TURN_ROUNDING,
     capsule_columns,
@@ -13,9 +14,8 @@ from replay.body import (
     capsule_shape,
     segment_power,
 )
-from replay.markers import above_joints
-from replay.motion import HeadPath, assemble, frames_of
-from replay.tracks import Track
+from replay.scene.markers import above_joints
+from replay.scene.motion import HeadPath, assemble, frames_of
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from PIL import Image
 
 import undulog
 from capture.errors import UsageError
-from replay.clip import Shot
-from replay.clip_files import open_film
+from replay.clip.files import open_film
+from replay.clip.film import Shot
 
 VERMILION = (255, 84, 48)
 GROUND = (16, 18, 22)

@@ -11,11 +11,18 @@ from analysis.results.energy import EnergyResult, JointCycles, Transport
 from analysis.results.over_time import JointOverTime, ResponseOverTime
 from capture import Session
 from capture.palette import joint_colors
-from replay.colors import power_colors
-from replay.cycles import ENERGY, GAIN, LAG, CycleTable, cycle_tables, together
-from replay.heat_maps import cell_colors, heat_maps
-from replay.response import charts
+from replay.cycles.heat_maps import cell_colors, heat_maps
+from replay.cycles.steps import (
+    ENERGY,
+    GAIN,
+    LAG,
+    CycleTable,
+    cycle_tables,
+    together,
+)
+from replay.plots.response import charts
 from replay.rrd import write_recording
+from replay.scene.colors import power_colors
 
 STARTS = (0.0, 1.0, 2.0)
 STOPS = (1.0, 2.0, 3.0)

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from capture.robot.kinematics import link_poses
-from replay.ensemble import DEGREES, body_frame, mean_cycles, pace_of
-from replay.joints import Places
-from replay.timeline import Rhythm
-from replay.tracks import Track
+from replay.cycles.ensemble import (
+    DEGREES,
+    body_frame,
+    mean_cycles,
+    pace_of,
+)
+from replay.plots.joints import Places
+from replay.samples.timeline import Rhythm
+from replay.samples.tracks import Track
 
 EPOCH_NS = 1_735_689_600_000_000_000
 PHASE = np.radians(DEGREES)

@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_typestore
 import undulog
 from capture import Session
 from capture.errors import MissingChannelError
-from replay.other_topics import is_foreign, log_others
-from replay.renamed import RenamedSession
+from replay.plots.other_topics import is_foreign, log_others
+from replay.samples.renamed import RenamedSession
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from replay.gait import changes, rhythm_of
-from replay.tracks import Track
-from replay.trail import trail_segments
+from replay.plots.gait import changes, rhythm_of
+from replay.samples.tracks import Track
+from replay.scene.trail import trail_segments
 
 T = np.arange(500, dtype=np.int64) * 10_000_000
 

@@ -14,8 +14,8 @@ from analysis.analyse import analyse_session
 from capture import Session, SessionWriter
 from capture.daemon.live_wire import LiveMessage
 from capture.robot import Plane
-from replay.live_cycles import CycleMeter
-from replay.live_decode import LiveLog
+from replay.live.cycles import CycleMeter
+from replay.live.decode import LiveLog
 
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
 Recorder, Relay, EPOCH_NS = shared["Recorder"], shared["Relay"], shared["EPOCH_NS"]

@@ -14,7 +14,7 @@ from capture.daemon import live_feed
 from capture.daemon.live_spawn import spawn_relay
 from capture.daemon.live_wire import DatagramHead, Kind, pack_datagram
 from capture.errors import UsageError
-from replay.live_inbox import Inbox
+from replay.live.inbox import Inbox
 
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
 EPOCH_NS = shared["EPOCH_NS"]

@@ -12,10 +12,10 @@ from analysis.cycles import cycle_maps
 from analysis.results.analysis import Estimate
 from analysis.results.artefact import Artefact
 from capture import Session
-from replay.cycles import cycle_tables
+from replay.cycles.steps import cycle_tables
 from replay.results import computed
 from replay.rrd import write_recording
-from replay.timeline import ENSEMBLE_CYCLE
+from replay.samples.timeline import ENSEMBLE_CYCLE
 
 CHAIN = """name = "chain5"
 description = "Five yaw joints."

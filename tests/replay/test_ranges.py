@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from capture.robot import Sensor, SensorKind
 from capture.robot.kinematics import link_poses
-from replay.ranges import rays
+from replay.scene.ranges import rays
 
 
 def ir(name="ir01", link="link01", position=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), limit=1.5):

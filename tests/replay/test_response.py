@@ -6,7 +6,7 @@ import math
 import pytest
 
 from analysis.results.analysis import Estimate
-from replay.response import charts
+from replay.plots.response import charts
 
 
 def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):

@@ -7,8 +7,8 @@ from analysis.text.answer import answer
 from capture import Session, SessionWriter
 from capture.errors import DataError, LogWriteError
 from capture.palette import joint_colors
-from replay.body import ROUNDING
 from replay.rrd import recording_id, write_recording
+from replay.scene.body import ROUNDING
 
 START = 1_735_689_600_000_000_000
 

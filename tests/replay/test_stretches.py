@@ -5,10 +5,10 @@ import pytest
 
 from capture import Session, SessionWriter
 from capture.robot import Plane
-from replay import stretches
 from replay.rrd import write_recording
-from replay.stretches import Span
-from replay.survey import survey
+from replay.samples import stretches
+from replay.samples.stretches import Span
+from replay.samples.survey import survey
 
 START = 1_735_689_600_000_000_000
 DRAWN = {

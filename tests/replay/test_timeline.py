@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from replay.timeline import GAIT_CYCLE, ROWS_PER_CHUNK, SESSION_TIME, Clock, Rhythm
+from replay.samples.timeline import (
+    GAIT_CYCLE,
+    ROWS_PER_CHUNK,
+    SESSION_TIME,
+    Clock,
+    Rhythm,
+)
 
 MS = 1_000_000
 T = np.arange(400, dtype=np.int64) * 10 * MS

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from replay.sampling import hold, interpolate
-from replay.tracks import (
+from replay.samples.sampling import hold, interpolate
+from replay.samples.tracks import (
     Track,
     brought_together,
     in_turn,

@@ -1,0 +1,1 @@
+"""The body as GIF or MP4."""

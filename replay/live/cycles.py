@@ -1,0 +1,288 @@
+"""Gain, lag and power of each joint in each cycle of a gait, while it is recorded.
+
+The estimator is the analysis's own (:mod:`analysis.estimators.demodulation`), on cycles that
+start where its do: half a turn after the logged phase began to run evenly. It looks half a cycle to
+either side, so a cycle is known half a cycle after its end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.cycles import LEAST_COVERED
+from analysis.demodulation_session import LoggedGait
+from analysis.estimators.cycle_sums import weigh
+from analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
+from analysis.estimators.series import Series, clean
+from analysis.reading import planes_of
+from capture.arrays import FloatArray, IntArray
+from capture.robot import Robot
+
+from ..plots.power import products
+from ..samples.survey import GAIT
+from ..samples.tracks import Track
+from .decode import Batch
+from .window import PATIENCE_NS
+
+KEPT_S = 60.0
+"""A cycle and its surroundings that last longer than this are not computed [s]."""
+
+_TURN = 2.0 * np.pi
+_ROUNDING_RAD = 1e-6
+_MARGIN_NS = 100_000_000
+_BEYOND = 2
+"""Samples of the phase beyond a cycle's surroundings that are waited for."""
+_KEYS = (
+    ("/joint_commands", "position"),
+    ("/joint_states", "position"),
+    ("/joint_states", "velocity"),
+    ("/joint_states", "effort"),
+)
+_COMMAND, _POSITION, _VELOCITY, _EFFORT = _KEYS
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What m joints did in one cycle.
+
+    Attributes:
+        start_ns: Its start [Unix ns].
+        stop_ns: Its end [Unix ns].
+        names: The joints, head to tail.
+        gain: Response over command, NaN where the cycle tells nothing, shape (m,).
+        lag_rad: Positive where the response is late [rad], shape (m,).
+        power_w: Mean mechanical power [W], NaN where it isn't known, shape (m,).
+    """
+
+    start_ns: int
+    stop_ns: int
+    names: tuple[str, ...]
+    gain: FloatArray
+    lag_rad: FloatArray
+    power_w: FloatArray
+
+
+class _Store:
+    """Samples of one joint, the last minute's."""
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[IntArray, FloatArray]] = []
+
+    def add(self, track: Track) -> None:
+        self._parts.append((track.t_ns, track.values))
+
+    def forget(self, before_ns: int) -> None:
+        """Let go of batches that end before a time."""
+        while self._parts and int(self._parts[0][0][-1]) < before_ns:
+            self._parts.pop(0)
+
+    @property
+    def last_ns(self) -> int:
+        return int(self._parts[-1][0][-1]) if self._parts else 0
+
+    def track(self, name: str) -> Track:
+        if not self._parts:
+            return Track(name, np.zeros(0, dtype=np.int64), np.zeros(0))
+        times, values = zip(*self._parts, strict=True)
+        return Track(name, np.concatenate(times), np.concatenate(values))
+
+
+class CycleMeter:
+    """Computes each cycle once its surroundings have come."""
+
+    def __init__(self, origin_ns: int) -> None:
+        """Know nothing yet.
+
+        Args:
+            origin_ns: Unix time from which seconds are counted [ns].
+        """
+        self._origin_ns = origin_ns
+        self._stores: dict[tuple[str, str], dict[str, _Store]] = {key: {} for key in _KEYS}
+        self._gait_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self._gait: dict[str, FloatArray] = {}
+        # Phase at which the run's first cycle starts, and the number of the next one. Counted, not
+        # added up: a sample at a cycle's edge has to be of the same cycle as in the analysis.
+        self._next: dict[str, tuple[float, int]] = {}
+        self._largest: dict[str, float] = {}  # of each joint's commands
+        self._newest_ns = 0
+
+    def add(self, batch: Batch, robot: Robot | None) -> list[Cycle]:
+        """Take new samples.
+
+        Args:
+            batch: The samples.
+            robot: The robot, which says what plane a joint is of; None where it isn't known.
+
+        Returns:
+            The cycles that have become known.
+        """
+        for key, stores in self._stores.items():
+            for track in batch.columns.get(key, ()):
+                if track.t_ns.size:
+                    stores.setdefault(track.name, _Store()).add(track)
+                    self._newest_ns = max(self._newest_ns, int(track.t_ns[-1]))
+        self._add_gait(batch.columns.get((GAIT, "position"), ()))
+        found: list[Cycle] = []
+        if self._gait_ns.size > 2 and any(name.endswith(".phase") for name in self._gait):
+            gait = LoggedGait(self._seconds(self._gait_ns), self._gait)
+            first = 0
+            for first, stop in gait.runs():
+                if first:  # a run of its own, with cycles of its own
+                    self._next.clear()
+                values = {name: value[first:stop] for name, value in gait.values.items()}
+                run = LoggedGait(gait.t_s[first:stop], values)
+                over = stop < gait.t_s.size
+                found += self._finished(run, planes_of(robot), over=over)
+            self._cut_gait(first)
+        self._forget()
+        return found
+
+    # -- the gait --------------------------------------------------------------------------
+
+    def _add_gait(self, tracks: Sequence[Track]) -> None:
+        """Append what the controller meant; phases run on over a whole turn."""
+        if not tracks:
+            return
+        names = {track.name for track in tracks}
+        if self._gait and names != set(self._gait):
+            self._gait_ns, self._gait = self._gait_ns[:0], {}
+            self._next.clear()
+        t_ns = tracks[0].t_ns
+        if any(not np.array_equal(track.t_ns, t_ns) for track in tracks):
+            return  # torn: what is missing shows as a gap
+        later = t_ns > (self._gait_ns[-1] if self._gait_ns.size else -1)
+        finite = later & np.isfinite([track.values for track in tracks]).all(axis=0)
+        for track in tracks:
+            old, new = self._gait.get(track.name, np.zeros(0)), track.values[finite]
+            if track.name.endswith(".phase"):
+                new = np.unwrap(np.concatenate([old[-1:], new]))[old[-1:].size :]
+            self._gait[track.name] = np.concatenate([old, new])
+        self._gait_ns = np.concatenate([self._gait_ns, t_ns[finite]])
+
+    def _cut_gait(self, first: int) -> None:
+        """Keep the run that goes on, and of it no more than is needed."""
+        if first:
+            self._next.clear()
+        oldest_ns = int(self._gait_ns[-1]) - round(KEPT_S * 1e9)
+        first = max(first, int(np.searchsorted(self._gait_ns, oldest_ns)))
+        self._gait_ns = self._gait_ns[first:]
+        self._gait = {name: values[first:] for name, values in self._gait.items()}
+
+    def _forget(self) -> None:
+        """Let go of samples that no cycle needs any more."""
+        oldest_ns = self._newest_ns - round(KEPT_S * 1e9)
+        if self._gait_ns.size and self._next:
+            needed = [
+                self._needed_ns(name, first + _TURN * number)
+                for name, (first, number) in self._next.items()
+            ]
+            oldest_ns = max(oldest_ns, min(needed))
+        for stores in self._stores.values():
+            for store in stores.values():
+                store.forget(oldest_ns)
+
+    def _needed_ns(self, name: str, start: float) -> int:
+        """The time of the first sample that the next cycle needs [ns]."""
+        whole = _whole(self._gait[name])
+        at = int(np.searchsorted(whole, start - np.pi))
+        return int(self._gait_ns[min(at, self._gait_ns.size - 1)]) - _MARGIN_NS
+
+    # -- cycles ----------------------------------------------------------------------------
+
+    def _finished(self, run: LoggedGait, planes: dict[str, str], *, over: bool) -> Iterator[Cycle]:
+        """Cycles of one run that are complete and not yet told."""
+        joints = [n for n in self._stores[_POSITION] if n in self._stores[_COMMAND]]
+        by_phase: dict[str, list[str]] = {}
+        for joint in joints:
+            own = run.phase_name(joint, planes.get(joint, ""))
+            main = run.phase_name("", planes.get(joint, "")) or own
+            if main is not None:
+                by_phase.setdefault(main, []).append(joint)
+        for name, own in by_phase.items():
+            whole = _whole(run.values[name])
+            if not np.all(np.diff(whole) > 0):
+                self._next.pop(name, None)
+                continue
+            first, number = self._next.get(name, (float(whole[0]) + np.pi, 0))
+            while first + _TURN * number - np.pi < whole[0] - _ROUNDING_RAD:
+                number += 1  # its beginning is let go of already
+            while first + _TURN * (number + 1) + np.pi <= whole[-1] + _ROUNDING_RAD:
+                start, end = first + _TURN * np.array([number, number + 1])
+                at = np.array([start, end, start - np.pi, end + np.pi])
+                begin, end, early, late = (float(t) for t in np.interp(at, whole, run.t_s))
+                stop = int(np.searchsorted(run.t_s, late)) + _BEYOND
+                if stop > run.t_s.size and not over:
+                    break
+                if not self._ready(float(run.t_s[min(stop, run.t_s.size) - 1]), own):
+                    break
+                near = slice(max(int(np.searchsorted(run.t_s, early)) - _BEYOND, 0), stop)
+                yield self._cycle(run, near, (begin, end), own, planes)
+                number += 1
+            self._next[name] = first, number
+
+    def _ready(self, until_s: float, joints: Sequence[str]) -> bool:
+        """Whether all joints' samples have come up to a time, or won't come any more."""
+        ends = [
+            self._stores[key][joint].last_ns for key in (_COMMAND, _POSITION) for joint in joints
+        ]
+        known_ns = max(min(ends), self._newest_ns - PATIENCE_NS)
+        return (known_ns - self._origin_ns) * 1e-9 >= until_s
+
+    def _cycle(
+        self,
+        run: LoggedGait,
+        near: slice,
+        edges: tuple[float, float],
+        joints: Sequence[str],
+        planes: dict[str, str],
+    ) -> Cycle:
+        edges_s: FloatArray = np.array(edges)
+        gain, lag, power = (np.full(len(joints), np.nan) for _ in range(3))
+        for i, joint in enumerate(joints):
+            own = run.phase_name(joint, planes.get(joint, "")) or ""
+            phase = Phase(run.t_s[near], _whole(run.values[own])[near])
+            command, response = self._series(_COMMAND, joint), self._series(_POSITION, joint)
+            if command.count > 1 and response.count > 1 and np.ptp(command.values) > 0.0:
+                asked, given = demodulate(command, response, phase, edges_s)
+                size = float(np.abs(asked[0]))
+                if np.isfinite(size):
+                    self._largest[joint] = max(self._largest.get(joint, 0.0), size)
+                if size > DRIVEN_SHARE * self._largest.get(joint, np.inf):
+                    gain[i], lag[i] = np.abs(given[0] / asked[0]), -np.angle(given[0] / asked[0])
+            power[i] = self._power(joint, edges)
+        start_ns, stop_ns = (self._origin_ns + round(edge * 1e9) for edge in edges)
+        return Cycle(start_ns, stop_ns, tuple(joints), gain, lag, power)
+
+    def _power(self, joint: str, edges: tuple[float, float]) -> float:
+        """Mean of torque times velocity [W]; NaN where less than nine tenths of it are known."""
+        both = [
+            (self._stores[key][joint].track(joint),)
+            for key in (_EFFORT, _VELOCITY)
+            if joint in self._stores[key]
+        ]
+        found = products(*both) if len(both) == 2 else ()
+        if not found:
+            return float("nan")
+        (track,) = found
+        series = clean(joint, track.t_ns, track.values, self._origin_ns).between(*edges)
+        if series.count < 2:
+            return float("nan")
+        weighed = weigh(series.t_s, *edges, 1)
+        if weighed.coverage < LEAST_COVERED:
+            return float("nan")
+        return float(np.sum(weighed.weights * series.values)) / (edges[1] - edges[0])
+
+    def _series(self, key: tuple[str, str], joint: str) -> Series:
+        track = self._stores[key][joint].track(joint)
+        return clean(joint, track.t_ns, track.values, self._origin_ns)
+
+    def _seconds(self, t_ns: IntArray) -> FloatArray:
+        return (t_ns - self._origin_ns).astype(np.float64) * 1e-9
+
+
+def _whole(phase: FloatArray) -> FloatArray:
+    """The phase counted upwards, whichever way the gait runs."""
+    return phase if phase[-1] >= phase[0] else -phase

@@ -1,0 +1,358 @@
+"""Messages of a recording that goes on, as the samples that are drawn."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Metadata, Schema
+from numpy.typing import NDArray
+
+from capture.arrays import FloatArray, IntArray
+from capture.daemon.live_wire import LiveMessage
+from capture.errors import DataError, RobotFileError
+from capture.log.cdr import Layout, layout_of
+from capture.log.joint_reader import OFFSET_TOPICS
+from capture.log.joint_rows import JointRows, merge_rows
+from capture.log.rosmsg import MessageType, parse_message_type
+from capture.log.sink import Description
+from capture.robot import Robot
+from capture.robot.description import parse_robot
+
+from ..plots.gait import MODE
+from ..samples.sampling import ordered
+from ..samples.tracks import (
+    JOINT_STATE,
+    OFFSETS,
+    Columns,
+    Track,
+    without_filler,
+)
+from ..scene.motion import POSE, HeadPath, tracked_head
+
+_NS = 1_000_000_000
+_FAR_NS = 3600 * _NS
+_OFFSETS_KEPT = 64
+_LAYOUTS_KEPT = 64
+
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_RANGE = "sensor_msgs/msg/Range"
+_STRING = "std_msgs/msg/String"
+_LOG = "rcl_interfaces/msg/Log"
+
+
+_Offsets = dict[str, tuple[IntArray, FloatArray]]
+"""Joint to stamps [ns] and sample time minus stamp [s]."""
+
+
+@dataclass
+class Batch:
+    """New samples.
+
+    Attributes:
+        columns: Of JointStates.
+        head: Of the head's pose, or None.
+        ranges: Topic to sampling times [ns], shape (n,), and distances [m], shape (n,).
+        modes: When a gait mode was said [ns], and which.
+        events: When something happened [ns], and its message.
+        newest_ns: The newest log time [ns]; 0 where there is no message.
+        messages: How many messages it was made of.
+    """
+
+    columns: Columns = field(default_factory=Columns)
+    head: HeadPath | None = None
+    ranges: dict[str, tuple[IntArray, FloatArray]] = field(
+        default_factory=dict[str, tuple[IntArray, FloatArray]]
+    )
+    modes: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])
+    events: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
+    newest_ns: int = 0
+    messages: int = 0
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Messages of one layout, a row each."""
+
+    layout: Layout
+    log_ns: IntArray
+    matrix: NDArray[np.uint8]
+
+    def values(self, path: str) -> NDArray[Any]:
+        """All values of one field, shape (n, count); (n, 0) where the layout hasn't it."""
+        leaf = self.layout.leaves.get(path)
+        if leaf is None:
+            return np.empty((len(self.matrix), 0))
+        stop = leaf.offset + leaf.count * np.dtype(leaf.dtype).itemsize
+        return np.ascontiguousarray(self.matrix[:, leaf.offset : stop]).view(leaf.dtype)
+
+    @property
+    def stamps(self) -> IntArray:
+        """header.stamp [ns], shape (n,)."""
+        seconds = self.values("header.stamp.sec")[:, 0].astype(np.int64)
+        return seconds * _NS + self.values("header.stamp.nanosec")[:, 0].astype(np.int64)
+
+
+@dataclass
+class _Topic:
+    """A channel and what is known of its messages."""
+
+    channel: Channel
+    schema: Schema
+    kind: MessageType
+    known: list[Layout] = field(default_factory=list[Layout])
+    decode: Callable[[bytes], Any] | None = None
+
+
+class LiveLog:
+    """What is known of a recording so far, and how to read its messages."""
+
+    def __init__(self) -> None:
+        """Know nothing yet."""
+        self.facts: Mapping[str, str] = {}
+        self.unread = 0
+        """Messages that could not be read, or came before their channel was known."""
+        self.notes: list[str] = []
+        self._schemas: dict[int, Schema] = {}
+        self._topics: dict[int, _Topic] = {}
+        self._files: dict[str, str] = {}
+        self._robot: Robot | None = None
+        self._offsets: dict[str, _Offsets] = {}
+        self._robot_is_read = True
+        self._shift_ns: int | None = None
+
+    @property
+    def robot(self) -> Robot | None:
+        """The robot, or None while none is described."""
+        if not self._robot_is_read:
+            self._robot_is_read = True
+            self._read_robot()
+        return self._robot
+
+    def unit(self, topic: str) -> str:
+        """Unit of a JointState topic; ``rad`` where its channel doesn't say."""
+        found = [one.channel for one in self._topics.values() if one.channel.topic == topic]
+        return found[0].metadata.get("unit", "rad") if found else "rad"
+
+    def define(self, record: Description | object) -> None:
+        """Take what explains messages; the same again changes nothing.
+
+        Args:
+            record: A schema, a channel, the facts of the session, or an attached file.
+
+        Raises:
+            DataError: If a schema can't be read.
+        """
+        match record:
+            case Schema():
+                self._schemas[record.id] = record
+            case Channel():
+                self._define_channel(record)
+            case Metadata():
+                self.facts = record.metadata
+            case Attachment():
+                text = record.data.decode("utf-8", "replace")
+                if self._files.get(record.name) != text:
+                    self._files[record.name] = text
+                    self._robot_is_read = False
+            case _:
+                return
+
+    def decode(self, messages: Iterable[LiveMessage]) -> Batch:
+        """Read messages.
+
+        Args:
+            messages: In the order of their sequence numbers.
+
+        Returns:
+            Their samples.
+        """
+        by_channel: dict[int, list[LiveMessage]] = {}
+        batch = Batch()
+        for message in messages:
+            by_channel.setdefault(message.channel_id, []).append(message)
+            batch.newest_ns = max(batch.newest_ns, message.log_time_ns)
+            batch.messages += 1
+        found: list[tuple[_Topic, list[LiveMessage]]] = []
+        for channel_id, own in by_channel.items():
+            if channel_id in self._topics:
+                found.append((self._topics[channel_id], own))
+            else:
+                self.unread += len(own)
+        found.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these tell the times
+        for topic, own in found:
+            self._read(topic, own, batch)
+        return batch
+
+    # -- definitions -----------------------------------------------------------------------
+
+    def _define_channel(self, channel: Channel) -> None:
+        schema = self._schemas.get(channel.schema_id)
+        known = self._topics.get(channel.id)
+        if schema is None or (known is not None and known.channel == channel):
+            return
+        kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
+        self._topics[channel.id] = _Topic(channel, schema, kind)
+
+    def _read_robot(self) -> None:
+        """Read the robot from the files that have come so far."""
+        if "robot.toml" not in self._files:
+            return
+        try:
+            text = self._files["robot.toml"]
+            self._robot = parse_robot(text, source="robot.toml", databases=self._files)
+        except RobotFileError as error:
+            self._robot = None
+            self.notes[:] = [f"the robot description can't be used: {error}"]
+        else:
+            self.notes.clear()
+
+    # -- messages --------------------------------------------------------------------------
+
+    def _read(self, topic: _Topic, messages: Sequence[LiveMessage], batch: Batch) -> None:
+        name, type_name = topic.channel.topic, topic.schema.name
+        if type_name == JOINT_STATE:
+            self._read_joints(topic, messages, batch)
+        elif type_name == _ODOMETRY and name == "/odom":
+            groups = self._groups(topic, messages)
+            if groups:
+                poses = [np.concatenate([g.values(p) for p in POSE], axis=1) for g in groups]
+                t_ns = np.concatenate([self._stamps(group) for group in groups])
+                batch.head = tracked_head(t_ns, np.concatenate(poses).astype(np.float64))
+        elif type_name == _RANGE:
+            groups = self._groups(topic, messages)
+            if groups:
+                t_ns = np.concatenate([self._stamps(group) for group in groups])
+                values = np.concatenate([group.values("range")[:, 0] for group in groups])
+                batch.ranges[name] = ordered(t_ns, values.astype(np.float64))
+        elif type_name == _STRING and name == MODE:
+            batch.modes += [(t, str(m.data)) for t, m in self._general(topic, messages)]
+        elif type_name == _LOG:
+            batch.events += self._general(topic, messages)
+
+    def _read_joints(self, topic: _Topic, messages: Sequence[LiveMessage], batch: Batch) -> None:
+        name = topic.channel.topic
+        fields = ("position", "velocity", "effort") if name == "/joint_states" else ("position",)
+        groups = self._groups(topic, messages)
+        if name in OFFSETS:
+            self._keep_offsets(name, [self._joint_rows(group, "position") for group in groups])
+            return
+        own: dict[tuple[str, int], IntArray] = {}  # the fields of a message share their times
+        for one in fields:
+            rows = [self._joint_rows(group, one) for group in groups]
+            tracks = self._tracks(name, one, [row for row in rows if row.values.size], own)
+            if tracks:
+                batch.columns[name, one] = tracks
+
+    def _tracks(
+        self,
+        topic: str,
+        one: str,
+        rows: Sequence[JointRows],
+        own: dict[tuple[str, int], IntArray],
+    ) -> tuple[Track, ...]:
+        names, times, values = merge_rows(rows, topic, one, _say_nothing)
+        offsets = self._offsets.get(OFFSET_TOPICS.get(topic, ""), {})
+        found: dict[str, Track] = {}
+        for name, t_ns, column in zip(names, times, values, strict=True):
+            if name in offsets:
+                key = name, t_ns.size
+                if key not in own:
+                    own[key] = _own_times(t_ns, *offsets[name])
+                t_ns = own[key]  # noqa: PLW2901
+            track = without_filler(Track(name, *ordered(t_ns, column)))
+            if np.isfinite(track.values).any():
+                found[name] = track
+        chain = self.robot.joint_names if self.robot is not None else ()
+        inside = [found[name] for name in chain if name in found]
+        return (*inside, *(track for name, track in found.items() if name not in chain))
+
+    def _keep_offsets(self, topic: str, rows: Sequence[JointRows]) -> None:
+        """Keep the last sample times relative to the stamp; none where all are zero."""
+        kept = self._offsets.setdefault(topic, {})
+        names, times, values = merge_rows(rows, topic, "position", _say_nothing)
+        if not kept and not any(column.any() for column in values):
+            return  # sampled together
+        for name, t_ns, column in zip(names, times, values, strict=True):
+            old_t, old = kept.get(name, (t_ns[:0], column[:0]))
+            joined = ordered(np.concatenate([old_t, t_ns]), np.concatenate([old, column]))
+            kept[name] = joined[0][-_OFFSETS_KEPT:], joined[1][-_OFFSETS_KEPT:]
+
+    def _joint_rows(self, group: _Group, one: str) -> JointRows:
+        strings = group.layout.strings
+        names = tuple(text for path, text in strings.items() if path.startswith("name["))
+        values = group.values(one).astype(np.float64)
+        return JointRows(names, self._stamps(group), group.log_ns, values)
+
+    def _stamps(self, group: _Group) -> IntArray:
+        return self._shifted(group.stamps, group.log_ns)
+
+    def _shifted(self, stamp_ns: IntArray, log_ns: IntArray) -> IntArray:
+        """Stamps on the log's clock; see :mod:`capture.log.stamp_clock`."""
+        if not stamp_ns.any():
+            return log_ns
+        if self._shift_ns is None:
+            apart = int(log_ns[0] - stamp_ns[0])
+            self._shift_ns = round(apart / _NS) * _NS if abs(apart) > _FAR_NS else 0
+        return stamp_ns + self._shift_ns
+
+    def _groups(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[_Group]:
+        """The messages by layout."""
+        found: list[_Group] = []
+        by_length: dict[int, list[LiveMessage]] = {}
+        for message in messages:
+            by_length.setdefault(len(message.payload), []).append(message)
+        for length, rest in by_length.items():
+            data = np.frombuffer(b"".join(one.payload for one in rest), dtype=np.uint8)
+            matrix = data.reshape(len(rest), length)
+            log_ns = np.array([one.log_time_ns for one in rest], dtype=np.int64)
+            known = [layout for layout in topic.known if layout.length == length]
+            while len(matrix):
+                try:
+                    layout = known.pop(0) if known else _learn(topic, matrix[0].tobytes())
+                except DataError:
+                    self.unread += 1
+                    matrix, log_ns = matrix[1:], log_ns[1:]
+                    continue
+                example = np.frombuffer(layout.example, dtype=np.uint8)[layout.static]
+                fits = (matrix[:, layout.static] == example).all(axis=1)
+                if fits.any():
+                    found.append(_Group(layout, log_ns[fits], matrix[fits]))
+                matrix, log_ns = matrix[~fits], log_ns[~fits]
+        return found
+
+    def _general(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[tuple[int, Any]]:
+        """Log times and messages of any shape."""
+        from mcap_ros2.decoder import DecoderFactory, McapROS2DecodeError
+
+        found: list[tuple[int, Any]] = []
+        try:
+            if topic.decode is None:
+                topic.decode = cast("Any", DecoderFactory().decoder_for("cdr", topic.schema))
+            decode = cast("Callable[[bytes], Any]", topic.decode)
+            found.extend((one.log_time_ns, decode(one.payload)) for one in messages)
+        except (McapROS2DecodeError, McapError, struct.error, ValueError, IndexError):
+            self.unread += len(messages) - len(found)
+        return found
+
+
+def _learn(topic: _Topic, example: bytes) -> Layout:
+    layout = layout_of(topic.kind, example)
+    topic.known.append(layout)
+    del topic.known[:-_LAYOUTS_KEPT]
+    return layout
+
+
+def _own_times(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
+    """Stamps plus the offset that was logged with each, or last before it [ns], shape (n,)."""
+    last = np.maximum(np.searchsorted(stamp_ns, t_ns, side="right") - 1, 0)
+    offset = np.nan_to_num(offset_s[last], nan=0.0, posinf=0.0, neginf=0.0)
+    return t_ns + np.rint(offset * _NS).astype(np.int64)
+
+
+def _say_nothing(_sentence: str) -> None:
+    """What is odd in a log is told by the recorder and by ``log check``, not by the picture."""

@@ -1,0 +1,173 @@
+"""A plot that grows: the same entities, names and colours as in a replay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from ..plots.joints import (
+    DEGREES,
+    SCALARS,
+    Color,
+    Series,
+    log_look,
+    log_rows,
+    part_entity,
+)
+from ..samples.sampling import GAP_STEPS, mark_gaps, typical_step_ns
+from ..samples.timeline import Clock
+from ..samples.tracks import Table, Track, tables
+
+
+class LiveStream(rr.RecordingStream):
+    """A recording stream that says a static thing once, and again only when it has changed."""
+
+    def __init__(self, application_id: str, recording_id: str) -> None:
+        """Make a stream that isn't connected yet.
+
+        Args:
+            application_id: The application.
+            recording_id: The recording.
+        """
+        super().__init__(application_id, recording_id=recording_id, send_properties=False)
+        self._said: dict[tuple[str, str], Any] = {}  # Arrow arrays
+
+    def log(
+        self,
+        entity_path: str | list[object],
+        entity: Any,
+        *extra: Any,
+        static: bool = False,
+        strict: bool | None = None,
+    ) -> None:
+        """Log, unless it is static and known already.
+
+        Args:
+            entity_path: Where to.
+            entity: What.
+            extra: What else.
+            static: Whether it has no time.
+            strict: Whether to raise on data that can't be logged.
+        """
+        if static and not self._is_news(str(entity_path), [entity, *extra]):
+            return
+        super().log(entity_path, entity, *extra, static=static, strict=strict)
+
+    def _is_news(self, entity_path: str, archetypes: Sequence[Any]) -> bool:
+        news = False
+        for archetype in archetypes:
+            for batch in archetype.as_component_batches():
+                key = (entity_path, str(batch.component_descriptor()))
+                value = batch.as_arrow_array()
+                if key not in self._said or not self._said[key].equals(value):
+                    self._said[key] = value
+                    news = True
+        return news
+
+
+class LivePlot:
+    """One quantity of all joints.
+
+    Joints that were sampled together share an entity, as in a replay. Here the whole isn't known
+    at first, so the parts only get smaller: joints that part once stay apart.
+    """
+
+    def __init__(
+        self,
+        entity: str,
+        *,
+        degrees: bool = False,
+        component: str | None = None,
+        titles: Mapping[str, str] | None = None,
+        width: float | None = None,
+    ) -> None:
+        """Start without joints.
+
+        Args:
+            entity: E.g. ``/joints/measured``.
+            degrees: Whether the values are angles [rad], to be plotted in degrees.
+            component: What is written; None for ``Angle:degrees`` or ``Scalars:scalars``.
+            titles: Lines' names by joint name; None for the joints' own.
+            width: Of the lines [points]; None for the viewer's own.
+        """
+        self._entity, self._degrees = entity, degrees
+        self._component = component or (DEGREES if degrees else SCALARS)
+        self._titles, self._width = titles, width
+        self._parts: list[tuple[str, ...]] = []
+        self._last: dict[str, tuple[int, int]] = {}
+        self._looks: dict[str, tuple[tuple[str, ...], list[Color | None] | None]] = {}
+
+    @property
+    def series(self) -> tuple[Series, ...]:
+        """What has been written."""
+        return tuple(Series(self._path(part), part, self._component) for part in self._parts)
+
+    def write(
+        self,
+        rec: rr.RecordingStream,
+        clock: Clock,
+        tracks: Sequence[Track],
+        palette: Mapping[str, Color] | None = None,
+    ) -> None:
+        """Write new samples.
+
+        Args:
+            rec: The recording.
+            clock: Its timelines.
+            tracks: The new samples.
+            palette: Colour by joint name; None for the grey of everything commanded.
+        """
+        by_name = {track.name: track for track in tracks if track.t_ns.size}
+        known = {name for part in self._parts for name in part}
+        new = [track for name, track in by_name.items() if name not in known]
+        self._parts += [table.names for table in tables(new)]
+        for part in tuple(self._parts):
+            own = [by_name[name] for name in part if name in by_name]
+            if own and (len(own) < len(part) or len(tables(own)) > 1):
+                at = self._parts.index(part)
+                self._parts[at : at + 1] = [(name,) for name in part]
+        for part in self._parts:
+            if part[0] in by_name:
+                (table,) = tables([by_name[name] for name in part])
+                path = self._path(part)
+                table = self._with_gap(path, table)
+                self._say_look(rec, path, part, palette)
+                t_ns, values = mark_gaps(table.t_ns, table.values)
+                log_rows(
+                    rec,
+                    clock,
+                    path,
+                    t_ns,
+                    values,
+                    degrees=self._degrees,
+                    component=self._component,
+                )
+
+    def _say_look(
+        self,
+        rec: rr.RecordingStream,
+        path: str,
+        part: tuple[str, ...],
+        palette: Mapping[str, Color] | None,
+    ) -> None:
+        """Say how the lines look, unless it has been said."""
+        look = part, None if palette is None else [palette.get(name) for name in part]
+        if self._looks.get(path) != look:
+            self._looks[path] = look
+            log_look(rec, path, part, palette, titles=self._titles, width=self._width)
+
+    def _path(self, part: tuple[str, ...]) -> str:
+        return self._entity if len(self._parts) == 1 else part_entity(self._entity, part[0])
+
+    def _with_gap(self, path: str, table: Table) -> Table:
+        """A row of NaN before the samples where there was a gap, which ends the line."""
+        last_ns, step_ns = self._last.get(path, (0, 0))
+        first_ns = int(table.t_ns[0])
+        self._last[path] = (int(table.t_ns[-1]), typical_step_ns(table.t_ns) or step_ns)
+        if not step_ns or first_ns - last_ns <= GAP_STEPS * step_ns:
+            return table
+        t_ns = np.insert(table.t_ns, 0, last_ns + step_ns)
+        return Table(table.names, t_ns, np.insert(table.values, 0, np.nan, axis=0))

@@ -1,0 +1,332 @@
+"""The relay: reads a recorder's live feed and draws it in Rerun, in a process of its own.
+
+A viewer that is frozen makes Rerun wait for ever once some hundred megabytes lie before it. That
+happens here, in a thread that does nothing else, and never in the recorder: the inbox goes on
+reading and drops what is not drawn. Where the whole relay stands still the socket fills, and the
+recorder drops what it doesn't take.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from capture.daemon.live_wire import Kind, LiveMessage, read_records
+from capture.errors import DataError, LogWriteError
+from capture.interruption import StopRequest, interruptible
+from capture.part_file import part_file
+
+from ..rrd import APPLICATION, recording_id, require_whole
+from .decode import LiveLog
+from .inbox import Datagram, Inbox
+from .plot import LiveStream
+from .scene import LiveScene
+from .target import LiveViewer
+
+BATCH_S = 0.03
+"""How often what has come is drawn [s]."""
+SILENCE_S = 10.0
+"""A feed that says nothing for so long has ended; a living one repeats its definitions [s]."""
+
+_LAGS_KEPT = 100_000
+_FLUSH_S = 1.0
+_GRACE_S = 3.0
+_LOOK_S = 0.05
+
+_HELD: list[LiveStream] = []
+"""Streams whose viewer takes nothing: to let go of one would wait for it."""
+
+Connect = Callable[[rr.RecordingStream], None]
+"""Gives a recording stream its sink."""
+
+
+@dataclass
+class RelayReport:
+    """What became of a live feed.
+
+    Attributes:
+        sessions: Session ids, in the order they came.
+        shown: Messages drawn.
+        dropped: Messages that the recorder or the relay dropped because drawing took too long.
+        unread: Messages and datagrams that could not be read.
+        lag_s: From the recorder's taking a message to Rerun's taking what was drawn of it [s]:
+            median, 99th percentile and largest of the last messages; None where there was none.
+        complaint: Why the viewer did not take all of it; empty where it did.
+    """
+
+    sessions: tuple[str, ...]
+    shown: int
+    dropped: int
+    unread: int
+    lag_s: tuple[float, float, float] | None
+    complaint: str = ""
+
+
+class Relay:
+    """Draws what lies in an inbox; one thread calls it."""
+
+    def __init__(self, inbox: Inbox, connect: Connect, *, one_session: bool = False) -> None:
+        """Draw nothing yet.
+
+        Args:
+            inbox: Where the feed comes in.
+            connect: Gives each session's recording stream its sink.
+            one_session: Whether to draw the first session only.
+        """
+        self._inbox, self._connect, self._one_session = inbox, connect, one_session
+        self.ended = False
+        """Whether the last session has ended."""
+        self._sessions: list[str] = []
+        self._feed_id: int | None = None
+        self._log = LiveLog()
+        self._scene: LiveScene | None = None
+        self._rec: LiveStream | None = None
+        self._heard_at = time.monotonic()
+        self._complaint = ""
+        self._shown = self._refused = 0
+        self._unread_before = self._dropped_before = self._dropped = 0
+        self._lags: deque[float] = deque(maxlen=_LAGS_KEPT)
+        self._states: list[LiveMessage] = []
+
+    @property
+    def report(self) -> RelayReport:
+        """What became of the feed so far."""
+        lags = tuple(self._lags)
+        lag_s = None
+        if lags:
+            p50, p99 = np.percentile(lags, [50.0, 99.0]).tolist()
+            lag_s = (float(p50), float(p99), max(lags))
+        return RelayReport(
+            sessions=tuple(self._sessions),
+            shown=self._shown,
+            dropped=self._not_shown + self._dropped_before,
+            unread=self._refused + self._inbox.refused + self._log.unread + self._unread_before,
+            lag_s=lag_s,
+            complaint=self._complaint,
+        )
+
+    @property
+    def _not_shown(self) -> int:
+        return self._dropped + self._inbox.dropped
+
+    def step(self) -> None:
+        """Draw what has come since the last step; waits for Rerun, if Rerun waits.
+
+        Raises:
+            LogWriteError: If the sink can't be made.
+        """
+        pending: list[LiveMessage] = []
+        for datagram in self._inbox.take():
+            self._heard_at = time.monotonic()
+            if datagram.head.feed_id != self._feed_id:
+                self._draw(pending)
+                pending = []
+                if not self._begin(datagram.head.feed_id):
+                    return
+            self._take(datagram, pending)
+            if datagram.head.kind is Kind.END:
+                self._draw(pending)
+                pending = []
+                self._end()
+        self._draw(pending)
+        if not self.ended and self._sessions and self._silent_s() > SILENCE_S:
+            self._end()
+
+    def close(self) -> None:
+        """Hand over what is left; waits for Rerun, but not for long."""
+        self._end()
+        if self._rec is None:
+            return
+        try:
+            self._rec.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError as error:
+            self._complaint = f"the viewer did not take the last of it: {error}"
+            _HELD.append(self._rec)
+            return
+        self._rec.disconnect()
+        self._rec = None
+
+    def _silent_s(self) -> float:
+        return time.monotonic() - self._heard_at
+
+    def _begin(self, feed_id: int) -> bool:
+        """Turn to a new feed; False where the first was the last."""
+        if self._one_session and self._scene is not None:
+            self._end()
+            return False
+        self._unread_before += self._log.unread
+        self._dropped_before += self._dropped
+        self._dropped = 0
+        self._feed_id, self._log, self._scene, self.ended = feed_id, LiveLog(), None, False
+        self._states.clear()
+        return True
+
+    def _take(self, datagram: Datagram, pending: list[LiveMessage]) -> None:
+        """Read a datagram: definitions at once, messages to be drawn."""
+        self._dropped = max(self._dropped, datagram.head.dropped)
+        if datagram.head.kind is Kind.MESSAGES:
+            self.ended = False  # it was only silent
+        try:
+            for record in read_records(datagram.data):
+                if not isinstance(record, LiveMessage):
+                    self._log.define(record)
+                elif datagram.head.kind is Kind.DEFINITIONS:
+                    self._states.append(record)
+                else:
+                    pending.append(record)
+        except DataError:
+            self._refused += 1
+
+    def _draw(self, messages: list[LiveMessage]) -> None:
+        if not messages:
+            return
+        batch = self._log.decode(messages)
+        if self._scene is None:
+            first_ns = min(message.log_time_ns for message in messages)
+            self._scene = self._open(first_ns)
+        if self._states:  # said before, and told again to whoever comes
+            self._scene.draw(self._log.decode(self._states), self._not_shown)
+            self._states.clear()
+        self._scene.draw(batch, self._not_shown)
+        self._shown += batch.messages
+        now_ns = time.monotonic_ns()
+        self._lags.extend((now_ns - message.offered_ns) * 1e-9 for message in messages)
+
+    def _open(self, first_ns: int) -> LiveScene:
+        """A recording stream for the session."""
+        rr.set_strict_mode(True)
+        facts = self._log.facts
+        session_id = facts.get("session_id") or f"feed-{self._feed_id or 0:016x}"
+        epoch = facts.get("epoch_ns", "")
+        epoch_ns = int(epoch) if epoch.isdecimal() else first_ns
+        if self._rec is not None:
+            self._rec.disconnect()
+        rec = LiveStream(APPLICATION, live_recording_id(session_id))
+        rec.set_log_time_enabled(False)
+        rec.set_log_tick_enabled(False)
+        self._connect(rec)
+        rec.send_recording_name(f"{session_id} live")
+        rec.send_recording_start_time_nanos(epoch_ns)
+        self._rec = rec
+        self._sessions.append(session_id)
+        return LiveScene(rec, self._log, session_id, epoch_ns)
+
+    def _end(self) -> None:
+        if self._scene is not None and not self.ended:
+            self._scene.finish(self._not_shown)
+        self.ended = True
+
+
+def live_recording_id(session_id: str) -> str:
+    """The live recording's id: not that of the replay, which has more in it.
+
+    Args:
+        session_id: The session's id.
+
+    Returns:
+        A name-based UUID; a relay that is started anew goes on in the same recording.
+    """
+    return str(uuid.UUID(recording_id(f"{session_id}/live")))
+
+
+def relay_to_viewer(path: Path, viewer: LiveViewer | None, address: str) -> RelayReport:
+    """Draw sessions in a viewer until it is closed or we are told to stop.
+
+    Args:
+        path: The socket to make.
+        viewer: The viewer, if it is a process of ours.
+        address: Where it takes data, e.g. ``rerun+http://127.0.0.1:9876/proxy``.
+
+    Returns:
+        What became of the feed.
+
+    Raises:
+        UsageError: If the socket can't be made.
+        UndulogError: If a sink can't be made.
+    """
+    with interruptible() as request, Inbox(path) as inbox:
+        relay = Relay(inbox, lambda rec: rec.connect_grpc(address))
+        return _run(relay, request, viewer)
+
+
+def relay_to_file(path: Path, output: Path) -> RelayReport:
+    """Draw one session to a file, which appears when the session ends or we are told to stop.
+
+    Args:
+        path: The socket to make.
+        output: The .rrd file; one of that name is replaced.
+
+    Returns:
+        What became of the feed.
+
+    Raises:
+        UsageError: If the socket can't be made.
+        DataError: If no session came.
+        LogWriteError: If the file can't be written.
+    """
+    with ExitStack() as stack:
+        request = stack.enter_context(interruptible())
+        draft = stack.enter_context(part_file(output))
+        inbox = stack.enter_context(Inbox(path))
+
+        def save(rec: rr.RecordingStream) -> None:
+            try:
+                rec.save(draft)
+            except (RuntimeError, OSError) as error:
+                raise LogWriteError(output, f"can't be written: {error}") from error
+
+        report = _run(Relay(inbox, save, one_session=True), request, None, until_end=True)
+        if not report.sessions:
+            raise DataError(f"{path}: no recording was heard; nothing is written")
+        require_whole(draft, output)
+        return report
+
+
+class _Painter(threading.Thread):
+    """The thread that may have to wait for a viewer."""
+
+    def __init__(self, relay: Relay) -> None:
+        super().__init__(name="live painter", daemon=True)
+        self.relay = relay
+        self.stop = threading.Event()
+        self.error: Exception | None = None
+
+    def run(self) -> None:
+        try:
+            while not self.stop.wait(BATCH_S):
+                self.relay.step()
+            self.relay.step()
+            self.relay.close()
+        except Exception as error:  # noqa: BLE001  raised again by the main thread
+            self.error = error
+
+
+def _run(
+    relay: Relay, request: StopRequest, viewer: LiveViewer | None, *, until_end: bool = False
+) -> RelayReport:
+    """Draw until told to stop, or until the viewer or (if so wanted) the session has ended."""
+    painter = _Painter(relay)
+    painter.start()
+    while painter.is_alive() and not request.requested:
+        if (viewer is not None and viewer.ended) or (until_end and relay.ended):
+            break
+        time.sleep(_LOOK_S)
+    painter.stop.set()
+    painter.join(_GRACE_S)
+    if painter.is_alive() and viewer is not None:
+        viewer.close()  # it takes nothing: what waits for it is let go
+        painter.join(_GRACE_S)
+    if painter.error is not None:
+        raise painter.error
+    if painter.is_alive():
+        return replace(relay.report, complaint="the viewer takes no data")
+    return relay.report

@@ -1,0 +1,195 @@
+"""What only a whole session can tell: which lines there are, how far they swing, when they meet.
+
+It goes through the session once, stretch by stretch, before anything is drawn, and keeps a few
+thousand samples of each line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import Session
+from capture.arrays import FloatArray, IntArray
+from capture.errors import DataError, MissingChannelError
+from capture.robot import Robot
+
+from ..plots.joints import MEASURED
+from ..plots.power import MECHANICAL
+from ..scene.body import segment_power
+from ..scene.colors import power_limit
+from .quantities import quantities
+from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
+from .stretches import stretches
+from .tracks import OFFSETS, Track, in_turn, resampled, wanted_fields
+
+GAIT = "/gait"
+
+_KEPT = 4000
+"""Samples of each line that are kept, about."""
+_CONTEXT_NS = (500_000_000, 60_000_000_000)
+_REACH_STEPS = 1.2 * GAP_STEPS
+
+_Number = TypeVar("_Number", np.int64, np.float64)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a session holds.
+
+    Attributes:
+        wanted: JointState topic to the fields that come.
+        samples: Entity to its lines, some of their samples each, in chain order.
+        parts: Entity to the names of its lines, those in one part that are drawn at common times.
+        drawing_ns: Sampling times of the first measured joint, thinned [ns], shape (n,).
+        power_limit_w: Power at which a segment's colour is full [W]; None where none is known.
+        context_ns: How far about a stretch its drawing has to look [ns].
+    """
+
+    wanted: Mapping[str, Sequence[str]]
+    samples: Mapping[str, tuple[Track, ...]]
+    parts: Mapping[str, tuple[tuple[str, ...], ...]]
+    drawing_ns: IntArray
+    power_limit_w: float | None
+    context_ns: int
+
+
+@dataclass
+class _Line:
+    """Kept samples of one line."""
+
+    t_ns: list[IntArray] = field(default_factory=list[IntArray])
+    values: list[FloatArray] = field(default_factory=list[FloatArray])
+
+
+def survey(session: Session, rate_hz: float) -> Survey:
+    """Go through a session.
+
+    Args:
+        session: The session.
+        rate_hz: How many drawing times a second are kept, at most.
+
+    Returns:
+        What it holds.
+    """
+    session.forget()  # an hour's index, as pages of the file
+    wanted = _carried(session)
+    every = {topic: 1 + session.channels[topic].count // _KEPT for topic in wanted}
+    thin = max(every.values(), default=1)
+    takes_turns = any(topic in session.channels for topic in OFFSETS)
+    chain = {} if session.robot is None else _ranks(session.robot.joint_names)
+    lines: dict[str, dict[str, _Line]] = {}
+    parts: dict[str, list[tuple[str, ...]]] = {}
+    times: list[IntArray] = []
+    powers: list[FloatArray] = []
+    step_ns = 0
+    for stretch in stretches(session, wanted, 0):
+        columns = stretch.columns
+        for tracks in columns.values():
+            step_ns = max([step_ns, *(typical_step_ns(track.t_ns) for track in tracks)])
+        for entity, tracks in quantities(columns).items():
+            own = lines.setdefault(entity, {})
+            for track in tracks:
+                line = own.setdefault(track.name, _Line())
+                line.t_ns.append(track.t_ns[::thin].copy())  # not a view, which keeps all
+                line.values.append(track.values[::thin].copy())
+            parts[entity] = _refined(parts.get(entity, []), _parts(tracks, turns=takes_turns))
+            if entity == MEASURED:
+                times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
+            if entity == MECHANICAL and session.robot is not None:
+                powers.append(_segments(session.robot, tracks, thin))
+    return Survey(
+        wanted={topic: fields for topic, fields in wanted.items() if fields},
+        samples={
+            entity: tuple(
+                Track(name, _joined(line.t_ns), _joined(line.values))
+                for name, line in sorted(own.items(), key=lambda item: chain.get(item[0], 1 << 30))
+            )
+            for entity, own in lines.items()
+        },
+        parts={entity: _in_order(found, chain) for entity, found in parts.items()},
+        drawing_ns=_joined(times) if times else np.zeros(0, dtype=np.int64),
+        power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
+        context_ns=int(np.clip(round(_REACH_STEPS * step_ns), *_CONTEXT_NS)),
+    )
+
+
+def _carried(session: Session) -> dict[str, list[str]]:
+    """The fields that come, but for the gait's, which is read as a whole.
+
+    The first stretch tells; what is not in it is looked for in the whole session, once.
+    """
+    wanted = {topic: one for topic, one in wanted_fields(session).items() if topic != GAIT}
+    stop_ns = session.start_ns + 1_000_000_000
+    try:
+        session.joint_columns(wanted, stop_ns=stop_ns)
+    except (MissingChannelError, DataError):
+        return {
+            topic: [one for one in fields if _comes(session, topic, one)]
+            for topic, fields in wanted.items()
+        }
+    return wanted
+
+
+def _comes(session: Session, topic: str, one: str) -> bool:
+    try:
+        session.joints(topic, one)
+    except (MissingChannelError, DataError):
+        return False
+    return True
+
+
+def _segments(robot: Robot, tracks: Sequence[Track], thin: int) -> FloatArray:
+    """Power of the links at some times [W], shape (n, links)."""
+    at_ns = tracks[0].t_ns[::thin]
+    return segment_power(resampled(tracks, robot.joint_names, at_ns, interpolate))
+
+
+def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:
+    """Lines that were sampled together, or by one message in turn."""
+    found: list[tuple[IntArray, list[str]]] = []
+    for track in tracks:
+        for t_ns, names in found:
+            if np.array_equal(t_ns, track.t_ns) or (turns and in_turn(t_ns, track.t_ns)):
+                names.append(track.name)
+                break
+        else:
+            found.append((track.t_ns, [track.name]))
+    return [tuple(names) for _, names in found]
+
+
+def _refined(
+    before: Sequence[tuple[str, ...]], now: Sequence[tuple[str, ...]]
+) -> list[tuple[str, ...]]:
+    """Parts that are together in both; who is in one of them only follows that one."""
+    label = {name: i for i, part in enumerate(now) for name in part}
+    found: list[tuple[str, ...]] = []
+    for part in before:
+        split: dict[int, list[str]] = {}
+        first = next((label[name] for name in part if name in label), -1)
+        for name in part:
+            split.setdefault(label.get(name, first), []).append(name)
+        found += [tuple(names) for names in split.values()]
+    known = {name for part in before for name in part}
+    found += [new for part in now if (new := tuple(n for n in part if n not in known))]
+    return found
+
+
+def _in_order(
+    parts: Sequence[tuple[str, ...]], chain: Mapping[str, int]
+) -> tuple[tuple[str, ...], ...]:
+    """Parts in the order of their first lines, lines in chain order."""
+    inside = [tuple(sorted(part, key=lambda name: chain.get(name, 1 << 30))) for part in parts]
+    return tuple(sorted(inside, key=lambda part: chain.get(part[0], 1 << 30)))
+
+
+def _ranks(names: Sequence[str]) -> dict[str, int]:
+    return {name: i for i, name in enumerate(names)}
+
+
+def _joined(pieces: Sequence[NDArray[_Number]]) -> NDArray[_Number]:
+    return np.concatenate(pieces)

@@ -1,0 +1,204 @@
+"""Joint samples as they are drawn: each joint's own times, joints sampled together in one table."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture import Session
+from capture.arrays import FloatArray, IntArray
+from capture.errors import DataError, MissingChannelError
+from capture.log.signals import JointSignals
+
+from .sampling import interpolate, ordered
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+OFFSETS = ("/joint_sample_offset", "/joint_command_offset")
+"""JointState topics that say when, not what."""
+
+Columns = dict[tuple[str, str], tuple["Track", ...]]
+"""(topic, field of the JointState) to tracks."""
+
+Resampler = Callable[[IntArray, FloatArray, IntArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One quantity of one joint.
+
+    Attributes:
+        name: The joint's name.
+        t_ns: Its own sampling times [ns], ascending, shape (n,).
+        values: In SI, shape (n,); NaN where the sample is missing.
+    """
+
+    name: str
+    t_ns: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class Table:
+    """Joints that were sampled at the same times.
+
+    Attributes:
+        names: Joint names, shape (k,).
+        t_ns: Their sampling times [ns], shape (n,).
+        values: In SI, shape (n, k).
+    """
+
+    names: tuple[str, ...]
+    t_ns: IntArray
+    values: FloatArray
+
+
+def wanted_fields(session: Session) -> dict[str, list[str]]:
+    """What a picture needs of a session's JointState topics.
+
+    Args:
+        session: The session.
+
+    Returns:
+        Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
+    """
+    return {
+        topic: ["position", *(["velocity", "effort"] if topic == "/joint_states" else [])]
+        for topic, channel in session.channels.items()
+        if channel.type_name == JOINT_STATE and channel.count and topic not in OFFSETS
+    }
+
+
+def read_columns(
+    session: Session,
+    wanted: Mapping[str, Sequence[str]] | None = None,
+    *,
+    start_ns: int | None = None,
+    stop_ns: int | None = None,
+) -> Columns:
+    """JointState topics of a session.
+
+    Args:
+        session: The session.
+        wanted: Topic to fields; None for all of :func:`wanted_fields`.
+        start_ns: First sampling time wanted [Unix ns]; None for the session's start.
+        stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
+
+    Returns:
+        (topic, field) to a track for each joint that has at least one sample, in the session's
+        order; without what never comes.
+    """
+    fields = wanted_fields(session) if wanted is None else wanted
+    window = {"start_ns": start_ns, "stop_ns": stop_ns}
+    try:
+        columns = session.joint_columns(fields, **window)
+    except (MissingChannelError, DataError):  # a field that never comes: take the others singly
+        columns: dict[tuple[str, str], JointSignals] = {}
+        for topic, field in [(one, field) for one in fields for field in fields[one]]:
+            with contextlib.suppress(MissingChannelError, DataError):
+                columns[topic, field] = session.joints(topic, field, **window)
+    found = {key: _tracks(signals) for key, signals in columns.items()}
+    return {key: tracks for key, tracks in found.items() if tracks}
+
+
+def _tracks(signals: JointSignals) -> tuple[Track, ...]:
+    tracks = [
+        without_filler(Track(name, *ordered(t_ns, values)))
+        for name, t_ns, values in zip(signals.names, signals.t_ns, signals.values, strict=True)
+    ]
+    return tuple(track for track in tracks if np.isfinite(track.values).any())
+
+
+def without_filler(track: Track) -> Track:
+    """Leave out the NaN that only fill up messages about something else.
+
+    A robot that reports one quantity, or one servo, a message fills the other places with NaN.
+    Where half of a joint's samples or more are NaN they say nothing; fewer are a gap.
+
+    Args:
+        track: The track as logged.
+
+    Returns:
+        The track without its NaN where they are half or more, else the track itself.
+    """
+    known = np.isfinite(track.values)
+    if 2 * np.count_nonzero(known) > known.size:
+        return track
+    return Track(track.name, track.t_ns[known], track.values[known])
+
+
+def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
+    """Put joints that were sampled at the same times into one table each.
+
+    Args:
+        tracks: The tracks, in chain order.
+
+    Returns:
+        The tables, in the order of their first joints; one table where all joints share their
+        times.
+    """
+    together: dict[bytes, list[Track]] = {}
+    for track in tracks:
+        together.setdefault(track.t_ns.tobytes(), []).append(track)
+    return tuple(
+        Table(
+            tuple(track.name for track in group),
+            group[0].t_ns,
+            np.stack([track.values for track in group], axis=1),
+        )
+        for group in together.values()
+    )
+
+
+def in_turn(first: IntArray, other: IntArray) -> bool:
+    """Whether two joints were sampled in turn: one of the other between any two of the first.
+
+    Args:
+        first: Sampling times of one joint [ns], ascending, shape (n,).
+        other: Those of the other, shape (m,).
+
+    Returns:
+        Whether they take turns throughout.
+    """
+    place = np.searchsorted(first, other, side="right")
+    inner = place[(place > 0) & (place < first.size)]
+    return inner.size >= max(first.size - 2, 1) and bool(np.all(np.diff(inner) == 1))
+
+
+def brought_together(tracks: Sequence[Track]) -> Table:
+    """Joints at the times of the first of them.
+
+    Args:
+        tracks: Joints that were sampled together or in turn, at least one.
+
+    Returns:
+        One table; the values of the others lie on the straight lines between their samples, which
+        is what a plot draws of them.
+    """
+    first = tracks[0]
+    values = [interpolate(track.t_ns, track.values, first.t_ns) for track in tracks]
+    return Table(tuple(track.name for track in tracks), first.t_ns, np.stack(values, axis=1))
+
+
+def resampled(
+    tracks: Sequence[Track], names: Sequence[str], at_ns: IntArray, method: Resampler
+) -> FloatArray:
+    """All joints at common times.
+
+    Args:
+        tracks: The tracks, in any order.
+        names: Joint names, in the order of the result's columns.
+        at_ns: The times [ns], shape (n,).
+        method: :func:`replay.samples.sampling.interpolate` or :func:`replay.samples.sampling.hold`.
+
+    Returns:
+        Shape (n, number of names); NaN columns for joints without a track.
+    """
+    found = np.full((at_ns.size, len(names)), np.nan)
+    column = {name: i for i, name in enumerate(names)}
+    for table in tables([track for track in tracks if track.name in column]):
+        found[:, [column[name] for name in table.names]] = method(table.t_ns, table.values, at_ns)
+    return found
