@@ -72,6 +72,7 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/analyse_hour.py
 	$(BIN)/python bench/twin_step.py
 	$(BIN)/python bench/replay_convert.py --minutes 5
+	$(BIN)/python bench/replay_merge.py
 	$(BIN)/python bench/first_picture.py 5
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
@@ -79,6 +80,7 @@ docs: $(READY)  ## the manual, as HTML under docs/_build/html
 
 pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images
+	$(BIN)/python docs/side_by_side.py docs/images
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
