@@ -74,7 +74,10 @@ def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(small, sessi
     ):
         _, err, written = ended(on_stage, controller, path)
     assert err.startswith("error: joint03: tracking error 0.")
-    assert "rad, more than 0.3 rad for 0.5 s; the joints were brought straight within " in err
+    # It lasts to the first tick that finds 0.5 s over, a little later on a busy computer.
+    assert re.search(
+        r"rad, more than 0\.3 rad for 0\.5\d? s; the joints were brought straight", err
+    )
     check_told(written, "joint03: tracking error 0.")
     stage["check_ramp_down"](written, "fault: ")
 

