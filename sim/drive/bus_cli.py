@@ -21,7 +21,7 @@ from .bus_report import BusReport, report_facts, report_lines
 from .console_watch import ConsoleWatch
 from .driven import Driven
 from .loop import BusTick
-from .over_bus import BusPlan, bus_plan, drive_bus
+from .over_bus import BusPlan, bus_plan, check_drivable, drive_bus
 
 
 @dataclass(frozen=True)
@@ -178,6 +178,7 @@ def drive_on_bus(
     if not arm:
         if recorder is not None:
             raise UsageError("--recorder is for --arm: a dry run sends nothing")
+        check_drivable(driven, robot or driven.robot)
         return run_dry(
             driven,
             on,

@@ -13,7 +13,7 @@ from capture.daemon.clock import SessionClock
 from capture.errors import LogWriteError, UsageError
 from capture.interruption import StopRequest
 from capture.log.frames import FrameArray
-from capture.robot import Direction, Quantity, Robot
+from capture.robot import Bus, Direction, Quantity, Robot
 from capture.sources.address import parse_address
 from capture.sources.contract import SourceAddress
 from capture.sources.events import Tally
@@ -96,10 +96,7 @@ def bus_plan(
     """
     address = bus_address(on)
     robot = robot or driven.robot
-    if robot.bus is None:
-        raise UsageError(f"{robot.name} has no bus map: {driven.name} can't be driven on one")
-    _check_map(robot)
-    driven.check_fits(robot)
+    check_drivable(driven, robot)
     limits = gate_limits(robot)
     length = driven.duration_s if duration_s is None else duration_s
     if not 1 / CONTROL_RATE_HZ <= length <= LONGEST_S:
@@ -109,18 +106,35 @@ def bus_plan(
     return BusPlan(driven, robot, limits, address, length, output, recorder, force)
 
 
-def _check_map(robot: Robot) -> None:
+def check_drivable(driven: Driven, robot: Robot) -> None:
+    """See that it can be driven on a bus of the robot at all, armed or dry.
+
+    Args:
+        driven: What to drive.
+        robot: On which robot.
+
+    Raises:
+        UsageError: If the robot has no bus, a joint can't be commanded or tells no angle, or the
+            commands are of other joints.
+    """
+    if robot.bus is None:
+        raise UsageError(f"{robot.name} has no bus map: {driven.name} can't be driven on one")
+    _check_map(robot.name, robot.joint_names, robot.bus)
+    driven.check_fits(robot)
+
+
+def _check_map(robot_name: str, joint_names: tuple[str, ...], bus: Bus) -> None:
     """See that every joint can be commanded and tells its angle."""
-    signals = robot.bus.signals if robot.bus is not None else ()
     for direction, quantity in (
         (Direction.TX, Quantity.COMMAND),
         (Direction.RX, Quantity.POSITION),
     ):
-        there = {s.target for s in signals if (s.direction, s.quantity) == (direction, quantity)}
-        lacking = [name for name in robot.joint_names if name not in there]
+        asked = direction, quantity
+        there = {one.target for one in bus.signals if (one.direction, one.quantity) == asked}
+        lacking = [name for name in joint_names if name not in there]
         if lacking:
             raise UsageError(
-                f"the bus map of {robot.name} has no {quantity} ({direction}) of "
+                f"the bus map of {robot_name} has no {quantity} ({direction}) of "
                 f"{', '.join(lacking)}: it can't be driven on a bus"
             )
 

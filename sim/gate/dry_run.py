@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from capture.arrays import FloatArray
+from capture.errors import SimulationError
 from capture.interruption import StopRequest
+from capture.log.writer import SessionWriter
 from capture.robot import Robot, Safety
 from capture.robot.safety import missing_limits
 
@@ -28,7 +30,7 @@ from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from ..scenario_file import parse_scenario
 from ..session_log import SessionLog
 from ..stability import warnings
-from ..twin import Twin
+from ..twin import Sample, Twin
 from .dry_run_gait import GatedGait
 from .dry_run_tally import Demand, JointDemand
 from .faults import GateFault
@@ -193,32 +195,31 @@ def dry_run(
     with ExitStack() as opened:
         twin = opened.enter_context(Twin(scenario, gait))
         gait.attach(gate, twin)
-        writer = log = None
+        session = None
         if output is not None:
-            facts = {
-                **driven.facts,
-                "planned_duration_s": repr(planned.duration_s),
-                "dry_run": "yes",
-            }
-            driver = Driver(gait, facts, driven.attachments, driven.records)
+            facts = {"planned_duration_s": repr(planned.duration_s), "dry_run": "yes"}
+            explained = driven.attachments, driven.records
+            driver = Driver(gait, {**driven.facts, **facts}, *explained)
             writer = opened.enter_context(open_session(scenario, output, driver, force=force))
-            log = SessionLog(writer, twin)
-        for sample in twin.samples():
-            gait.book(sample)
-            if log is not None:
-                log.write(sample)
-                for remark in gait.fresh_remarks():
-                    log.say(*remark)
-            if on_time is not None:
-                on_time(gate.run_s)
-            if gait.done or (stop is not None and stop.requested):
-                break
+            session = _Session(writer, twin)
+        try:
+            for sample in twin.samples():
+                gait.book(sample)
+                if session is not None:
+                    session.write(sample, gait.fresh_remarks())
+                if on_time is not None:
+                    on_time(gate.run_s)
+                if gait.done or (stop is not None and stop.requested):
+                    break
+        except SimulationError as error:
+            if session is not None:
+                session.fail(str(error))
+            raise
         outcome, first = gate.outcome, gait.inner.first
         complete = outcome is not None and outcome.how is How.COMPLETE
-        if log is not None and writer is not None:
-            log.hear(twin.flush())
-            why = [] if complete else [outcome.why if outcome is not None else "it was stopped"]
-            writer.set_verdict("good" if complete else "bad", why)
+        if session is not None:
+            why = "it was stopped" if outcome is None else outcome.why
+            session.finish(None if complete else why)
     return DryRun(
         driven=driven.name,
         kind=driven.kind,
@@ -237,6 +238,27 @@ def dry_run(
         remarks=tuple(gait.remarks),
         path=output,
     )
+
+
+class _Session:
+    """The session of the twin."""
+
+    def __init__(self, writer: SessionWriter, twin: Twin) -> None:
+        self._writer, self._twin = writer, twin
+        self._log = SessionLog(writer, twin)
+
+    def write(self, sample: Sample, remarks: Iterable[Remark]) -> None:
+        self._log.write(sample)
+        for remark in remarks:
+            self._log.say(*remark)
+
+    def finish(self, why_bad: str | None) -> None:
+        self._log.hear(self._twin.flush())
+        self._writer.set_verdict("good" if why_bad is None else "bad", [why_bad] if why_bad else [])
+
+    def fail(self, why: str) -> None:
+        self.finish(why)
+        self._log.say("error", why)
 
 
 def nominal_world(robot: Robot) -> Scenario:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session, SessionWriter
+from capture import Session, SessionWriter, load_robot
+from capture.errors import SimulationError
 from capture.robot import Safety
 from capture.robot.description import parse_robot
 from sim.drive.driven import find_driven
@@ -236,10 +237,10 @@ def test_on_the_command_line_nothing_is_opened(tmp_path, capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setblocking(False)
         on = f"can:socketcand:can0?host=127.0.0.1&port={server.getsockname()[1]}"
-        words = ["drive", "snake13-horizontal-pi3", "--on", on, "--duration", "0.3"]
+        words = ["drive", "weak-servo-pi3", "--on", on, "--duration", "0.3"]
         assert front.run(words) == 0
         text = capsys.readouterr().out
-        assert text.startswith("snake13-horizontal-pi3 on snake13 would run as it is; closest")
+        assert text.startswith("weak-servo-pi3 on snake25 would run as it is; closest")
         assert "nothing was sent, and no bus opened" in text
         path = tmp_path / "dry.mcap"
         assert front.run([*words, "--json", "-o", str(path)]) == 0
@@ -255,10 +256,41 @@ def test_on_the_command_line_nothing_is_opened(tmp_path, capsys):
 def test_the_exit_code_says_that_it_would_not_run(tmp_path, capsys):
     scenario = tmp_path / "weak.toml"
     scenario.write_text(
-        'description = "weak"\nrobot = "snake13"\nduration_s = 2.0\n'
+        'description = "weak"\nrobot = "snake25"\nduration_s = 2.0\n'
         "[servo]\nstall_torque = 0.02\n"
         "[gait.horizontal]\namplitude = 0.5\nfrequency_hz = 0.5\nlag = 0.5\n"
     )
     assert front.run(["drive", str(scenario), "--on", "can:socketcand:can0"]) == 1
-    assert capsys.readouterr().out.startswith("weak on snake13 would stop ")
+    assert capsys.readouterr().out.startswith("weak on snake25 would stop ")
     assert front.run(["drive", str(scenario), "--on", "can"]) == 2
+
+
+def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, capsys):
+    on = ("--on", "can:socketcand:can0")
+    assert front.run(["drive", "snake13-horizontal-pi3", *on]) == 2
+    assert "snake13 has no bus map" in capsys.readouterr().err
+    whole = load_robot("snake25")
+    with SessionWriter(
+        tmp_path / "few.mcap",
+        session_id="made",
+        epoch_ns=EPOCH_NS,
+        robot=whole,
+        clock={"c": "host"},
+    ) as writer:
+        channel = writer.joint_state("/joint_commands", ("joint01", "joint02"), unit="rad")
+        channel.write(EPOCH_NS, np.zeros(2))
+    assert front.run(["drive", str(tmp_path / "few.mcap"), *on]) == 2
+    told = capsys.readouterr().err
+    assert "it commands 2 joints: joint01, joint02" in told
+    assert "snake25 has 25: joint01, joint02, joint03" in told
+
+
+def test_a_twin_that_fails_leaves_a_session_that_says_so(robot, tmp_path):
+    driven = find_driven(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
+    world = dataclasses.replace(nominal_world(robot), physics_rate_hz=200)
+    path = tmp_path / "twin.mcap"
+    with pytest.raises(SimulationError, match="the twin failed at 0"):
+        dry_run(driven, world=world, output=path)
+    with Session.open(path) as session:
+        assert session.verdict == "bad"
+        assert any("the twin failed" in m.msg for _, m in session.messages("/rosout"))
