@@ -77,7 +77,7 @@ def _answer(run: DryRun) -> Iterator[str]:
                 f"{what} would not start: {run.robot} lacks the limits {', '.join(run.missing)}; "
                 f"{near}"
             )
-            yield "Its description needs, with values of its own:"
+            yield "Its description needs this, with values of its own; --robot names the file:"
             yield from (f"  {line}" for line in safety_example(run.missing).splitlines())
 
 
