@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from capture import Session
+from capture.arrays import IntArray
 from capture.environment import base_versions
 from capture.log.signals import Signal
 
@@ -19,7 +20,7 @@ from .demodulation_session import response_over_time
 from .energy.cycles import energy_result
 from .energy.ledger import check_ledger
 from .energy.transport import transport
-from .estimators.series import Series, clean
+from .estimators.series import Series, clean_together
 from .estimators.spectrum import BINS_PER_SIDE
 from .fitting import GaitFit, fit_gait
 from .flags import find_artefacts
@@ -143,14 +144,18 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     stretch = choose_stretch(session, columns, options, warn)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     commands = _series(columns.names, columns.command, stretch, origin_ns)
+    session.forget()  # what each step has looked at need not stay in memory beside the next one's
     responses = _series(columns.names, columns.position, stretch, origin_ns)
     _warn_dropped(commands, responses, warn)
+    session.forget()
     held = within(artefacts, session, stretch)
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
+    del commands
+    session.forget()
     span = _span(stretch, origin_ns, gait)
-    energies = joint_energies(columns, held, span, warn)
+    energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)
     joints = joint_results(
         session.robot,
@@ -162,15 +167,12 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         span=span,
     )
     warn_flags(held, joints, gait, warn)
+    cost = transport(session, sound, energies, span, warn)
+    session.forget()
     energy = energy_result(
-        session,
-        columns,
-        energies,
-        span,
-        transport=transport(session, sound, energies, span, warn),
-        closure=closure,
-        warn=warn,
+        session, columns, energies, span, transport=cost, closure=closure, warn=warn
     )
+    session.forget()
     over_time = response_over_time(session, columns, artefacts, warn)
     body = body_motion(session, sound, gait, span, warn)
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
@@ -202,12 +204,16 @@ def _series(
     names: tuple[str, ...], signals: Mapping[str, Signal], stretch: Stretch, origin_ns: int
 ) -> dict[str, Series]:
     """The signals of a stretch as series, in chain order."""
-    result: dict[str, Series] = {}
-    for name in (one for one in names if one in signals):
-        t_ns, values = signals[name].t_ns, signals[name].values
-        i, j = np.searchsorted(t_ns, (stretch.start_ns, stretch.stop_ns), side="left")
-        result[name] = clean(name, t_ns[i:j], values[i:j], origin_ns)
-    return result
+    part: dict[str, Signal] = {}
+    times: dict[int, tuple[slice, IntArray]] = {}
+    for one in (signals[name] for name in names if name in signals):
+        if id(one.t_ns) not in times:
+            limits = (stretch.start_ns, stretch.stop_ns)
+            inside = slice(*np.searchsorted(one.t_ns, limits, side="left").tolist())
+            times[id(one.t_ns)] = inside, one.t_ns[inside]
+        inside, t_ns = times[id(one.t_ns)]
+        part[one.name] = Signal(one.name, one.unit, t_ns, one.values[inside])
+    return clean_together(part, origin_ns)
 
 
 def _warn_dropped(

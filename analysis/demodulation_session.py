@@ -154,7 +154,8 @@ def response_over_time(
         return _joint(command, response, [*pairs], false=false.get(name, []), settled_s=settled_s)
 
     samples = sum(one.t_ns.size for one in (*columns.command.values(), *columns.position.values()))
-    joints = [one for one in in_threads(of_joint, columns.names, samples) if one is not None]
+    found = in_threads(of_joint, columns.names, samples, session.forget)
+    joints = [one for one in found if one is not None]
     if not any(any(g is not None for g in one.gain) for one in joints):
         warn("gain and lag over time are null: no whole cycle of the logged phase drives a joint")
         return None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from capture import Session
 from capture.arrays import FloatArray
 from capture.robot import Robot
 
@@ -49,11 +50,12 @@ class Energies:
 
 
 def joint_energies(
-    columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
+    session: Session, columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
 ) -> dict[str, Energies]:
     """Energies of all joints.
 
     Args:
+        session: An open session.
         columns: The session's columns.
         artefacts: Of the analysed stretch; what a sensor falsifies has no energy.
         span: The window.
@@ -84,7 +86,8 @@ def joint_energies(
         return Energies(found.get("mechanical"), found.get("electrical"))
 
     samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
-    result = dict(zip(columns.names, in_threads(of_joint, columns.names, samples), strict=True))
+    found = in_threads(of_joint, columns.names, samples, session.forget)
+    result = dict(zip(columns.names, found, strict=True))
     thin = [
         name
         for name, one in result.items()

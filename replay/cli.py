@@ -152,7 +152,8 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     command = single.command_topic or COMMANDS
     response = single.response_topic or STATES
     options = Options(command_topic=command, response_topic=response)
-    with Session.open(file) as session, progress("view", total=2) as bar:
+    folder = output.parent  # on a disk, so that an hour's columns need not be in memory
+    with Session.open(file, column_folder=folder) as session, progress("view", total=2) as bar:
         bar.update(0, note="results" if single.result else "analysis")
         if single.result:
             layer = saved(session, single.result, options)

@@ -16,7 +16,10 @@ MANY = 1 << 18
 
 
 def in_threads(
-    function: Callable[[_Item], _Result], items: Sequence[_Item], samples: int
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    samples: int,
+    after: Callable[[], None] = lambda: None,
 ) -> list[_Result]:
     """Apply a function to independent items, in threads where there is much to do.
 
@@ -24,12 +27,19 @@ def in_threads(
         function: Spends its time in NumPy, which lets other threads run.
         items: What it is applied to.
         samples: All that it will look at.
+        after: Called after each item, by the thread that worked on it.
 
     Returns:
         Its results, in the order of the items; the same bits however many threads there are.
     """
     threads = threads_or_default(None)
+
+    def work(item: _Item) -> _Result:
+        result = function(item)
+        after()
+        return result
+
     if samples < MANY or threads == 1:
-        return [function(item) for item in items]
+        return [work(item) for item in items]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, items))
+        return list(pool.map(work, items))

@@ -83,7 +83,7 @@ def find_artefacts(session: Session, columns: Columns) -> tuple[Artefact, ...]:
         ]
 
     samples = sum(one.t_ns.size for key in QUANTITIES for one in columns.of(key).values())
-    return tuple(chain.from_iterable(in_threads(of_joint, columns.names, samples)))
+    return tuple(chain.from_iterable(in_threads(of_joint, columns.names, samples, session.forget)))
 
 
 _Found = Iterator[tuple[str, str, tuple[Span, ...], str]]

@@ -21,6 +21,7 @@ from .cdr import Layout, layout_of
 from .chunk import Buffer
 from .groups import Group, Matrix, Stamping, fits_layout
 from .message_heads import BODY_AT, FIXED_SIZE, Places
+from .pages import FilePages
 from .rosmsg import MessageType
 from .storage import LogFile
 from .stores import TimeStore
@@ -28,6 +29,8 @@ from .stores import TimeStore
 _LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
 _MAX_LAYOUTS = 64
 _MAX_SHARED = 8
+_HELD = 8
+"""Batches after which what was read is let go of, where columns lie in files."""
 _EXPANSION = 64
 """No more memory is reserved than this many times the bytes in the file; more may be used."""
 
@@ -108,14 +111,18 @@ def read_messages(
             _EXPANSION * stored,
             shared,
             stamping,
+            log_file.pages,
         )
         for request in requests
     ]
     wanted = [request.channel_ids for request in requests]
-    for _, found in record_batches(log_file, wanted, blocks, warn, threads):
+    batches = record_batches(log_file, wanted, blocks, warn, threads)
+    for k, (_, found) in enumerate(batches, start=1):
         for reader, records in zip(readers, found, strict=True):
             if len(records.offsets):
                 reader.add(records, window_ns)
+        if log_file.pages is not None and k % _HELD == 0:
+            log_file.forget()
     return [Messages(reader.groups, reader.unread) for reader in readers]
 
 
@@ -174,12 +181,13 @@ class _GroupReader:
         reserve: int,
         shared: list[TimeStore],
         stamping: Stamping,
+        pages: FilePages | None,
     ) -> None:
         self._type = request.message_type
         self._paths = None if request.paths is None else frozenset(request.paths)
         self._layouts = request.layouts
         self._expected, self._reserve = expected, reserve
-        self._shared, self._stamping = shared, stamping
+        self._shared, self._stamping, self._pages = shared, stamping, pages
         self._by_length: dict[int, list[Group]] = {}
         self._count = 0
         self.groups: list[Group] = []
@@ -242,7 +250,7 @@ class _GroupReader:
                 group = self._group(layout, self._capacity(length, int(fits.sum())))
                 known.append(group)
             else:
-                group = Group(layout, self._paths, 1, stamping=self._stamping)
+                group = Group(layout, self._paths, 1, (), self._stamping, self._pages)
             self.groups.append(group)
             group.take(places.take(fits), log_ns[fits], order[fits])
             rest = ~fits
@@ -262,8 +270,9 @@ class _GroupReader:
     def _group(self, layout: Layout, capacity: int) -> Group:
         """A group; the first of a topic may have the times of another topic's first."""
         if self.groups:
-            return Group(layout, self._paths, capacity, stamping=self._stamping)
-        group = Group(layout, self._paths, capacity, tuple(self._shared), self._stamping)
+            return Group(layout, self._paths, capacity, (), self._stamping, self._pages)
+        shared = tuple(self._shared)
+        group = Group(layout, self._paths, capacity, shared, self._stamping, self._pages)
         if len(self._shared) < _MAX_SHARED:
             self._shared.append(group.kept_times)
         return group

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..arrays import IntArray
 from .cdr import Layout, Leaf
 from .message_heads import Places
+from .pages import FilePages
 from .stores import ColumnStore, Times, TimeStore
 
 _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
@@ -83,6 +84,7 @@ class Group:
         capacity: int,
         others: Sequence[TimeStore] = (),
         stamping: Stamping | None = None,
+        pages: FilePages | None = None,
     ) -> None:
         """Start empty.
 
@@ -92,6 +94,7 @@ class Group:
             capacity: Messages to expect.
             others: Times of other topics, which may be the same.
             stamping: What works out the times, of other topics too; None for one of its own.
+            pages: Where large columns lie; None for memory.
         """
         self.layout = layout
         self._stamping = stamping or Stamping()
@@ -105,7 +108,7 @@ class Group:
         self.kept_times = TimeStore(capacity, stamped=self.is_stamped, others=others)
         self._order: list[IntArray | range] = []
         self._columns = {
-            path: ColumnStore(leaf.dtype, leaf.count, capacity)
+            path: ColumnStore(leaf.dtype, leaf.count, capacity, pages)
             for path, leaf in leaves.items()
             if leaf not in (self._stamp or ()) and (paths is None or path in paths)
         }

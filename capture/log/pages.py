@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import mmap
+import os
+import sys
+import tempfile
+import weakref
+from pathlib import Path
 
 import numpy as np
 
@@ -39,3 +44,49 @@ def keep_freed(size: int) -> None:
         size: Of the largest such piece [byte].
     """
     np.empty(size, dtype=np.uint8)  # freed at once, never written
+
+
+class FilePages:
+    """Memory that lies in a file, so that what is not looked at need not be in memory.
+
+    The file has no name and is gone with what refers to it. What was written stays when its pages
+    are let go of: the system writes it to the disk when it needs the room, and not before.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Choose where the files go.
+
+        Args:
+            folder: On a disk; in a file system in memory nothing is gained.
+        """
+        self._folder = folder
+        self._held: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+
+    def new(self, size: int) -> mmap.mmap:
+        """Memory in a file of its own; where there is no room for one, memory as it usually is.
+
+        Args:
+            size: How much [byte], more than 0.
+
+        Returns:
+            Zeros, given back when nothing refers to them any more.
+
+        Raises:
+            MemoryError: If there is not as much, neither on the disk nor in memory.
+        """
+        if sys.platform != "linux":
+            return new_pages(size)
+        try:
+            with tempfile.TemporaryFile(dir=self._folder) as file:
+                # A hole in a mapped file ends the process when the disk is full: reserve it all.
+                os.posix_fallocate(file.fileno(), 0, size)
+                found = mmap.mmap(file.fileno(), size)
+        except OSError:
+            return new_pages(size)
+        self._held.add(found)
+        return found
+
+    def release(self) -> None:
+        """Let go of the pages; what they hold is read again when it is looked at."""
+        for each in self._held:
+            each.madvise(mmap.MADV_DONTNEED)

@@ -43,13 +43,17 @@ _NS = 1_000_000_000
 class Session:
     """A recorded session, opened for reading."""
 
-    def __init__(self, path: Path | str, *, threads: int | None = None) -> None:
+    def __init__(
+        self, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
+    ) -> None:
         """Open a session.
 
         Args:
             path: The MCAP file; of a split session any part, or the folder that holds it.
             threads: How many decompress what is read; None for one a core that this process may
                 use, at most four. What is read is the same.
+            column_folder: A folder on a disk: large columns lie there, in files without names, and
+                :meth:`forget` lets go of their memory (Linux). None for memory.
 
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
@@ -58,20 +62,24 @@ class Session:
         """
         threads = threads_or_default(threads)
         self.path = Path(path)
-        self._file = LogFile(self.path)
+        self._file = LogFile(self.path, column_folder)
         self._warnings = list(self._file.warnings)
         self._topics = Topics(self._file, self._warn, threads=threads)
         self._clock = StampClock(self._topics, self._warn)
         self._joints = JointReader(self.path, self._topics, self._clock, self._warn)
 
     @classmethod
-    def open(cls, path: Path | str, *, threads: int | None = None) -> Self:
+    def open(
+        cls, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
+    ) -> Self:
         """Open a session; the same as calling the class.
 
         Args:
             path: The MCAP file; of a split session any part, or the folder that holds it.
             threads: How many decompress what is read; None for one a core that this process may
                 use, at most four. What is read is the same.
+            column_folder: A folder on a disk: large columns lie there, in files without names, and
+                :meth:`forget` lets go of their memory (Linux). None for memory.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -81,7 +89,7 @@ class Session:
             LogError: If it can't be opened.
             UsageError: If ``threads`` is less than 1.
         """
-        return cls(path, threads=threads)
+        return cls(path, threads=threads, column_folder=column_folder)
 
     def close(self) -> None:
         """Release the file."""
@@ -91,7 +99,8 @@ class Session:
         """Let go of the memory of what was read so far.
 
         For who goes through a long session stretch by stretch: the pages of a mapped file count as
-        this process's memory as long as they are. What is read next is the same.
+        this process's memory as long as they are. What is read next is the same. Columns that lie
+        in files are let go of, too, and keep their values; those in memory stay.
         """
         self._file.forget()
 

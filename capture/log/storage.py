@@ -22,6 +22,7 @@ from .block_source import BlockSource
 from .chunk import Block, Buffer
 from .mcap_file import McapFile
 from .message_heads import read_heads
+from .pages import FilePages
 from .part_files import PartFiles, first_part, open_parts
 from .part_names import PART_RECORD
 from .recovered import Recovered
@@ -31,11 +32,12 @@ from .wal_tail import MessageKey, WalContents, WalTail, beyond, read_wal
 class LogFile:
     """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, column_folder: Path | None = None) -> None:
         """Open a session and find what it holds.
 
         Args:
             path: Its file, any of its parts, or a folder that holds it and no other.
+            column_folder: Where large columns lie in files; None for memory.
 
         Raises:
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
@@ -55,6 +57,7 @@ class LogFile:
         self.recovered: Recovered | None = None
         self._sources: list[BlockSource] = []
         self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
+        self.pages = None if column_folder is None else FilePages(column_folder)
         first = first_part(path)
         wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
@@ -90,6 +93,8 @@ class LogFile:
         """Let go of what was read; it is read again when needed."""
         for file in self.files:
             file.forget()
+        if self.pages is not None:
+            self.pages.release()
 
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """See :meth:`BlockSource.payload`."""

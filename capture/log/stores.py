@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import IntArray
-from .pages import new_pages
+from .pages import FilePages, new_pages
 
 _SHORT_NS = 2**31
 _LARGE = 4 << 20
@@ -30,14 +30,18 @@ class ColumnStore:
     Single bytes are kept row by row: they are text or records, not columns.
     """
 
-    def __init__(self, dtype: str, width: int, capacity: int) -> None:
+    def __init__(
+        self, dtype: str, width: int, capacity: int, pages: FilePages | None = None
+    ) -> None:
         """Reserve memory; little of it is used before rows come.
 
         Args:
             dtype: numpy type string of a number.
             width: Numbers a row.
             capacity: Rows to expect; more may come, at the price of a copy.
+            pages: Where a large column lies; None for memory.
         """
+        self._pages = pages
         self._dtype = np.dtype(dtype)
         self._by_row = self._dtype.itemsize == 1
         self._width = width
@@ -86,7 +90,7 @@ class ColumnStore:
         self._memory, self._ready = None, 0
         if size < _LARGE:
             return np.empty(shape, dtype=self._dtype)
-        memory = new_pages(size)
+        memory = new_pages(size) if self._pages is None else self._pages.new(size)
         if sys.platform == "linux":
             self._memory = memory
         return np.frombuffer(memory, dtype=self._dtype).reshape(shape)
