@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from .console import emit_json
-from .errors import UsageError
+from .errors import ImportFormatError, UsageError
 
 if TYPE_CHECKING:
     from .exchange.column_map import ColumnMap
@@ -149,7 +149,7 @@ def _column_map(
     from .exchange.csv_import import is_frame_csv
 
     if not log.is_file():
-        raise UsageError(f"{log}: no such file")
+        raise ImportFormatError(log, "no such file")
     if log.suffix.lower() != ".csv" or is_frame_csv(log):
         if columns is not None or options:
             raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")

@@ -7,7 +7,8 @@
     |  |- MissingExtraError (ImportError)   a verb whose extra is not installed
     |  |- OutputExistsError (FileExistsError)
     |  |- SettingsError                    settings of a recording, all faults listed
-   |  `- JointSetError (DataError)        commands of another joint set than the robot's
+    |  `- JointSetError (DataError)        commands of another joint set than the robot's
+    |- InputFileError (OSError)            a file to read that isn't there, or can't be read
     |- RobotFileError (ValueError)          a robot description with faults, all listed
     |- ScenarioError (ValueError)           a scenario file with faults, all listed
     |- PlanError (ValueError)               a drive plan with faults, all listed
@@ -74,6 +75,20 @@ class OutputExistsError(UsageError, FileExistsError):
         """
         self.path = Path(path)
         super().__init__(f"{path} exists already; choose another name or give --force")
+
+
+class InputFileError(UndulogError, OSError):
+    """A description, a model, a result: it isn't there, or it can't be read."""
+
+    def __init__(self, path: Path | str, message: str) -> None:
+        """Build the message.
+
+        Args:
+            path: The file.
+            message: What is wrong with it.
+        """
+        self.path = Path(path)
+        super().__init__(f"{path}: {message}")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ from typing import Any, cast
 import numpy as np
 
 from .arrays import ComplexArray, FloatArray, frozen
-from .errors import Fault, NullModelError, UsageError
+from .errors import Fault, NullModelError
+from .input_file import read_input
 from .part_file import write_text
 from .strict_table import Faults, Table
 
@@ -152,13 +153,11 @@ def read_null_model(path: Path) -> NullModel:
         The model.
 
     Raises:
-        UsageError: If the file can't be read.
+        InputFileError: If the file isn't there or can't be read.
         NullModelError: If it has faults; lists all of them.
     """
     try:
-        values: Any = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: can't be read: {error.strerror or error}") from error
+        values: Any = json.loads(read_input(path).decode("utf-8"))
     except ValueError as error:
         raise NullModelError(path, [Fault("syntax", str(error), "JSON in UTF-8")]) from error
     if not isinstance(values, dict) or cast("dict[str, Any]", values).get("format") != FORMAT:

@@ -8,6 +8,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from .errors import Fault, FaultyFileError, UsageError
+from .input_file import read_input
 from .strict_table import listed
 
 
@@ -57,7 +58,8 @@ class Shelf:
             Its text.
 
         Raises:
-            UsageError: If there is none of that name or the file can't be read.
+            UsageError: If there is none of that name.
+            InputFileError: If it is a path, and the file isn't there or can't be read.
             FaultyFileError: If the file is not UTF-8 (the shelf's own kind of it).
         """
         if str(name_or_path) in self.names():
@@ -65,16 +67,15 @@ class Shelf:
             text = (place / f"{name_or_path}.toml").read_text(encoding="utf-8")
             return Description(text, Path(f"{name_or_path}.toml"), place)
         path = Path(name_or_path)
-        if not path.is_file():
+        is_path = bool(path.suffix) or len(path.parts) > 1
+        if not is_path and not path.is_file():
             near = listed(self.names(), str(name_or_path))
             raise UsageError(f"no {self.kind} {str(name_or_path)!r}: not a file, nor one of {near}")
         try:
-            return Description(path.read_bytes().decode("utf-8"), path, path.parent)
+            return Description(read_input(path).decode("utf-8"), path, path.parent)
         except UnicodeDecodeError as error:
             fault = Fault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
             raise self.error(path, [fault]) from error
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
 
     def _place(self) -> Traversable:
         return resources.files(self.package) / self.folder

@@ -44,9 +44,10 @@ def _command_line_page() -> str:
         "# Command line",
         "",
         (
-            "One command, `undulog`. Exit codes: 0 done, 1 the work failed, 2 wrong usage. Nothing "
-            "is overwritten without `--force`; Ctrl-C and SIGTERM leave a readable file. Bars of "
-            "progress go to stderr, and only on a terminal."
+            "One command, `undulog`. Exit codes: 0 done, 1 the work failed (also: a file that "
+            "isn't there), 2 wrong usage (also: a name that nothing has). Nothing is overwritten "
+            "without `--force`; Ctrl-C and SIGTERM leave a readable file. Bars of progress go to "
+            "stderr, and only on a terminal."
         ),
         "",
     ]

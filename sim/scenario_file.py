@@ -128,7 +128,8 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         The scenario.
 
     Raises:
-        UsageError: If there is no such scenario or the file cannot be read.
+        UsageError: If no scenario has that name.
+        InputFileError: If it is a path, and the file isn't there or can't be read.
         ScenarioError: If it has faults; lists all of them.
         RobotFileError: If the robot's own file has faults.
     """

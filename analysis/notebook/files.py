@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
 from capture.console import refuse_existing
-from capture.errors import DataError, LogError, MissingExtraError
+from capture.errors import DataError, MissingExtraError
+from capture.input_file import read_input
 from capture.part_file import part_file, write_text
 
 from ..command_line import check_output
@@ -106,14 +107,12 @@ def load(path: Path | str) -> Shown:
         The result, equal to the one that was written.
 
     Raises:
-        LogError: If there is no such file or it can't be read.
+        InputFileError: If it isn't there or can't be read.
         DataError: If it holds no result.
     """
     path = Path(path)
     try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise LogError(path, error.strerror or str(error)) from error
+        data: Any = json.loads(read_input(path).decode("utf-8"))
     except ValueError as error:
         raise DataError(f"{path}: not JSON: {error}") from error
     for kind in _KINDS:

@@ -43,7 +43,8 @@ def analyse_with_null(
         The result.
 
     Raises:
-        UsageError: If the file can't be read, or is of another robot or gait.
+        InputFileError: If the file isn't there or can't be read.
+        UsageError: If it is of another robot or gait.
         NullModelError: If the file has faults.
         MissingChannelError: If the session has neither commands nor responses.
         DataError: If they hold too few samples.

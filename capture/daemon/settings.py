@@ -41,7 +41,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-from ..errors import DataError, SettingsError, UsageError
+from ..errors import DataError, SettingsError
+from ..input_file import read_input
 from ..strict_table import Faults, listed, shown
 from .amounts import SIZE_UNITS
 from .setting_values import PARSERS
@@ -145,7 +146,7 @@ def resolve(
         The settings.
 
     Raises:
-        UsageError: If the file can't be read.
+        InputFileError: If the file isn't there or can't be read.
         SettingsError: If there are faults; lists all of them, of all layers.
         TypeError: If ``cli`` has a name that no setting has.
     """
@@ -209,9 +210,7 @@ def _environment(environ: Mapping[str, str], faults: Faults) -> _Layer:
 
 def _file(path: Path, faults: Faults) -> _Layer:
     try:
-        tables = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: can't be read: {error.strerror or error}") from error
+        tables = tomllib.loads(read_input(path).decode("utf-8"))
     except UnicodeDecodeError as error:
         faults.add(f"{path}: byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
         tables = {}

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Fault, FaultyFileError, UsageError
+from ..input_file import read_input
 from ..robot import Quantity, Robot
 from ..robot.bus_map import JOINT_QUANTITIES
 from ..strict_table import Faults, Table, listed
@@ -103,13 +104,11 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
         The map.
 
     Raises:
-        UsageError: If the file can't be read.
+        InputFileError: If the file isn't there or can't be read.
         FaultyFileError: If it has faults; lists all of them.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: can't be read: {error.strerror}") from error
+        values = tomllib.loads(read_input(path).decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FaultyFileError(path, [Fault("syntax", str(error), "TOML 1.0")]) from error
     column_map, faults = _parse(values, robot)

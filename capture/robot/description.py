@@ -63,7 +63,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
         The robot.
 
     Raises:
-        UsageError: If there is no such robot or the file cannot be read.
+        UsageError: If no robot has that name.
+        InputFileError: If it is a path, and the file isn't there or can't be read.
         RobotFileError: If the description has faults; lists all of them.
     """
     found = _SHELF.read(name_or_path)

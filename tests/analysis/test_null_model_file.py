@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from capture.errors import NullModelError, UsageError
+from capture.errors import InputFileError, NullModelError
 from capture.null_model import NullModel, SharedParameter, read_null_model, write_null_model
 
 
@@ -80,5 +80,5 @@ def test_what_is_no_json(tmp_path):
     path.write_text("{")
     with pytest.raises(NullModelError, match="syntax"):
         read_null_model(path)
-    with pytest.raises(UsageError, match="can't be read"):
+    with pytest.raises(InputFileError, match="no such file"):
         read_null_model(tmp_path / "none.json")

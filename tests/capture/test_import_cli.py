@@ -68,7 +68,7 @@ def test_a_csv_by_options_and_by_file(tmp_path: Path, capsys):
 
 WRONG = [
     (2, "{log} -o {dir}/x.mcap -r snak25", "did you mean snake25?"),
-    (2, "{dir}/no.log -o {dir}/x.mcap -r snake25", "no.log: no such file"),
+    (1, "{dir}/no.log -o {dir}/x.mcap -r snake25", "no.log: no such file"),
     (2, "{log} -o {log} -r snake25", "a session is an .mcap file, not .log"),
     (2, "{log} -o {dir}/no/x.mcap -r snake25", "no doesn't exist"),
     (2, "{dir}/a.csv -o {dir}/x.mcap -r snake25", "needs --columns MAP.toml or --map options"),

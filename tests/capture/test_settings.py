@@ -22,7 +22,7 @@ from capture.daemon.amounts import (
 )
 from capture.daemon.setting_values import PARSERS
 from capture.daemon.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, resolve
-from capture.errors import DataError, SettingsError, UsageError
+from capture.errors import DataError, InputFileError, SettingsError
 
 MANUAL = Path(__file__).parents[2] / "docs" / "recording.md"
 NEEDED = {"sources": ("can:virtual:a",), "output": "run.mcap"}
@@ -313,9 +313,11 @@ def test_a_file_that_is_no_settings_file_is_a_fault(tmp_path, text):
         resolve(NEEDED, {}, tmp_path / "x.toml")
 
 
-def test_a_missing_file_is_wrong_usage(tmp_path):
-    with pytest.raises(UsageError, match="can't be read"):
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputFileError, match=r"none\.toml: no such file"):
         resolve(NEEDED, {}, tmp_path / "none.toml")
+    with pytest.raises(InputFileError, match="can't be read: Is a directory"):
+        resolve(NEEDED, {}, tmp_path)
 
 
 def test_a_name_that_no_setting_has_is_a_mistake_of_the_caller():

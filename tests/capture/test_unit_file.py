@@ -87,6 +87,7 @@ def test_what_the_recorder_relies_on_is_there(unit):
     assert found["Type"] == ["notify"]
     assert found["KillSignal"] == ["SIGTERM"]
     assert found["Restart"] == ["on-failure"]
+    assert found["AssertPathExists"] == ["/etc/undulog/%i.toml"]
     assert found["RestartPreventExitStatus"] == ["2"]
     assert found["RuntimeDirectory"] == found["StateDirectory"] == ["undulog/%i"]
     families = found["RestrictAddressFamilies"][0].split()

@@ -45,11 +45,6 @@ def test_a_missing_argument_exits_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert "FILE" in capsys.readouterr().err
 
 
-def test_a_missing_file_exits_1_and_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert undulog.run(["log", "info", "nowhere.mcap"]) == 1
-    assert "nowhere.mcap: no such file" in capsys.readouterr().err
-
-
 def test_a_missing_extra_says_which_one_to_install() -> None:
     # None in sys.modules makes Python raise the same ImportError as a package that isn't there.
     code = (

@@ -19,7 +19,7 @@ from analysis.results.sweep import (
     ToneCoupling,
 )
 from capture import Session
-from capture.errors import DataError, LogError, OutputExistsError, UsageError
+from capture.errors import DataError, InputFileError, OutputExistsError, UsageError
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -262,7 +262,7 @@ def test_files_that_hold_no_result_are_refused(text, error, said, tmp_path):
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(LogError, match="No such file"):
+    with pytest.raises(InputFileError, match="no such file"):
         load(tmp_path / "none.json")
 
 

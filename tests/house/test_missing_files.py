@@ -1,0 +1,87 @@
+"""A file that isn't there is told alike by every verb: one line that names it, exit code 1."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import undulog
+from sim import load_scenario
+from sim.record import record
+
+# What isn't there is {no} with a suffix, what is there {run}; outputs go to {out}.
+LINES = [
+    "record --settings {no}.toml",
+    "record can:virtual:bus --robot {no}.toml -o {out}.mcap",
+    "record twin:{no}.toml -o {out}.mcap",
+    "import {no}.log --robot snake25 -o {out}.mcap",
+    "import {no}.csv --robot snake25 -o {out}.mcap --map t=time:s",
+    "import {no}.mf4 --robot snake25 -o {out}.mcap",
+    "import {csv} --columns {no}.toml --robot snake25 -o {out}.mcap",
+    "import {csv} --robot {no}.toml -o {out}.mcap",
+    "log info {no}.mcap",
+    "log check {no}.mcap",
+    "log recover {no}.mcap",
+    "log cut {no}.mcap -o {out}.mcap",
+    "log merge {run} {no}.mcap -o {out}.mcap",
+    "log export {no}.mcap -o {out}.log",
+    "log export {no}.mcap -o {out}.csv",
+    "sim run {no}.toml -o {out}.mcap",
+    "sim fit {no}.mcap -o {out}.toml",
+    "sim fit {run} --on twin:{no}.toml -o {out}.toml",
+    "sim null {no}.toml -o {out}.json",
+    "sim serve {no}.toml --socketcand 0",
+    "drive {no}.mcap --on twin -o {out}.mcap",
+    "drive {no}.toml --on twin -o {out}.mcap",
+    "drive flat --on twin:{no}.toml -o {out}.mcap",
+    "drive flat --on can:virtual:bus --robot {no}.toml",
+    "analyse {no}.mcap",
+    "analyse {run} {no}.mcap",
+    "analyse {run} --null {no}.json",
+    "compare {run} {no}.mcap",
+    "plan lag-sweep --like {no}.mcap -o {out}",
+    "plan multisine --like {no}.mcap -o {out}",
+    "plan phase-kicks --like {no}.mcap -o {out}",
+    "plan reversal --like {no}.mcap -o {out}",
+    "report {no}.mcap -o {out}.html",
+    "replay {no}.mcap --on twin -o {out}.mcap",
+    "replay {run} --on twin:{no}.toml -o {out}.mcap",
+    "replay {run} --on can:virtual:bus --robot {no}.toml",
+    "view {no}.mcap --save {out}.rrd",
+    "view {run} {no}.mcap --save {out}.rrd",
+    "view {no}.mcap --clip {out}.gif",
+    "view {run} --result {no}.json --save {out}.rrd",
+]
+WITHOUT_FILES = {"record status", "record mark", "record note", "record split", "record stop"}
+WITHOUT_FILES |= {"record unit", "sim list", "info"}
+
+
+@pytest.fixture(scope="module")
+def there(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A session and a CSV that can be read."""
+    folder = tmp_path_factory.mktemp("there")
+    record(load_scenario("flat").changed(duration_s=0.1), folder / "run.mcap")
+    (folder / "a.csv").write_text("t,a\n0,1\n")
+    return {"run": folder / "run.mcap", "csv": folder / "a.csv"}
+
+
+def test_every_verb_is_here() -> None:
+    tried = {max((v for v in undulog.VERBS if line.startswith(v)), key=len) for line in LINES}
+    assert tried == set(undulog.VERBS) - WITHOUT_FILES
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(
+    line: str, there: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = {"no": tmp_path / "nowhere", "out": tmp_path / "out", **there}
+    suffix = re.search(r"\{no\}(\.\w+)", line)
+    assert suffix is not None
+    assert undulog.run(shlex.split(line.format_map(words))) == 1
+    said = capsys.readouterr()
+    assert said.err == f"error: {tmp_path / 'nowhere'}{suffix[1]}: no such file\n"
+    assert said.out == ""
+    assert not any(tmp_path.iterdir())
