@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -33,10 +34,12 @@ def test_a_cell_shows_what_it_prints_and_its_last_expression():
 
 
 @pytest.mark.slow
-def test_the_notebook_runs_and_says_what_its_text_says():
+def test_the_notebook_runs_says_what_its_text_says_and_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     page = page_module().executed_page()
     assert "B differs from A: joint03 most" in page
     assert "scenario.toml: servo_of.joint03.stall_torque: not set -> 0.2" in page
     assert page.count("<figure") == 3
     assert "```text\nTrue\n```" in page
     assert "differences.parquet" in page
+    assert not any(tmp_path.iterdir())
