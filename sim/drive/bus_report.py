@@ -24,6 +24,8 @@ class BusReport:
         ticks: Ticks that the gait commanded.
         cuts: How often commands of single joints were changed, by why.
         jitter: Lateness of the ticks; None where the robot set the pace.
+        waits: Commands that were sent a little later, so that no joint was faster than it may.
+        longest_wait_s: The longest of these waits [s].
         wall_s: How long it took.
         first_frames: The commands of the first tick, as candump writes frames.
         told: Samples of the gait that the recorder took.
@@ -38,6 +40,8 @@ class BusReport:
     ticks: int
     cuts: dict[str, int]
     jitter: Jitter | None
+    waits: int = 0
+    longest_wait_s: float = 0.0
     wall_s: float = 0.0
     first_frames: list[str] = field(default_factory=list[str])
     told: int = 0
@@ -60,6 +64,12 @@ def remarks_of(report: BusReport) -> list[Remark]:
     if overruns:
         text = f"{overruns} control ticks were left out, as the one before took too long"
         remarks.append(Remark("warn", text))
+    if report.waits:
+        text = (
+            f"{report.waits} commands followed a late one and waited up to "
+            f"{report.longest_wait_s * 1e3:.2f} ms, so that no joint was told to be too fast"
+        )
+        remarks.append(Remark("info", text))
     changed = {why: count for why, count in report.cuts.items() if count}
     if changed:
         listed = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in changed.items())
@@ -90,6 +100,8 @@ def report_facts(report: BusReport) -> dict[str, Any]:
         "sent": tally.sent,
         "received": tally.received,
         "decoded": tally.decoded,
+        "waits": report.waits,
+        "longest_wait_s": report.longest_wait_s,
         "changed": report.cuts,
         "lateness": None if report.jitter is None else report.jitter.to_dict(),
         "real_time_factor": tally.loop_s / max(report.wall_s, 1e-3),

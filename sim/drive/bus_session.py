@@ -111,7 +111,7 @@ class BusSession:
             self._frames.add(frames)
             newest = frames[-1]
             self._device_minus_host_ns = int(newest["t_device_ns"]) - int(newest["t_host_ns"])
-        self._keep_sent(tick.sent, t_ns)
+        self._keep_sent(tick.sent)
         if tick.tick % _DECODE_TICKS == 0:
             self._frames.decode(self._now_ns, t_ns + 1)
         self._change("phase", self._phase, step.phase)
@@ -124,13 +124,13 @@ class BusSession:
         if step.gait is not None:
             self._write_gait(step.gait, t_ns)
 
-    def _keep_sent(self, frames: FrameArray, t_ns: int) -> None:
+    def _keep_sent(self, frames: FrameArray) -> None:
         """Keep what was sent, with the time on the device's clock as far as that is known."""
         self._frames.write_raw(self._now_ns)
         if len(frames):
             kept = np.array(frames)
-            kept["t_host_ns"] = t_ns
-            kept["t_device_ns"] = max(t_ns + self._device_minus_host_ns, 0)
+            device_ns = frames["t_host_ns"].astype(np.int64) + self._device_minus_host_ns
+            kept["t_device_ns"] = np.maximum(device_ns, 0)
             self._frames.keep(kept, self._now_ns)
 
     def _write_gait(self, gait: GaitTick, t_ns: int) -> None:
@@ -213,7 +213,7 @@ class BusSession:
 
 
 def stamped(tick: BusTick, t_ns: int) -> BusTick:
-    """The same tick with the arrival of its frames at the tick's time.
+    """The same tick with its frames, both ways, at the tick's time.
 
     Args:
         tick: The tick.
@@ -222,7 +222,7 @@ def stamped(tick: BusTick, t_ns: int) -> BusTick:
     Returns:
         Copies of the frames, ``t_host_ns`` set.
     """
-    received = [np.array(frames) for frames in tick.received]
-    for frames in received:
+    received, sent = [np.array(frames) for frames in tick.received], np.array(tick.sent)
+    for frames in (*received, sent):
         frames["t_host_ns"] = t_ns
-    return tick._replace(received=received)
+    return tick._replace(received=received, sent=sent)

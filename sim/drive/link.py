@@ -13,9 +13,12 @@ import re
 import select
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
+import numpy as np
+
+from capture.arrays import IntArray
 from capture.errors import SourceError
 from capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray
 from capture.robot import ClockDomain
@@ -54,11 +57,16 @@ class Link(Protocol):
         """
         ...
 
-    def send(self, frames: FrameArray) -> None:
+    def send(self, frames: FrameArray, earliest_ns: IntArray | None = None) -> IntArray:
         """Put frames on the bus.
 
         Args:
             frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
+                None: at once.
+
+        Returns:
+            When the bus had each of them, on the session's clock [ns], shape (n,).
 
         Raises:
             SourceError: If the bus doesn't take them.
@@ -187,21 +195,30 @@ class VirtualRobotLink:
         self._ticks = [(later, at - count) for later, at in self._ticks]
         return tick, frames
 
-    def send(self, frames: FrameArray) -> None:
-        """Put frames on the bus.
+    def send(self, frames: FrameArray, earliest_ns: IntArray | None = None) -> IntArray:
+        """Put frames on the bus, all of them at once.
 
         Args:
             frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
+                None: at once.
+
+        Returns:
+            When the bus had them, on the session's clock [ns], shape (n,).
 
         Raises:
             SourceError: If the robot is gone, or takes nothing.
         """
+        text = sent_text(frames)
+        if earliest_ns is not None:
+            wait_until(int(earliest_ns.max(initial=0)), self._tally.now_ns)
         try:
-            self._socket.sendall(sent_text(frames))
+            self._socket.sendall(text)
         except TimeoutError as error:
             raise SourceError(self.place, f"takes no commands for {_SEND_S:g} s") from error
         except OSError as error:
             raise self._gone(error) from error
+        return np.full(len(frames), self._tally.now_ns(), dtype=np.int64)
 
     def close(self) -> None:
         """Release it; safe to call twice."""
@@ -229,6 +246,17 @@ class VirtualRobotLink:
 
     def _gone(self, error: OSError) -> SourceError:
         return SourceError(self.place, f"the robot is gone: {error.strerror or error}")
+
+
+def wait_until(earliest_ns: int, now_ns: Callable[[], int]) -> None:
+    """Wait for a moment of a clock.
+
+    Args:
+        earliest_ns: The moment [ns].
+        now_ns: The clock.
+    """
+    while (left_ns := earliest_ns - now_ns()) > 0:
+        time.sleep(left_ns * 1e-9)
 
 
 def sent_text(frames: FrameArray) -> bytes:

@@ -19,6 +19,7 @@ from capture.robot import Direction, Quantity, Robot
 from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate, GateStep, Heard, Phase
 from ..gate.presence import Presence
+from ..gate.spacing import Spacing
 from ..scenario import CONTROL_RATE_HZ
 from .console_watch import ConsoleWatch
 from .link import Link
@@ -34,7 +35,7 @@ class BusTick(NamedTuple):
         tick: Its number, from 0.
         step: What the gate had done.
         received: Frames that came by then.
-        sent: What was sent: requests, then commands.
+        sent: What was sent: requests, then commands; ``t_host_ns`` is when the bus had them.
     """
 
     tick: int
@@ -101,7 +102,9 @@ class CommandEncoder:
 class ControlLoop:
     """One drive: a gate between a gait and a bus."""
 
-    def __init__(self, gate: Gate, robot: Robot, link: Link, pace: Pace) -> None:
+    def __init__(
+        self, gate: Gate, robot: Robot, link: Link, pace: Pace, spacing: Spacing | None
+    ) -> None:
         """Put it together.
 
         Args:
@@ -109,12 +112,15 @@ class ControlLoop:
             robot: Whose bus it is.
             link: The bus.
             pace: When the ticks are.
+            spacing: How closely commands may follow each other; None where the robot sets the
+                pace, and all ticks are a period apart.
 
         Raises:
             DataError: If the robot has no bus.
         """
         self.tally = LoopTally()
         self._gate, self._link, self._pace = gate, link, pace
+        self._spacing = spacing
         self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
         self._presence = Presence(robot)
         self._polls = poll_frames(robot)
@@ -191,11 +197,20 @@ class ControlLoop:
         """Send the commands, and ask for the state where the robot doesn't tell it unasked."""
         if self._gate.phase is Phase.DONE and step.command is None:
             return empty_frames(0)
-        frames = self._polls
+        frames, earliest_ns = self._polls, None
         if step.command is not None:
-            frames = np.concatenate([frames, self._encoder.frames(step.command)])
+            commands = self._encoder.frames(step.command)
+            if self._spacing is not None:
+                earliest_ns = self._spacing.earliest_ns(step.command, len(commands))
+                earliest_ns = np.pad(earliest_ns, (len(frames), 0))
+            frames = np.concatenate([frames, commands])
             self.tally.commanded = True
-        if len(frames):
-            self._link.send(frames)
-            self.tally.sent += len(frames)
-        return frames
+        if not len(frames):
+            return frames
+        sent_ns = self._link.send(frames, earliest_ns)
+        self.tally.sent += len(frames)
+        if step.command is not None and self._spacing is not None:
+            self._spacing.sent(step.command, sent_ns[len(self._polls) :])
+        stamped = frames.copy()
+        stamped["t_host_ns"] = sent_ns
+        return stamped

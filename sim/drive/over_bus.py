@@ -23,6 +23,7 @@ from ..gate.gate import Gate
 from ..gate.lateness import jitter
 from ..gate.limits import GateLimits, gate_limits
 from ..gate.outcome import How, Outcome
+from ..gate.spacing import Spacing
 from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from .bus_report import BusReport, remarks_of
 from .bus_session import BusSession, stamped
@@ -218,13 +219,15 @@ def drive_bus(
             listen_s=0.0 if virtual is not None else LISTEN_S,
         )
         pace = LockstepPace(virtual) if virtual and lockstep else WallPace(link, CONTROL_RATE_HZ)
-        loop = ControlLoop(gate, robot, link, pace)
+        # In simulated time all ticks are a period apart, whenever they come.
+        spacing = None if lockstep else Spacing(plan.limits.rate, clock.now_ns)
+        loop = ControlLoop(gate, robot, link, pace, spacing)
         opened.enter_context(quick_collections())
         begun = time.monotonic()
         try:
             tell.begin()
             loop.run(stop, tell.tick, console)
-            report = _report(gate, loop.tally, lockstep=lockstep)
+            report = _report(gate, loop.tally, spacing)
             tell.end(report)
         except LogWriteError:
             raise  # there is nobody to tell
@@ -260,18 +263,20 @@ def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -
     return session
 
 
-def _report(gate: Gate, tally: LoopTally, *, lockstep: bool) -> BusReport:
+def _report(gate: Gate, tally: LoopTally, spacing: Spacing | None) -> BusReport:
     outcome = gate.outcome or Outcome(How.STOPPED, "", "")
     began = gate.run_from
     return BusReport(
         outcome=outcome,
         tally=tally,
-        lockstep=lockstep,
+        lockstep=spacing is None,
         approach_s=None if began is None else began / CONTROL_RATE_HZ,
         gait_s=gate.run_s,
         ticks=gate.run_ticks,
         cuts=gate.cuts,
         jitter=jitter(tally.late_s),
+        waits=0 if spacing is None else spacing.waits,
+        longest_wait_s=0.0 if spacing is None else spacing.longest_s,
     )
 
 

@@ -6,8 +6,10 @@ import logging
 from collections.abc import Sequence
 
 import can
+import numpy as np
 from can.util import cast_from_string
 
+from capture.arrays import IntArray
 from capture.errors import SourceError, UsageError
 from capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
 from capture.robot import ClockDomain
@@ -17,6 +19,8 @@ from capture.sources.events import Tally
 from capture.sources.options import only
 from capture.sources.python_can import PythonCanLink, bus_class, failure, open_bus
 from capture.sources.socketcand import server_of
+
+from .link import wait_until
 
 _SEND_S = 0.02
 """So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one
@@ -82,26 +86,36 @@ class PythonCanBus:
             raise self._lost(error) from error
         return [frames for frames in found if len(frames) and not holds_fd(frames)]
 
-    def send(self, frames: FrameArray) -> None:
-        """Put frames on the bus.
+    def send(self, frames: FrameArray, earliest_ns: IntArray | None = None) -> IntArray:
+        """Put frames on the bus, one after the other.
 
         Args:
             frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
+                None: at once.
+
+        Returns:
+            When the bus had each of them, on the session's clock [ns], shape (n,).
 
         Raises:
             SourceError: If the bus doesn't take them.
         """
-        columns = (frames["id_flags"].tolist(), frames["dlc"].tolist(), frames["data"])
-        for id_flags, length, data in zip(*columns, strict=True):
+        sent_ns: list[int] = []
+        times: list[int] = [0] * len(frames) if earliest_ns is None else earliest_ns.tolist()
+        columns = (frames["id_flags"].tolist(), frames["dlc"].tolist(), frames["data"], times)
+        for id_flags, length, data, at_ns in zip(*columns, strict=True):
             message = can.Message(
                 arbitration_id=id_flags & ID_MASK,
                 is_extended_id=bool(id_flags & EXTENDED_FLAG),
                 data=data[:length].tobytes(),
             )
+            wait_until(at_ns, self._now_ns)
             try:
                 self._bus.send(message, timeout=_SEND_S)
             except (can.CanError, OSError) as error:
                 raise self._lost(failure(error)) from error
+            sent_ns.append(self._now_ns())
+        return np.array(sent_ns, dtype=np.int64)
 
     def close(self) -> None:
         """Release it; safe to call twice."""

@@ -139,6 +139,7 @@ class Gate:
         self._clamp: Clamp | None = None
         self._way: Ramp | Ending | None = None
         self._progress_s = 0.0
+        self._tick: int | None = None  # the last one in which something was sent
         self._reported: GateFault | None = None
         self._said: set[str] = set()
         self._remarks: list[Remark] = []
@@ -183,6 +184,7 @@ class Gate:
         clamp = self._clamp or self._begin(tick, heard, stop)
         if clamp is None:
             return self._quiet()
+        self._tell_left_out(tick, heard.late_s)
         self._heed(tick, heard, clamp, stop, at_once=at_once)
         if self.phase is Phase.DONE:
             return self._quiet()
@@ -351,6 +353,16 @@ class Gate:
         self._become(Phase.DONE, "nothing is sent any more")
 
     # -- telling ---------------------------------------------------------------------------
+
+    def _tell_left_out(self, tick: int, late_s: float) -> None:
+        """Say what is skipped where the loop came late; the way of a ramp goes on where it was."""
+        before, self._tick = self._tick, tick
+        left_out = 0 if before is None else tick - before - 1
+        if left_out > 0:
+            many = f"{left_out} control ticks were" if left_out > 1 else "a control tick was"
+            of_gait = f", {left_out / self._rate_hz:g} s of the gait" * (self.phase is Phase.RUN)
+            text = f"gate: {late_s:.3f} s late, {many} left out{of_gait}"
+            self._remark("warn", text)
 
     def _become(self, phase: Phase, detail: str = "") -> None:
         self.phase = phase

@@ -297,11 +297,12 @@ class Written:
         commands: ``/joint_commands``, a row a tick: (log time [s], joint to angle [rad]).
         said: ``/rosout``: (log time [s], level, text).
         sent: Raw command frames, in order: (identifier, data as hexadecimal).
+        sent_ns: When the sender had handed over each of them, on its own clock [ns].
         metadata: All records, by name.
     """
 
     def __init__(self, path):
-        self.commands, self.said, self.sent = [], [], []
+        self.commands, self.said, self.sent, self.sent_ns = [], [], [], []
         with path.open("rb") as stream:
             reader = make_reader(stream, decoder_factories=[DecoderFactory()])
             self.metadata = {one.name: one.metadata for one in reader.iter_metadata()}
@@ -314,11 +315,12 @@ class Written:
                     self.said.append((at_s, message.level, message.msg))
                 elif channel.topic == "/can/can0":
                     frames = np.frombuffer(bytes(message.data), FRAME)
+                    ours = frames[frames["dir"] != 0]
                     self.sent += [
                         (int(one["id_flags"]), one["data"][: one["dlc"]].tobytes().hex())
-                        for one in frames
-                        if one["dir"]
+                        for one in ours
                     ]
+                    self.sent_ns += ours["t_host_ns"].tolist()
 
     def time_of(self, words):
         """When the first event with these words was written [s]."""
@@ -334,8 +336,12 @@ class Written:
         return {name: np.array([row[name] for row in rows]) for name in names}
 
 
-def check_session(path, lines):
-    """The session is whole, and its commands are those on the bus; returns what is written."""
+def check_session(path, lines, *, max_rate=MAX_RATE, lockstep=False):
+    """The session is whole, and its commands are those on the bus; returns what is written.
+
+    No joint was told to be faster than it may, in true time as the sender's own clock has it: that
+    of a robot in lockstep is simulated.
+    """
     written = Written(path)
     heard = commands_of(lines)
     for name, (_, angle) in heard.items():
@@ -344,8 +350,30 @@ def check_session(path, lines):
         assert np.abs(given - angle).max(initial=0.0) <= STEP / 2 * (1 + 1e-6), name
     on_bus = [(one["id"], one["data"]) for one in lines if (one["name"] or "").endswith("_command")]
     assert written.sent == on_bus  # bit by bit, and so nothing came after the end
+    if not lockstep:
+        check_true_rates(written, lines, max_rate=max_rate)
     check_pace(np.array([at_s for at_s, _ in written.commands]))
     return written
+
+
+def check_true_rates(written, lines, *, max_rate=MAX_RATE):
+    """From each command of a joint to its next: no more than the rate allows in the time between.
+
+    What it was told is what the listener heard, when it was sent is what the sender wrote down;
+    returns the shortest time between two commands [s].
+    """
+    sent_ns = {}
+    names = [one["name"] for one in lines if (one["name"] or "").endswith("_command")]
+    for name, at_ns in zip(names, written.sent_ns, strict=True):
+        sent_ns.setdefault(name.removesuffix("_command"), []).append(at_ns)
+    shortest_s = math.inf
+    for name, (_, angle) in commands_of(lines).items():
+        apart_s = np.diff(sent_ns[name]) * 1e-9
+        step = np.abs(np.diff(angle))
+        beyond = step - max_rate * apart_s - STEP * (1 + 1e-6)
+        assert beyond.max(initial=0.0) <= 0.0, (name, beyond.max(), apart_s[np.argmax(beyond)])
+        shortest_s = min(shortest_s, apart_s.min(initial=math.inf))
+    return shortest_s
 
 
 def check_pace(times_s, late_s=0.02):

@@ -158,6 +158,34 @@ def test_a_process_that_comes_late_does_not_jump(small, session, tmp_path):
     stage["check_ramp_down"](written, "fault: ")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(
+    plain, small, session, tmp_path
+):
+    """It catches up at the greatest rate that the robot's file allows: in true time, too."""
+    path = tmp_path / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage:
+        if plain:  # frames are handed over one by one
+            on_stage.on += "&plain=yes"
+        with on_stage.replay(session, path) as controller:
+            on_stage.wait_for_commands(controller)
+            for _ in range(8):
+                controller.send_signal(signal.SIGSTOP)
+                time.sleep(0.3)
+                controller.send_signal(signal.SIGCONT)
+                time.sleep(0.4)
+            controller.send_signal(signal.SIGINT)
+            out, _, written = ended(on_stage, controller, path)
+    left_out = [text for _, _, text in written.said if " control ticks were left out" in text]
+    assert sum("s of the gait" in text for text in left_out) >= 4
+    assert any("command held back to 4 rad/s" in text for _, _, text in written.said)
+    told = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
+    skipped = [re.search(r"late, (\S+) control tick", text) for _, _, text in written.said]
+    counts = [1 if found[1] == "a" else int(found[1]) for found in skipped if found]
+    assert sum(counts) <= int(told[1]) >= 4 * 25
+
+
 # -- what is refused ----------------------------------------------------------------------------
 
 
@@ -354,7 +382,7 @@ def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
         lines = on_stage.lines
     assert controller.returncode in {0, 1}, (out, err)  # such steps can be too much for the servos
     stage["check_limits"](lines)
-    written = stage["check_session"](path, lines)
+    written = stage["check_session"](path, lines, lockstep=True)
     assert len(stage["commands_of"](lines)) == 25
     cuts = [text for _, _, text in written.said if "command held back to 4 rad/s" in text]
     assert cuts

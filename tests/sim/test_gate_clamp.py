@@ -18,6 +18,7 @@ from sim.gate.clamp import Clamp
 from sim.gate.ending import Ending
 from sim.gate.limits import gate_limits
 from sim.gate.ramp import Ramp
+from sim.gate.spacing import Spacing
 from sim.gate.status import JointStatus
 from sim.gate.yielding import Yielding
 
@@ -167,3 +168,41 @@ def test_limits_that_are_missing_are_named_with_an_example():
     )
     assert "\n[safety]\nmax_rate = 4.0" in text
     assert "min_voltage" not in text  # its bus doesn't tell voltages
+
+
+times = st.lists(st.floats(0.0, 0.05), min_size=2, max_size=30)
+
+
+@given(st.data(), times, st.integers(1, 4))
+def test_frames_that_wait_for_their_times_are_never_too_fast(data, apart_s, count):
+    """Whatever is wanted, however late a tick, wherever a burst is held up: a clock of our own."""
+    now_ns = 10**18
+    spacing = Spacing(LIMITS.rate, lambda: now_ns)
+    clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
+    before = None
+    for pause_s in apart_s:
+        now_ns += round(pause_s * 1e9)
+        command = clamp.apply(data.draw(arrays(np.float64, 25, elements=near))).command
+        sent_ns = []
+        for earliest_ns in spacing.earliest_ns(command, count).tolist():
+            assert earliest_ns - now_ns <= 10_000_001  # no wait is longer than a period
+            now_ns = max(now_ns, earliest_ns) + data.draw(st.integers(0, 3_000_000))
+            sent_ns.append(now_ns)
+        spacing.sent(command, np.array(sent_ns))
+        if before is not None:
+            for a_ns, b_ns in zip(before[1], sent_ns, strict=True):
+                way = np.abs(command - before[0])
+                assert (way <= 4.0 * (b_ns - a_ns) * 1e-9 + 1e-12).all()
+        before = command, sent_ns
+    assert spacing.longest_s <= PERIOD_S + 1e-9
+
+
+def test_what_is_slow_enough_does_not_wait():
+    now_ns = 10**18
+    spacing = Spacing(LIMITS.rate, lambda: now_ns)
+    for k in range(50):
+        command = np.full(25, 0.03 * (k % 2))  # 3 rad/s
+        assert (spacing.earliest_ns(command, 25) <= now_ns).all()
+        spacing.sent(command, np.full(25, now_ns))
+        now_ns += 8_000_000  # behind a late tick
+    assert (spacing.waits, spacing.longest_s) == (0, 0.0)
