@@ -20,6 +20,9 @@ from mcap.opcode import Opcode
 
 from ..arrays import IntArray
 
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a file."""
+
 PREFIX_SIZE = 9
 """Opcode (u8) and length (u64) before each record's body."""
 

@@ -17,8 +17,7 @@ from pathlib import Path
 import zstandard
 from mcap.opcode import Opcode
 
-from .chunk import PREFIX_SIZE, inflate, walk_records
-from .mcap_file import MAGIC
+from .chunk import MAGIC, PREFIX_SIZE, inflate, walk_records
 
 _CHUNK = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
 _PIECE = 1 << 24

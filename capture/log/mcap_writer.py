@@ -37,7 +37,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-MAGIC = b"\x89MCAP0\r\n"
+from .chunk import MAGIC
+
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
 

@@ -1,0 +1,131 @@
+"""The bytes of an MCAP file and the payloads of its blocks, decompressed and checked."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import weakref
+import zlib
+from collections import OrderedDict
+from pathlib import Path
+
+import zstandard
+
+from ..errors import LogError, NotALogError
+from .chunk import Block, Buffer, checks_itself, inflate, inflate_zstd_into, read_at
+
+_MAX_BLOCK_SIZE = 1 << 30
+_CACHE_SIZE = 64 << 20
+
+
+class McapPayloads:
+    """An MCAP file, memory-mapped; what lies in a block of it."""
+
+    def __init__(self, path: Path) -> None:
+        """Map a file.
+
+        Args:
+            path: The MCAP file.
+
+        Raises:
+            NotALogError: If it is empty.
+            LogError: If the operating system can't open it.
+        """
+        self.path = path
+        self.buffer, descriptor = _mapped(path)
+        self._close_descriptor = weakref.finalize(self, os.close, descriptor)
+        self._descriptor = descriptor
+        self._cache: OrderedDict[int, Buffer] = OrderedDict()
+
+    def close(self) -> None:
+        """Release the mapping."""
+        self._cache.clear()
+        self.buffer.close()
+        self._close_descriptor()
+
+    def forget(self) -> None:
+        """Let go of the file's pages and of what was decompressed; it is read again when needed."""
+        self._cache.clear()
+        if hasattr(mmap, "MADV_DONTNEED"):  # what is mapped counts as this process's memory
+            self.buffer.madvise(mmap.MADV_DONTNEED)
+
+    def payload(self, block: Block) -> tuple[Buffer, int]:
+        """See :meth:`BlockSource.payload`."""
+        if not block.compression:
+            return self.buffer, block.start
+        if block.start in self._cache:
+            self._cache.move_to_end(block.start)
+            return self._cache[block.start], 0
+        data = self._decompress(block)
+        self._cache[block.start] = data
+        while len(self._cache) > 1 and sum(map(len, self._cache.values())) > _CACHE_SIZE:
+            self._cache.popitem(last=False)
+        return data, 0
+
+    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
+        """See :meth:`BlockSource.payload_once`."""
+        if block.compression:
+            data = self._decompress(block)
+            return data, 0, len(data)
+        if block.crc and block.complete:
+            with memoryview(self.buffer) as whole, whole[block.start : block.stop] as payload:
+                if zlib.crc32(payload) != block.crc:
+                    where = f"the chunk at byte {block.start}"
+                    raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+        return self.buffer, block.start, block.stop
+
+    def inflates(self, block: Block, limit: int) -> bool:
+        """See :meth:`BlockSource.inflates`."""
+        return block.compression == "zstd" and block.complete and 0 < block.size <= limit
+
+    def inflate_into(self, block: Block, room: memoryview) -> None:
+        """See :meth:`BlockSource.inflate_into`.
+
+        A frame that has a checksum of its own is not held against the chunk's CRC as well: both
+        are 32 bits of the same bytes, and decompression has verified the one.
+        """
+        where = f"the chunk at byte {block.start}"
+        try:
+            with read_at(self._descriptor, block.start, block.stop) as raw:
+                size = inflate_zstd_into(raw, room)
+                checked = not block.crc or checks_itself(raw)
+        except zstandard.ZstdError as error:
+            raise LogError(self.path, f"{where} can't be decompressed: {error}") from error
+        except OSError as error:
+            raise LogError(self.path, f"{where} can't be read: {error.strerror}") from error
+        if size != block.size:
+            raise LogError(self.path, f"{where} has {size} bytes, not {block.size}")
+        if not checked and zlib.crc32(room) != block.crc:
+            raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+
+    def _decompress(self, block: Block) -> bytes:
+        where = f"the chunk at byte {block.start}"
+        if block.size > _MAX_BLOCK_SIZE:
+            raise LogError(self.path, f"{where} claims {block.size} bytes; at most 1 GiB is read")
+        raw = self.buffer[block.start : block.stop]
+        try:
+            data = inflate(block.compression, raw, block.size, whole=block.complete)
+        except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+            told = str(error) or "it claims more bytes than there is memory"
+            raise LogError(self.path, f"{where} can't be decompressed: {told}") from error
+        if not block.complete:
+            return data
+        if len(data) != block.size:
+            raise LogError(self.path, f"{where} has {len(data)} bytes, not {block.size}")
+        if block.crc and zlib.crc32(data) != block.crc:
+            raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+        return data
+
+
+def _mapped(path: Path) -> tuple[mmap.mmap, int]:
+    """The file in memory, and a descriptor of it."""
+    try:
+        with path.open("rb") as stream:
+            if not stream.read(1):
+                raise NotALogError(path, "the file is empty (0 bytes)")
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            return data, os.dup(stream.fileno())
+    except FileNotFoundError as error:
+        raise LogError(path, "no such file") from error
+    except OSError as error:
+        raise LogError(path, f"can't be opened: {error.strerror}") from error
