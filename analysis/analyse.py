@@ -140,11 +140,12 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         warn,
         reference_topic=options.reference_topic,
     )
+    session.forget()  # what each step has looked at need not stay in memory beside the next one's
     artefacts = find_artefacts(session, columns)
     stretch = choose_stretch(session, columns, options, warn)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     commands = _series(columns.names, columns.command, stretch, origin_ns)
-    session.forget()  # what each step has looked at need not stay in memory beside the next one's
+    session.forget()
     responses = _series(columns.names, columns.position, stretch, origin_ns)
     _warn_dropped(commands, responses, warn)
     session.forget()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -144,34 +145,40 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     from analysis.stretch import Options
     from capture import Session
 
-    from .blueprint import build_blueprint
     from .results import computed, saved
-    from .rrd import write_recording
     from .samples.renamed import COMMANDS, STATES, RenamedSession
 
     command = single.command_topic or COMMANDS
     response = single.response_topic or STATES
     options = Options(command_topic=command, response_topic=response)
     folder = output.parent  # on a disk, so that an hour's columns need not be in memory
-    with Session.open(file, column_folder=folder) as session, progress("view", total=2) as bar:
+    with ExitStack() as stack:
+        session = stack.enter_context(Session.open(file, column_folder=folder))
+        bar = stack.enter_context(progress("view", total=2))
         bar.update(0, note="results" if single.result else "analysis")
         if single.result:
             layer = saved(session, single.result, options)
         else:
             layer = computed(session, options)
+        session.forget()
         bar.update(1, note="recording")
-        with RenamedSession.with_joints(
-            file, command_topic=command, response_topic=response
-        ) as shown:
-            recording = write_recording(
-                shown,
-                output,
-                analysis=layer.analysis,
-                steady=layer.steady,
-                named=layer.named,
-                notes=layer.notes,
-                layout=partial(build_blueprint, front=single.tab or "session"),
-            )
+        from .blueprint import build_blueprint
+        from .rrd import write_recording  # Rerun takes memory that the analysis can use before
+
+        shown = session
+        if (command, response) != (COMMANDS, STATES):
+            names = {"command_topic": command, "response_topic": response}
+            renamed = RenamedSession.with_joints(file, **names, column_folder=folder)
+            shown = stack.enter_context(renamed)
+        recording = write_recording(
+            shown,
+            output,
+            analysis=layer.analysis,
+            steady=layer.steady,
+            named=layer.named,
+            notes=layer.notes,
+            layout=partial(build_blueprint, front=single.tab or "session"),
+        )
         return recording, session.duration_s
 
 

@@ -30,10 +30,10 @@ from .blueprint import build_blueprint
 from .content import Content, Signal, Start, signal_title
 from .cycles.heat_maps import heat_maps, log_maps
 from .cycles.mean_cycle import (
-    Channels,
     Look,
     averaged_ns,
     log_mean_cycle,
+    read_channels,
 )
 from .cycles.steps import cycle_tables, log_cycles
 from .layer import Layer, Named
@@ -41,7 +41,6 @@ from .plots import gait, joints, power
 from .plots.other_topics import log_others, log_words
 from .plots.response import charts, log_charts, log_current
 from .plots.write import Plots
-from .samples.quantities import DRAWN, quantities
 from .samples.stretches import stretches
 from .samples.survey import GAIT, Survey, survey
 from .samples.timeline import Clock
@@ -199,6 +198,7 @@ def _log(
     head, scene = _open_scene(rec, clock, sources, places, palette)
     if scene is not None:
         scene.named = named
+    session.forget()
     limit = None if head is None else sources.found.power_limit_w
     for stretch in stretches(session, sources.found.wanted, sources.found.context_ns):
         plots.write(stretch)
@@ -238,26 +238,12 @@ def _log(
         mean=log_mean_cycle(
             rec,
             clock,
-            _channels(sources, averaged_ns(clock, analysis)),
+            read_channels(session, sources.found.wanted, averaged_ns(clock, analysis)),
             Look(robot, places, palette, limit),
             analysis=analysis,
             warnings=sources.warnings,
         ),
     )
-
-
-def _channels(sources: _Sources, part_ns: tuple[int, int]) -> Channels:
-    """What the mean cycle is taken of."""
-    tracks = quantities(
-        read_columns(
-            sources.session,
-            {topic: fields for topic, fields in sources.found.wanted.items() if topic in DRAWN},
-            start_ns=part_ns[0],
-            stop_ns=part_ns[1],
-        )
-    )
-    kinds = (joints.MEASURED, joints.COMMANDED, power.MECHANICAL)
-    return Channels(*(tracks.get(kind, ()) for kind in kinds))
 
 
 def _open_scene(

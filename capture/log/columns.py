@@ -110,8 +110,8 @@ def read_messages(
             _expected(log_file, request, len(blocks)),
             _EXPANSION * stored,
             shared,
-            stamping,
-            log_file.pages,
+            stamping=stamping,
+            pages=log_file.pages,
         )
         for request in requests
     ]
@@ -180,6 +180,7 @@ class _GroupReader:
         expected: int,
         reserve: int,
         shared: list[TimeStore],
+        *,
         stamping: Stamping,
         pages: FilePages | None,
     ) -> None:
@@ -250,7 +251,7 @@ class _GroupReader:
                 group = self._group(layout, self._capacity(length, int(fits.sum())))
                 known.append(group)
             else:
-                group = Group(layout, self._paths, 1, (), self._stamping, self._pages)
+                group = self._new_group(layout, 1)
             self.groups.append(group)
             group.take(places.take(fits), log_ns[fits], order[fits])
             rest = ~fits
@@ -270,12 +271,18 @@ class _GroupReader:
     def _group(self, layout: Layout, capacity: int) -> Group:
         """A group; the first of a topic may have the times of another topic's first."""
         if self.groups:
-            return Group(layout, self._paths, capacity, (), self._stamping, self._pages)
-        shared = tuple(self._shared)
-        group = Group(layout, self._paths, capacity, shared, self._stamping, self._pages)
+            return self._new_group(layout, capacity)
+        group = self._new_group(layout, capacity, tuple(self._shared))
         if len(self._shared) < _MAX_SHARED:
             self._shared.append(group.kept_times)
         return group
+
+    def _new_group(
+        self, layout: Layout, capacity: int, others: tuple[TimeStore, ...] = ()
+    ) -> Group:
+        return Group(
+            layout, self._paths, capacity, others, stamping=self._stamping, pages=self._pages
+        )
 
     def _capacity(self, length: int, seen: int) -> int:
         """Room for a group: all that is expected for the first, and what a file of its size has."""

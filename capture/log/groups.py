@@ -83,6 +83,7 @@ class Group:
         paths: frozenset[str] | None,
         capacity: int,
         others: Sequence[TimeStore] = (),
+        *,
         stamping: Stamping | None = None,
         pages: FilePages | None = None,
     ) -> None:

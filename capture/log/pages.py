@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
 import sys
@@ -10,6 +11,9 @@ import weakref
 from pathlib import Path
 
 import numpy as np
+
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+"""glibc's (malloc_trim(3)); other allocators have none."""
 
 
 def new_pages(size: int) -> mmap.mmap:
@@ -87,6 +91,11 @@ class FilePages:
         return found
 
     def release(self) -> None:
-        """Let go of the pages; what they hold is read again when it is looked at."""
-        for each in self._held:
+        """Let go of the pages, and of memory that was freed but kept.
+
+        What the pages hold is read again when it is looked at.
+        """
+        for each in list(self._held):
             each.madvise(mmap.MADV_DONTNEED)
+        if _TRIM is not None:
+            _TRIM(0)

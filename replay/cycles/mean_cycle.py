@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rerun.components import FillMode
 
 from analysis.results.analysis import Analysis
+from capture import Session
 from capture.arrays import FloatArray
 from capture.palette import joint_colors
 from capture.robot import Robot
@@ -26,8 +27,9 @@ from ..plots.joints import (
     Places,
     Series,
 )
+from ..plots.power import mechanical_power
 from ..samples.timeline import ENSEMBLE_CYCLE, Clock
-from ..samples.tracks import Track
+from ..samples.tracks import Track, read_columns
 from ..scene.body import capsule_columns, capsule_poses, segment_power
 from ..scene.colors import power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
@@ -39,6 +41,8 @@ ABOUT = f"{ENSEMBLE}/about"
 
 MOST_S = 600.0
 """The mean cycle is taken of so much at most [s], so that an hour needs no more memory."""
+
+_TOPICS = ("/joint_states", "/joint_commands")
 
 _WHITE = (255, 255, 255, 255)
 _FAINT = 110
@@ -111,6 +115,31 @@ def averaged_ns(clock: Clock, analysis: Analysis | None) -> tuple[int, int]:
     windows = () if analysis is None else analysis.gait.windows
     start_ns = clock.start_ns + round(windows[0].start_s * 1e9) if windows else clock.start_ns
     return start_ns, start_ns + round(MOST_S * 1e9)
+
+
+def read_channels(
+    session: Session, wanted: Mapping[str, Sequence[str]], part_ns: tuple[int, int]
+) -> Channels:
+    """Read what is averaged.
+
+    Args:
+        session: The session.
+        wanted: JointState topic to the fields that come.
+        part_ns: Start and end of the part that is averaged [Unix ns].
+
+    Returns:
+        The channels; none of a kind that the session doesn't have.
+    """
+    start_ns, stop_ns = part_ns
+    drawn = {topic: fields for topic, fields in wanted.items() if topic in _TOPICS}
+    columns = read_columns(session, drawn, start_ns=start_ns, stop_ns=stop_ns)
+    channels = Channels(
+        columns.get(("/joint_states", "position"), ()),
+        columns.get(("/joint_commands", "position"), ()),
+        mechanical_power(columns),
+    )
+    session.forget()
+    return channels
 
 
 def log_mean_cycle(

@@ -26,13 +26,21 @@ class RenamedSession(Session):
     _names: Mapping[str, str] = MappingProxyType({})
 
     @classmethod
-    def with_joints(cls, path: Path, *, command_topic: str, response_topic: str) -> Self:
+    def with_joints(
+        cls,
+        path: Path,
+        *,
+        command_topic: str,
+        response_topic: str,
+        column_folder: Path | None = None,
+    ) -> Self:
         """Open a bag and say where its joints are.
 
         Args:
             path: The file.
             command_topic: JointState topic of the commands; ``/joint_commands`` may be missing.
             response_topic: JointState topic of the responses; ``/joint_states`` may be missing.
+            column_folder: Where large columns lie in files, as for :class:`capture.Session`.
 
         Returns:
             The session.
@@ -41,7 +49,7 @@ class RenamedSession(Session):
             LogError: If it can't be opened.
             MissingChannelError: If it has no topic of a name that was given.
         """
-        session = cls(path)
+        session = cls(path, column_folder=column_folder)
         logged = session.channels
         names = {COMMANDS: command_topic, STATES: response_topic}
         for usual, topic in names.items():

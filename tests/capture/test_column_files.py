@@ -1,0 +1,82 @@
+"""Columns in files: the same numbers, in memory only while they are looked at, and nothing left."""
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture import Session, SessionWriter
+
+EPOCH_NS = 1_700_000_000_000_000_000
+NAMES = [f"joint{k:02d}" for k in range(1, 26)]
+TICKS = 24_000
+COLUMN_BYTES = TICKS * len(NAMES) * 8
+WANTED = {"/joint_states": ["position", "velocity", "effort"]}
+
+
+@pytest.fixture(scope="module")
+def values():
+    return np.random.default_rng(3).normal(size=(TICKS, len(NAMES)))
+
+
+@pytest.fixture(scope="module")
+def session_path(tmp_path_factory, values):
+    path = tmp_path_factory.mktemp("columns") / "s.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
+        for tick, row in enumerate(values):
+            states.write(EPOCH_NS + tick * 10_000_000, row, -row, 2 * row)
+    return path
+
+
+def resident():
+    """What of this process is in memory [byte]."""
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    (line,) = (one for one in lines if one.startswith("VmRSS:"))
+    return int(line.split()[1]) << 10
+
+
+def assert_true(found, values):
+    for field, factor in zip(WANTED["/joint_states"], (1, -1, 2), strict=True):
+        signals = found["/joint_states", field]
+        assert signals.names == tuple(NAMES)
+        assert np.array_equal(np.transpose(signals.values), factor * values)
+
+
+def test_columns_in_files_leave_memory_and_come_back(session_path, values, tmp_path):
+    with Session.open(session_path, column_folder=tmp_path) as session:
+        found = session.joint_columns(WANTED)
+        assert list(tmp_path.iterdir()) == []  # the files have no names
+        assert_true(found, values)
+        before = resident()
+        session.forget()
+        assert before - resident() > 0.8 * 3 * COLUMN_BYTES
+    assert_true(found, values)  # a closed session's columns stay, too
+
+
+def test_columns_in_memory_stay(session_path, values):
+    with Session.open(session_path) as session:
+        found = session.joint_columns(WANTED)
+        session.forget()
+    assert_true(found, values)
+
+
+def test_without_room_on_the_disk_columns_lie_in_memory(session_path, values, tmp_path):
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(tmp_path)]
+    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    if mounted.returncode != 0:
+        pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
+    try:
+        with Session.open(session_path, column_folder=tmp_path) as session:
+            assert_true(session.joint_columns(WANTED), values)
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
+
+
+def test_columns_in_files_can_be_written_to(session_path, tmp_path):
+    with Session.open(session_path, column_folder=tmp_path) as session:
+        column = session.joint_columns(WANTED)["/joint_states", "effort"].values[0]
+        again = session.joint_columns(WANTED)["/joint_states", "effort"].values[0]
+    column[:] = 0.0  # own_times does so
+    assert again.any()
