@@ -1,7 +1,6 @@
-"""Experiments for the page: a linear chain without physics, run both ways, and kicked."""
+"""Experiments with a linear chain without physics: run both ways, kicked, swept."""
 
 import numpy as np
-import pytest
 
 from analysis import analyse_experiment
 from capture import Session, SessionWriter
@@ -42,10 +41,8 @@ def analysed(paths):
     return analyse_experiment(opened())
 
 
-@pytest.fixture(scope="session")
-def both_ways_files(tmp_path_factory):
-    """Six runs each way, in turn."""
-    folder = tmp_path_factory.mktemp("ways")
+def both_ways(folder):
+    """Six runs each way, in turn; the second joint is weak."""
     paths = []
     for k in range(6):
         for way, name in ((1, "forward"), (-1, "reverse")):
@@ -55,21 +52,13 @@ def both_ways_files(tmp_path_factory):
     return paths
 
 
-@pytest.fixture(scope="session")
-def both_ways(both_ways_files):
-    """A wave and its reverse; the second joint is weak."""
-    return analysed(both_ways_files)
-
-
-@pytest.fixture(scope="session")
-def kicked(tmp_path_factory):
+def kicked(folder):
     """Every joint's command kicked in phase and amplitude, and a pattern held out."""
-    folder = tmp_path_factory.mktemp("kicks")
     off = [np.zeros(M, dtype=complex)]
     for step in (0.05j, -0.05j, 0.05, -0.05):
         off += [np.where(joint == PLACE, step, 0) for joint in range(M)]
     off.append(1j * np.array([0.1, -0.12, 0.05, 0.08, -0.11]))
-    return analysed(
+    return [
         write_run(
             folder / f"run{k:02d}.mcap",
             WAVE * np.exp(one),
@@ -78,14 +67,12 @@ def kicked(tmp_path_factory):
             0.002,
         )
         for k, one in enumerate(off)
-    )
+    ]
 
 
-@pytest.fixture(scope="session")
-def swept(tmp_path_factory):
+def swept(folder):
     """A lag sweep: the commands of the runs are the columns of a DFT."""
-    folder = tmp_path_factory.mktemp("sweep")
     dft = 0.02 * np.exp(2j * np.pi * np.outer(PLACE, PLACE) / M)
-    return analysed(
+    return [
         write_run(folder / f"run{k}.mcap", dft[:, k], CHAIN @ dft[:, k], k, 1e-5) for k in PLACE
-    )
+    ]

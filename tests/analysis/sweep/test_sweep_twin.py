@@ -16,7 +16,7 @@ from sim.drive.driven import find_driven
 from sim.physics.engine import Kernels
 from sim.record import Driver, record
 
-shared = runpy.run_path(str(Path(__file__).with_name("twin_chains.py")))
+shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 
 SIGMA, AMPLITUDE = 2e-4, 0.02
 """Noise of the encoders, and of each command's first tone [rad]."""

@@ -17,7 +17,7 @@ from capture.errors import UsageError
 
 
 def load_tables():
-    path = Path(__file__).parents[2] / "docs" / "heterogeneity_tables.py"
+    path = Path(__file__).parents[3] / "docs" / "heterogeneity_tables.py"
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -8,7 +8,7 @@ import pytest
 
 
 def load_tables():
-    path = Path(__file__).parents[2] / "docs" / "estimator_tables.py"
+    path = Path(__file__).parents[3] / "docs" / "estimator_tables.py"
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -14,7 +14,7 @@ from sim.record import record
 
 pytestmark = pytest.mark.slow
 
-shared = runpy.run_path(str(Path(__file__).with_name("twin_chains.py")))
+shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 
 ROBOT = shared["chain"](7, stall_torque=0.25)
 """Four yaw joints in two mirror pairs."""

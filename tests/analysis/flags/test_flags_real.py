@@ -10,7 +10,7 @@ from analysis.analyse import analyse_session
 from analysis.stretch import Options
 from capture import Session, SessionWriter
 
-ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"
+ARCSNAKE = Path(__file__).parents[3].parent / "shared" / "data" / "arcsnake"
 EPOCH_NS = 1_735_689_600_000_000_000
 GEAR = 22
 RUNS = [

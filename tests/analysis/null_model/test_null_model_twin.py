@@ -8,7 +8,7 @@ import pytest
 
 import undulog
 
-shared = runpy.run_path(str(Path(__file__).with_name("twin_chains.py")))
+shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 
 WEAK = {"servo_of": {"joint05": {"stall_torque": 0.2}}}
 

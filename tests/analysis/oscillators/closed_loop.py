@@ -21,7 +21,7 @@ from sim import GaitTick, load_scenario
 from sim.physics.engine import Kernels
 from sim.record import Driver, record
 
-shared = runpy.run_path(str(Path(__file__).with_name("twin_chains.py")))
+shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 
 AMPLITUDE, FREQUENCY_HZ, LAG = 0.4, 0.5, math.pi / 3
 OMEGA = 2.0 * math.pi * FREQUENCY_HZ

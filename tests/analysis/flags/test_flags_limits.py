@@ -13,7 +13,7 @@ from sim.record import record
 
 here = Path(__file__).parent
 planted = runpy.run_path(str(here / "planted.py"))
-chains = runpy.run_path(str(here / "twin_chains.py"))
+chains = runpy.run_path(str(here.parent / "twin_chains.py"))
 
 STALL = 1.5
 """Of the planted sessions' servos [N m]."""

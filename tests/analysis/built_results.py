@@ -1,0 +1,172 @@
+"""Results built by hand: a snake with weak servos, one joint, and a session without a gait."""
+
+import math
+
+from analysis.results.analysis import (
+    Analysis,
+    BodyPoint,
+    BodyResult,
+    Coupling,
+    Estimate,
+    GaitFacts,
+    Index,
+    JointResult,
+    Provenance,
+    SessionFacts,
+    Window,
+)
+
+
+def around(value, half):
+    return Estimate(value, (value - half, value + half))
+
+
+def driven_joint(name, place, plane="horizontal", flags=()):
+    """``place`` runs from 0 at the head to 1 at the tail; late and weak in the middle."""
+    inside = math.sin(math.pi * place)
+    lag = math.radians(7.46 + 6.2 * inside)
+    net = -0.016 + 0.424 * inside
+    return JointResult(
+        name=name,
+        plane=plane,
+        command_amplitude_rad=0.4,
+        gain=around(1.07 - 0.14 * inside + 0.01 * math.cos(9 * place), 0.0042),
+        lag_rad=around(lag, math.radians(0.21)),
+        energy_net_j=net,
+        energy_plus_j=max(net, 0) + 0.05,
+        energy_abs_j=abs(net) + 0.11,
+        energy_el_j=net * 1.9 + 0.2,
+        energy_el_clipped_j=max(net, 0) * 2.1 + 0.25,
+        coverage=0.998,
+        samples=800,
+        flags=tuple(flags),
+    )
+
+
+def passive_joint(name, plane="vertical"):
+    return JointResult(
+        name=name,
+        plane=plane,
+        command_amplitude_rad=None,
+        gain=Estimate(),
+        lag_rad=Estimate(),
+        energy_net_j=0.0021,
+        energy_plus_j=0.004,
+        energy_abs_j=0.0059,
+        energy_el_j=None,
+        energy_el_clipped_j=None,
+        coverage=1.0,
+        samples=800,
+    )
+
+
+def provenance(path):
+    return Provenance(
+        command=f"undulog analyse {path}",
+        versions={"undulog": "0.1.0", "numpy": "2.4.6"},
+        inputs={path: "9f" * 32},
+        options={"harmonics": 1, "settle_s": None},
+    )
+
+
+def point(place, link, mm, deg):
+    return BodyPoint(place, link, around(mm * 1e-3, 0.6e-3), around(math.radians(deg), 0.03))
+
+
+def exact(place, link, mm, deg):
+    return BodyPoint(place, link, Estimate(mm * 1e-3), Estimate(math.radians(deg)))
+
+
+def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
+    name = rename or (lambda text: text)
+    joints = []
+    for i in range(25):
+        label = name(f"joint{i + 1:02d}")
+        if i % 2 == 0:
+            joints.append(driven_joint(label, i / 24, flags=("saturated",) if i == 12 else ()))
+        else:
+            joints.append(passive_joint(label))
+    body = BodyResult(
+        plane="horizontal",
+        observed=(
+            point("head", name("link01"), 52, 0),
+            point("middle", name("link13"), 35, -128),
+            point("tail", name("link26"), 30, 97),
+        ),
+        null={
+            "viscous": (
+                exact("head", name("link01"), 55, 0),
+                exact("middle", name("link13"), 41, -117),
+                exact("tail", name("link26"), 38, 110),
+            ),
+        },
+    )
+    indices = {
+        "gain_cv": Index(0.0412, (0.0387, 0.0440), 0.0004, "1", "coefficient of variation of gain"),
+        "lag_sd": Index(0.0371, (0.0352, 0.0391), 1e-7, "rad", "circular sd of lag"),
+        "boundary_contrast_lag": Index(
+            -0.1082, (-0.1134, -0.1030), None, "rad", "lag, ends minus middle"
+        ),
+        "energy_gini": Index(0.44, None, None, "1", "Gini coefficient of E_abs"),
+    }
+    return Analysis(
+        session=SessionFacts(
+            id=name(session_id),
+            path=path,
+            robot=name("snake25"),
+            start_ns=1_767_225_600_000_000_000,
+            duration_s=16.0,
+            verdict="good",
+        ),
+        gait=GaitFacts(
+            frequency_hz=around(0.5, 0.0002),
+            windows=(Window(8.0, 16.0, 4.0),),
+            wave="head-to-tail",
+            lag_per_joint_rad={"horizontal": math.pi / 3},
+        ),
+        joints=tuple(joints),
+        body=body,
+        heterogeneity=indices,
+        coupling=Coupling(
+            identifiable=False,
+            why="one gait gives 13 numbers for 169 unknowns",
+            record="kicks of the phase and amplitude of one joint at a time: "
+            "undulog plan phase-kicks -o DIR",
+        ),
+        warnings=(
+            "Boundary and modules can't be told apart by one direction; record the reverse.",
+            name("E_el of joint02 is null: the session has no /joint_current of it."),
+        ),
+        provenance=provenance(path),
+    )
+
+
+def make_still():
+    nothing = Estimate()
+    joints = tuple(
+        JointResult(f"j{i}", None, None, nothing, nothing, None, None, None, None, None, 0.0, 0)
+        for i in range(4)
+    )
+    return Analysis(
+        session=SessionFacts("ramp", "ramp.mcap", None, 1_767_225_600_000_000_000, 3.0, None),
+        gait=GaitFacts(nothing),
+        joints=joints,
+        body=None,
+        heterogeneity={"gain_cv": Index(None, None, None, "1", "coefficient of variation of gain")},
+        coupling=Coupling(False, "no gait was found", "a periodic gait of at least 5 cycles"),
+        warnings=("No gait: the commands are a ramp, no line stands out of their spectrum.",),
+        provenance=provenance("ramp.mcap"),
+    )
+
+
+def make_single():
+    return Analysis(
+        session=SessionFacts("bench", "servo.mcap", "bench1", 0, 21.0, "degraded"),
+        gait=GaitFacts(around(1.25, 0.001), (Window(1.0, 21.0, 25.0),)),
+        joints=(driven_joint("servo", 0.5, plane=None),),
+        body=None,
+        heterogeneity={},
+        coupling=Coupling(False, "one joint has nobody to be coupled to"),
+        warnings=(),
+        provenance=provenance("servo.mcap"),
+    )
