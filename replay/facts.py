@@ -28,6 +28,7 @@ def markdown(
     content: Content,
     named: Sequence[Named] = (),
     has_cycles: bool,
+    awaited: bool = False,
 ) -> str:
     """What a reader needs beside the picture.
 
@@ -39,6 +40,7 @@ def markdown(
         content: What the recording holds.
         named: Modules that tests name.
         has_cycles: Whether there is a timeline of gait cycles.
+        awaited: Whether its analysis is still to come.
 
     Returns:
         Markdown.
@@ -52,8 +54,7 @@ def markdown(
         *_health(session.metadata),
         *_versions(session.metadata),
     )
-    told_first = "Not analysed." if analysis is None else answer(analysis).sentence
-    parts = [f"**{told_first}**"]
+    parts = [f"**{_told_first(analysis, awaited=awaited)}**"]
     if named:
         told = ", ".join(f"{one.joint} ({one.why})" for one in named)
         parts.append(f"**Named, pink in the pictures:** {told}")
@@ -65,6 +66,12 @@ def markdown(
     if legend:
         parts.append(legend)
     return "\n\n".join(parts) + "\n"
+
+
+def _told_first(analysis: Analysis | None, *, awaited: bool) -> str:
+    if analysis is not None:
+        return answer(analysis).sentence
+    return "Being analysed: the answer comes in a moment." if awaited else "Not analysed."
 
 
 def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:

@@ -15,9 +15,10 @@ from capture import Session
 from capture.errors import UndulogError, UsageError
 from capture.robot import Robot
 
+from ..drawing import palette_of
 from ..plots.gait import rhythm_of
 from ..plots.joints import Color
-from ..rrd import Recording, palette_of, write_recording
+from ..rrd import Recording, write_recording
 from ..samples.timeline import Rhythm
 from ..samples.tracks import Track, read_columns, wanted_fields
 from ..scene.motion import HeadPath, read_head

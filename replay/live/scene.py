@@ -23,9 +23,9 @@ from ..content import (
     Start,
     signal_title,
 )
+from ..drawing import palette_of, start_of
 from ..facts import log_facts
 from ..plots import gait, joints, power
-from ..rrd import palette_of, start_of
 from ..samples.quantities import DRAWN, SIGNALS
 from ..samples.sampling import hold
 from ..samples.timeline import Clock

@@ -12,11 +12,12 @@ from capture.robot import Robot
 
 from ..plots.joints import Color, Places
 from ..plots.power import mechanical_power
-from ..samples.stretches import Stretch
+from ..samples.stretches import Span, Stretch
 from ..samples.timeline import Clock
-from . import body, markers, marks, ranges, trail
+from . import body, markers, marks, ranges
 from .motion import HeadPath, assemble, frames_of
 from .surroundings import log_surroundings, world_of
+from .trail import log_trail
 
 
 class Scene:
@@ -34,6 +35,7 @@ class Scene:
         palette: Mapping[str, Color],
         limit_w: float | None,
         warnings: list[str],
+        trail: Span,
     ) -> None:
         """Write what doesn't move, and the head's trail.
 
@@ -47,6 +49,7 @@ class Scene:
             palette: Colour by joint name.
             limit_w: Power at which a segment's colour is full [W]; None where none is known.
             warnings: Grows by a sentence where the surroundings can't be drawn.
+            trail: The part of the trail that is drawn.
         """
         self._rec, self._clock, self._robot = rec, clock, robot
         self._places, self._palette, self._limit_w = places, palette, limit_w
@@ -61,7 +64,7 @@ class Scene:
         if world is not None:
             log_surroundings(rec, world)
         if head.tracked:
-            trail.log_trail(rec, clock, head)
+            log_trail(rec, clock, head, trail)
 
     def write(self, stretch: Stretch) -> None:
         """Draw a stretch.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from capture.arrays import FloatArray, IntArray
 
 from ..samples.sampling import decimate, gaps
+from ..samples.stretches import Span
 from ..samples.timeline import Clock
 from .motion import HeadPath
 
@@ -17,6 +18,7 @@ TRAIL_RATE_HZ = 10.0
 TRAIL_SECONDS = 20.0
 
 _COLOR = (104, 108, 128, 255)
+_WHOLE = Span()
 
 
 def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDArray[np.float32]]:
@@ -35,16 +37,19 @@ def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDAr
     return t_ns[1:][whole], pieces[whole]
 
 
-def log_trail(rec: rr.RecordingStream, clock: Clock, head: HeadPath) -> None:
+def log_trail(rec: rr.RecordingStream, clock: Clock, head: HeadPath, span: Span = _WHOLE) -> None:
     """Draw the head's path; the view shows its last 20 s.
 
     Args:
         rec: The recording.
         clock: Its timelines.
         head: The head's path.
+        span: The part that is drawn.
     """
     chosen = decimate(head.t_ns, TRAIL_RATE_HZ)
     t_ns, pieces = trail_segments(head.t_ns[chosen], head.position[chosen])
+    part = span.rows(t_ns)
+    t_ns, pieces = t_ns[part], pieces[part]
     look = rr.LineStrips3D.from_fields(colors=_COLOR, radii=rr.Radius.ui_points(1.0))
     rec.log(TRAIL, look, static=True)
     for rows, times in clock.rows(t_ns):
