@@ -163,5 +163,6 @@ def convert(session: Session, path: Path) -> tuple[Recording, Seen | None]:
         seen = see(session, Options(), notes.append)
     except UndulogError as error:  # a session without a gait can be seen too
         notes.append(f"not analysed: {error}")
+    session.forget()
     analysis = None if seen is None else seen.analysis
     return write_recording(session, path, analysis=analysis, notes=notes), seen

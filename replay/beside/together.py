@@ -58,7 +58,8 @@ def bring_together(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-beside-")))
         pairs: list[tuple[Session, str]] = []
         for file, name in zip(files, called, strict=True):
-            pairs.append((stack.enter_context(Session.open(file)), name))
+            session = Session.open(file, column_folder=folder)
+            pairs.append((stack.enter_context(session), name))
         step("angles")
         # Aligned before the long part, since that may refuse.
         aligned = align([read_side(session, name) for session, name in pairs], how)
