@@ -65,6 +65,7 @@ class FilePages:
         """
         self._folder = folder
         self._held: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+        self._used = False
 
     def new(self, size: int) -> mmap.mmap:
         """Memory in a file of its own; where there is no room for one, memory as it usually is.
@@ -88,6 +89,7 @@ class FilePages:
         except OSError:
             return new_pages(size)
         self._held.add(found)
+        self._used = True
         return found
 
     def release(self) -> None:
@@ -95,7 +97,9 @@ class FilePages:
 
         What the pages hold is read again when it is looked at.
         """
-        for each in list(self._held):
+        held = list(self._held)
+        for each in held:
             each.madvise(mmap.MADV_DONTNEED)
-        if _TRIM is not None:
+        if self._used and _TRIM is not None:
             _TRIM(0)
+        self._used = bool(held)  # once more when all are gone: it takes milliseconds
