@@ -48,6 +48,7 @@ class DurableSink:
         flush_interval_s: float = 10.0,
         sync_interval_s: float = 1.0,
         ballast: int = 8 << 20,
+        last_words: int = 0,
     ) -> None:
         """Create the first part and the write-ahead log.
 
@@ -63,6 +64,9 @@ class DurableSink:
                 write-ahead log has everything.
             sync_interval_s: What power loss costs at most, about [s].
             ballast: Bytes kept in reserve for finalising on a full disk.
+            last_words: Bytes of messages that are accepted even when the ballast had to go, for
+                what has yet to be brought to a safe end; well below the ballast. The caller
+                looks at :attr:`shortage`.
 
         Raises:
             OutputExistsError: If a file or a write-ahead log is there and ``force`` is not given.
@@ -71,7 +75,7 @@ class DurableSink:
             DataError: If a size or time makes no sense.
         """
         limits = [value for value in (split_size, split_ns) if value is not None]
-        if min(limits, default=1) < 1 or not flush_interval_s > 0 or ballast < 0:
+        if min(limits, default=1) < 1 or not flush_interval_s > 0 or min(ballast, last_words) < 0:
             raise DataError("sizes and times of a recording are positive")
         self.path = Path(path)
         self._force = force
@@ -83,6 +87,7 @@ class DurableSink:
         self._mark = 0  # messages that the part had one half of the interval ago
         self._known: list[Description] = []
         self._messages: int = 0
+        self._last_words = last_words
         self._refused: LogWriteError | None = None
         self._part_began: int = 0
         self._split_trouble: UndulogError | None = None
@@ -185,7 +190,7 @@ class DurableSink:
             DataError: If a number is out of range.
         """
         if self._disk.trouble is not None or self._refused is not None or not self._open:
-            self._refuse()
+            self._refuse(len(payload))
         if log_time_ns >= self._split_at_ns:
             self._split_by_time(log_time_ns)
         try:
@@ -338,8 +343,12 @@ class DurableSink:
         if not self._open:
             raise LogWriteError(self.path, "the session is closed")
 
-    def _refuse(self) -> None:
+    def _refuse(self, size: int) -> None:
+        """Refuse a message, unless its bytes are among the last words."""
         self._refuse_closed()
+        if self._disk.failure is None and self._refused is None and size <= self._last_words:
+            self._last_words -= size
+            return
         trouble = self._disk.trouble or self._refused
         if trouble is not None:
             raise type(trouble)(trouble.path, _reason(trouble))

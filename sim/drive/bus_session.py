@@ -11,7 +11,9 @@ import numpy as np
 from capture.daemon.bus_recorder import BusRecorder
 from capture.daemon.source_clock import SourceClock
 from capture.log.channels import StringChannel
+from capture.log.durable_sink import DurableSink
 from capture.log.frames import FrameArray
+from capture.log.wal_segment import require_space
 from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain, Robot
 
@@ -23,10 +25,14 @@ from .loop import BusTick
 
 _EVENTS_OF = "drive"
 _DECODE_TICKS = 10  # many frames at once cost little more than a few
+_ROOM = 48 << 20
+"""So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute."""
+_LAST_WORDS = 4 << 20
+"""So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints."""
 
 
 class BusSession:
-    """Writes one drive.
+    """Writes one drive; what was written survives the death of the process, and a full disk.
 
     ``/joint_commands`` holds what was sent, before the bus rounds it, at the tick's own time;
     ``/gate/wanted`` what was to be sent, before the gate changed anything; ``/gate/phase`` what the
@@ -65,10 +71,13 @@ class BusSession:
             force: Replace an existing file.
 
         Raises:
-            OutputExistsError: If the file is there and ``force`` is not given.
-            LogWriteError: If it can't be created.
+            OutputExistsError: If the file is there and ``force`` is not given, or what a drive
+                that was killed left of it.
+            LogWriteError: If it can't be created, or there is no room for it.
             DataError: If the robot has no bus.
         """
+        require_space(path, _ROOM)
+        self._sink = DurableSink(path, force=force, last_words=_LAST_WORDS)
         self.writer = SessionWriter(
             path,
             session_id=uuid.uuid4().hex,
@@ -76,7 +85,7 @@ class BusSession:
             robot=robot,
             clock={bus: clock},
             metadata=facts,
-            force=force,
+            sink=self._sink,
         )
         self.writer.explain(attachments, records)
         names = robot.joint_names
@@ -94,6 +103,15 @@ class BusSession:
         self._said: set[str] = set()
         self._epoch_ns = self._t_ns = epoch_ns
         self._device_minus_host_ns = 0
+        self._open = True
+
+    @property
+    def shortage(self) -> str | None:
+        """Why it can't go on for long: its disk, and what is missing; None while it can."""
+        found = self._sink.shortage
+        if found is None:
+            return None
+        return f"the disk at {_mount_of(found.path)} is full or fails: {found}"
 
     def write(self, tick: BusTick, t_ns: int) -> None:
         """Write one tick.
@@ -198,11 +216,14 @@ class BusSession:
         self.writer.set_verdict("bad", [text])
 
     def close(self) -> None:
-        """Write what is left and finalise.
+        """Write what is left and finalise; safe to call twice.
 
         Raises:
             LogWriteError: If it can't be written.
         """
+        if not self._open:
+            return
+        self._open = False
         try:
             self._frames.finish(self._now_ns)
         finally:
@@ -210,6 +231,12 @@ class BusSession:
 
     def _now_ns(self) -> int:
         return self._t_ns
+
+
+def _mount_of(path: Path) -> Path:
+    """Where the disk of a file is mounted."""
+    place = path.resolve()
+    return next(one for one in (place, *place.parents) if one.is_mount())
 
 
 def stamped(tick: BusTick, t_ns: int) -> BusTick:

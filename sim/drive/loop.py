@@ -58,6 +58,7 @@ class LoopTally:
         overruns: Ticks left out because the one before took too long.
         sent: Frames sent.
         commanded: Whether a command was among them.
+        untold: Ticks that the session could not take.
         received: Frames that came.
         decoded: Frames of these with something that the robot's map names.
         late_s: How late each tick was [s], where the clock sets the pace.
@@ -67,6 +68,7 @@ class LoopTally:
     overruns: int = 0
     sent: int = 0
     commanded: bool = False
+    untold: int = 0
     received: int = 0
     decoded: int = 0
     late_s: list[float] = field(default_factory=list[float])
@@ -172,6 +174,7 @@ class ControlLoop:
                         raise
                     unwritten = error
                     self._gate.report(GateFault(FaultKind.LOG, str(error)))
+            self.tally.untold += unwritten is not None
         if failed := unwritten or self._gate.gait_error:
             raise failed
 

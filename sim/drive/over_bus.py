@@ -19,6 +19,7 @@ from capture.sources.contract import SourceAddress
 from capture.sources.events import Tally
 
 from ..garbage import quick_collections
+from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate
 from ..gate.lateness import jitter
 from ..gate.limits import GateLimits, gate_limits
@@ -222,15 +223,22 @@ def drive_bus(
         # In simulated time all ticks are a period apart, whenever they come.
         spacing = None if lockstep else Spacing(plan.limits.rate, clock.now_ns)
         loop = ControlLoop(gate, robot, link, pace, spacing)
+
+        def each_tick(tick: BusTick) -> None:
+            tell.tick(tick)
+            if (shortage := session.shortage) is not None:  # it still takes what the ending is
+                gate.report(GateFault(FaultKind.LOG, shortage))
+
         opened.enter_context(quick_collections())
         begun = time.monotonic()
         try:
             tell.begin()
-            loop.run(stop, tell.tick, console)
+            loop.run(stop, each_tick, console)
             report = _report(gate, loop.tally, spacing)
             tell.end(report)
-        except LogWriteError:
-            raise  # there is nobody to tell
+            session.close()
+        except LogWriteError as error:
+            raise _unwritten(error, session, gate, loop.tally) from error
         except Exception as error:
             tell.failed(str(error) or type(error).__name__)
             raise
@@ -261,6 +269,22 @@ def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -
     )
     session.note("undulog.gate", plan.limits.facts())
     return session
+
+
+def _unwritten(
+    error: LogWriteError, session: BusSession, gate: Gate, tally: LoopTally
+) -> LogWriteError:
+    """A session that can't be written, with what became of the robot and what is missing."""
+    try:
+        session.close()
+    except LogWriteError as later:  # says what is kept, and where
+        error = later
+    said = [str(error).removeprefix(f"{error.path}: ")]
+    if gate.outcome is not None:
+        said.append(gate.outcome.ended)
+    if tally.untold:
+        said.append(f"the last {tally.untold} control ticks are not in the session")
+    return LogWriteError(error.path, "; ".join(said))
 
 
 def _report(gate: Gate, tally: LoopTally, spacing: Spacing | None) -> BusReport:

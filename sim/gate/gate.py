@@ -221,8 +221,8 @@ class Gate:
     def _begin(self, tick: int, heard: Heard, stop: str) -> Clamp | None:
         """Start from the pose, once it is known; None while it isn't."""
         waited_s = tick / self._rate_hz
-        if heard.trouble is not None:
-            raise SourceError(self._place, f"no command was sent: {heard.trouble.text}")
+        if (trouble := heard.trouble or self._reported) is not None:
+            raise SourceError(self._place, f"no command was sent: {trouble.text}")
         if stop:
             self.outcome = Outcome(How.STOPPED, stop, "no command was sent")
             self.phase = Phase.DONE

@@ -105,11 +105,20 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
     np.testing.assert_allclose(omega, np.pi)
     np.testing.assert_allclose(lag, -np.pi / 3)
     for place, name in enumerate(("joint01", "joint03", "joint05")):
-        meant = a * np.sin(phase + place * lag) + offset
+        meant = held_back(a * np.sin(phase + place * lag) + offset)
         given = commands.signal(name).values
         given = given[~np.isnan(given)]  # a tick's frames that came more than 0.1 s apart
         assert len(given) == report["ticks"]
         assert np.abs(given - meant).max() <= STEP / 2 * (1 + 1e-6)
+
+
+def held_back(wanted, most=4.0 * 0.01):
+    """What the gate lets through: behind ticks that a busy computer leaves out, step by step."""
+    given = np.zeros_like(wanted)  # the robot stands straight
+    for k, each in enumerate(wanted):
+        before = given[k - 1] if k else 0.0
+        given[k] = np.clip(each, before - most, before + most)
+    return given
 
 
 def test_the_virtual_robot_is_driven_as_any_other_through_python_can(tmp_path, alone):
