@@ -101,17 +101,12 @@ def _largest(decided: Decided) -> str:
         others = len(decided.named) - 1
         more = f"; {others} other joint{'s' if others > 1 else ''} by less" if others else ""
         smallest = min(one.p_holm for one in own)
-        return f"{name} most, {parts} (p {_p(smallest)}){more}"
+        return f"{name} most, {parts} ({formats.told_p(smallest)}){more}"
     first = beyond_doubt[0]
     others = len(beyond_doubt) - 1
     more = f"; and {others} more" if others else ""
     where = "the body's" if first.place == BODY else f"{first.place}:"
-    return f"{where} {told(first)} (p {_p(first.p_holm)}){more}"
-
-
-def _p(p: float) -> str:
-    text = formats.p_value(p)
-    return text if text.startswith("<") else f"= {text}"
+    return f"{where} {told(first)} ({formats.told_p(first.p_holm)}){more}"
 
 
 def _not_shown(decided: Decided) -> str:

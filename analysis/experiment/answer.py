@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ..results.analysis import Estimate
 from ..results.experiment import Reversal
 from ..reversal.modules import SIGNIFICANT
 from ..text import formats
@@ -31,33 +30,8 @@ def experiment_answer(reversal: Reversal | None, roles: Mapping[int, Role]) -> s
     return _different(reversal) if reversal.p < SIGNIFICANT else _bounded(reversal)
 
 
-def percent(share: Estimate) -> str:
-    """A share with its interval.
-
-    Args:
-        share: 0 to 1.
-
-    Returns:
-        For example ``97 % [91, 99]``; an en dash where it is missing.
-    """
-    return formats.estimate(formats.scaled(share, 100.0), " %", most=1)
-
-
-def told_p(p: float) -> str:
-    """A p-value with its name.
-
-    Args:
-        p: 0 to 1.
-
-    Returns:
-        For example ``p = 0.013`` or ``p < 0.001``.
-    """
-    text = formats.p_value(p)
-    return f"p {text}" if text.startswith("<") else f"p = {text}"
-
-
 def _different(reversal: Reversal) -> str:
-    told = told_p(reversal.p)
+    told = formats.told_p(reversal.p)
     if not reversal.weak:
         return (
             f"the two directions differ ({told}), but not as a module would make them: check that "
@@ -77,7 +51,7 @@ def _bounded(reversal: Reversal) -> str:
     share = reversal.boundary_share
     if share.value is None:
         return f"{bound}: the joints' spread is no more than noise"
-    told = f"share {percent(share)}"
+    told = f"share {formats.percent(share)}"
     if share.ci95 is not None and share.ci95[0] > 0.5:
         return f"{bound}: the pattern is boundary ({told})"
     return f"{bound}: boundary or module is still open (boundary {told}); record more runs"

@@ -17,7 +17,6 @@ from ..reversal.modules import SIGNIFICANT
 from ..sweep.answer import sweep_detail, sweep_method
 from ..text import formats
 from ..text.table import put, sheet
-from .answer import percent, told_p
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -90,12 +89,13 @@ def reversal_detail(reversal: Reversal) -> Iterable[str]:
         yield (
             f"{weak.name} against its mirror {weak.mirror}, over both directions: "
             f"{_gain(weak.log_gain_contrast)} in gain, {_lag(weak.lag_contrast_rad)} in lag "
-            f"({told_p(weak.p)}, named by {weak.by})."
+            f"({formats.told_p(weak.p)}, named by {weak.by})."
         )
     shares = (reversal.module_share, reversal.boundary_share)
     if shares[0].value is not None:
         yield (
-            f"Spread over the joints: modules {percent(shares[0])}, boundary {percent(shares[1])}."
+            f"Spread over the joints: modules {formats.percent(shares[0])}, "
+            f"boundary {formats.percent(shares[1])}."
         )
     if max(reversal.equivalence_gain_p, reversal.equivalence_lag_p) < SIGNIFICANT:
         yield "Shown to be alike: every mirror pair within 2 % and 1°."

@@ -34,7 +34,7 @@ def kick_answer(coupling: Coupling) -> str:
     )
     if coupling.nonlinearity.value is None:
         return told
-    return f"{told}; nonlinearity {_percent(coupling.nonlinearity)}"
+    return f"{told}; nonlinearity {formats.percent(coupling.nonlinearity)}"
 
 
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
@@ -67,13 +67,13 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
     lti = coupling.lti
     if lti.asymmetry.value is not None:
         bands = ", ".join(
-            f"{_percent(share)} within {k} joint{'s' if k > 1 else ''}"
+            f"{formats.percent(share)} within {k} joint{'s' if k > 1 else ''}"
             for k, share in enumerate((lti.within_1, lti.within_2, lti.within_3), start=1)
         )
         yield (
             "Read as a linear time-invariant chain, which it is not unless the nonlinearity is "
             f"small: X = H^-1 (condition number {coupling.condition_number:.3g}) has asymmetry "
-            f"{_percent(lti.asymmetry)}; off-diagonal energy {bands}."
+            f"{formats.percent(lti.asymmetry)}; off-diagonal energy {bands}."
         )
 
 
@@ -94,10 +94,6 @@ def held_out_detail(coupling: LocalCoupling) -> Iterable[str]:
         )
     if coupling.valid_to is not None:
         yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
-
-
-def _percent(share: Estimate) -> str:
-    return formats.estimate(formats.scaled(share, 100.0), " %", most=1)
 
 
 def _worst(rows: tuple[RowCheck, ...]) -> str:

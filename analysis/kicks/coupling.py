@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import ComplexArray, FloatArray
+from capture.arrays import ComplexArray
 
 from ..reading import Warn
 from ..response import CONFIDENCE
@@ -19,7 +19,7 @@ from ..results.coupling import (
     Lti,
     Matrix,
     RowCheck,
-    Rows,
+    rows_of,
 )
 from .experiment import KickExperiment
 from .local import (
@@ -108,7 +108,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     return LocalCoupling(
         identifiable=True,
         why=f"central differences of {len(kicks)} kicks around one gait",
-        matrix=_table(P.value),
+        matrix=rows_of(P.value),
         condition_number=_finite(reading.condition_number),
         joints=experiment.names,
         base_runs=len(experiment.runs.base),
@@ -200,8 +200,8 @@ def _rows(names: Sequence[str], matrix: Measured, expected: float) -> list[tuple
 def _lti(reading: LtiReading) -> Lti:
     return Lti(
         LTI_LABEL,
-        _table(reading.H.real),
-        _table(reading.H.imag),
+        rows_of(reading.H.real),
+        rows_of(reading.H.imag),
         _finite(reading.condition_number),
         reading.asymmetry,
         *reading.band_energy,
@@ -209,11 +209,7 @@ def _lti(reading: LtiReading) -> Lti:
 
 
 def _matrix(matrix: Measured) -> Matrix:
-    return Matrix(_table(matrix.value), _table(matrix.error), _table(matrix.half))
-
-
-def _table(values: FloatArray) -> Rows:
-    return tuple(tuple(float(x) for x in row) for row in values)
+    return Matrix(rows_of(matrix.value), rows_of(matrix.error), rows_of(matrix.half))
 
 
 def _finite(value: float) -> float | None:

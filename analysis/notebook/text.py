@@ -9,7 +9,6 @@ from typing import Any
 
 from ..compare.result import Comparison
 from ..compare.table import render_comparison
-from ..experiment.answer import told_p
 from ..experiment.table import render_experiment, reversal_detail
 from ..kicks.answer import kick_answer, kick_detail
 from ..results.analysis import Analysis, Coupling
@@ -17,8 +16,8 @@ from ..results.coupling import LocalCoupling
 from ..results.experiment import Experiment, Reversal
 from ..results.sweep import LinearCoupling
 from ..sweep.answer import sweep_answer, sweep_detail
+from ..text import formats
 from ..text.answer import answer
-from ..text.formats import plain
 from ..text.table import render
 
 MOST_ROWS = 40
@@ -61,7 +60,7 @@ def _(result: Comparison) -> str:
 def _(result: Reversal) -> str:
     runs = f"{result.forward_runs} + {result.reverse_runs} runs"
     differ = f"{result.weak[0].name} is weak" if result.weak else "no module is named"
-    return f"Reversal, {runs}: {differ} ({told_p(result.p)})"
+    return f"Reversal, {runs}: {differ} ({formats.told_p(result.p)})"
 
 
 @headline_of.register
@@ -142,18 +141,18 @@ def html_of(result: Any) -> str:
     Returns:
         The answer, the first table, and the warnings; names from logs are escaped.
     """
-    told = escape(plain(headline_of(result)))
+    told = escape(formats.plain(headline_of(result)))
     name, frame = next(iter(result.frames().items()))
     clean = frame.head(MOST_ROWS).map(_readable)
     shown = clean.to_html(float_format="{:.4g}".format, index=False, na_rep="–")
     left = len(frame) - MOST_ROWS
     more = f", {left} more rows in frames()[{name!r}]" if left > 0 else ""
     warnings = "".join(
-        f"<li>{escape(plain(text))}</li>" for text in getattr(result, "warnings", ())
+        f"<li>{escape(formats.plain(text))}</li>" for text in getattr(result, "warnings", ())
     )
     said = f"<details><summary>warnings</summary><ul>{warnings}</ul></details>" if warnings else ""
     return f"<p><strong>{told}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{said}"
 
 
 def _readable(cell: object) -> object:
-    return plain(cell) if isinstance(cell, str) else cell
+    return formats.plain(cell) if isinstance(cell, str) else cell

@@ -7,8 +7,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..experiment.answer import told_p
-from ..results.analysis import Analysis, Estimate
+from ..results.analysis import Analysis, Estimate, leaves_out_zero
 from ..text import formats
 from .deviation import SIGNIFICANT
 
@@ -116,15 +115,15 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
     """
     if named:
         first = next(one for one in modules if one.name == named[0])
-        clear = {kind: e for kind, e in first.relative.items() if _leaves_out_zero(e)}
+        clear = {kind: e for kind, e in first.relative.items() if leaves_out_zero(e.ci95)}
         shown = (clear or first.relative).items()
-        own = ", ".join(f"{_words(kind)} {_percent(one)}" for kind, one in shown)
+        own = ", ".join(f"{_words(kind)} {formats.percent(one)}" for kind, one in shown)
         also = f"; then {', '.join(named[1:])}" if len(named) > 1 else ""
-        return f"{first.name} deviates: {own} ({told_p(p)}){also}"
+        return f"{first.name} deviates: {own} ({formats.told_p(p)}){also}"
     if fit_p < SIGNIFICANT:
         return (
             f"neither identical modules nor a single one that deviates explain this session "
-            f"(fit {told_p(fit_p)}): the model is not of this robot, ground or gait"
+            f"(fit {formats.told_p(fit_p)}): the model is not of this robot, ground or gait"
         )
     bounds: list[str] = []
     for kind in modules[0].relative:
@@ -132,7 +131,7 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
         if max(ends) < 1:  # more than that is no bound
             bounds.append(f"{100 * max(ends):.2g} % in {_words(kind)}")
     bound = f": none by more than {', '.join(bounds)}" if bounds else ", nor any bound on it"
-    return f"no module is shown to deviate ({told_p(p)}){bound}"
+    return f"no module is shown to deviate ({formats.told_p(p)}){bound}"
 
 
 def told_null(result: NullModelResult) -> list[str]:
@@ -150,17 +149,9 @@ def told_null(result: NullModelResult) -> list[str]:
     )
     return [
         f"Modules, {result.condition}: {result.answer}.",
-        f"Shared by all modules: {shared}; fit {told_p(result.fit_p)}.",
+        f"Shared by all modules: {shared}; fit {formats.told_p(result.fit_p)}.",
     ]
-
-
-def _leaves_out_zero(one: Estimate) -> bool:
-    return one.ci95 is not None and (one.ci95[0] > 0 or one.ci95[1] < 0)
 
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _percent(share: Estimate) -> str:
-    return formats.estimate(formats.scaled(share, 100.0), " %", most=1)

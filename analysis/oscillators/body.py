@@ -12,7 +12,7 @@ from capture.arrays import FloatArray
 from ..estimators.norm_ratio import noise_draws
 from ..response import CONFIDENCE
 from ..results.analysis import Estimate
-from ..results.coupling import LocalCoupling
+from ..results.coupling import LocalCoupling, rows_of
 from ..text import formats
 from .comparator import explicit_coupling, homogeneous
 from .entrainment import entrainment
@@ -25,7 +25,6 @@ from .result import (
     Levels,
     Mode,
     RelativeCoupling,
-    Rows,
 )
 
 EXPLICIT_DRAWS = 100
@@ -71,7 +70,7 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
         pseudospectrum=Levels(
             tuple(levels.real.tolist()),
             tuple(levels.imag.tolist()),
-            _rows(levels.level),
+            rows_of(levels.level),
             levels.noise,
         ),
         entrainment=_relative(P),
@@ -119,8 +118,8 @@ def _relative(P: MeasuredP) -> RelativeCoupling:
     condition = reading.condition_number
     return RelativeCoupling(
         ENTRAINMENT_LABEL,
-        None if reading.relative is None else _rows(reading.relative),
-        None if reading.half is None else _rows(reading.half),
+        None if reading.relative is None else rows_of(reading.relative),
+        None if reading.half is None else rows_of(reading.half),
         condition if np.isfinite(condition) else None,
     )
 
@@ -153,7 +152,3 @@ def _pace(gap: Estimate) -> str:
 
 def _pair(ends: FloatArray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
-
-
-def _rows(values: FloatArray) -> Rows:
-    return tuple(tuple(float(x) for x in row) for row in values)

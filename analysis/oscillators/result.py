@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..results.analysis import Estimate
+from ..results.coupling import Rows
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,6 @@ class ChainCoupling:
     links: tuple[Link, ...] = ()
     oscillators: tuple[Rate, ...] = ()
 
-
-Rows = tuple[tuple[float, ...], ...]
 
 ENTRAINMENT_LABEL = (
     "P read as entrainment, P = (Gamma + L)^-1 Gamma: Gamma^-1 L = P^-1 - I, coupling relative to "

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from ..experiment.answer import percent
 from ..experiment.table import by_warning, method, reversal_detail
 from ..kicks.answer import kick_checks
 from ..results.analysis import (
@@ -232,8 +231,16 @@ def _facts(experiment: Experiment) -> list[Fact]:
         lag_bound = math.degrees(reversal.lag_bound_rad)
         facts += [
             Fact("p of identical modules", formats.p_value(reversal.p), _floor(reversal.p_floor)),
-            Fact("Modules' share", percent(reversal.module_share), "of the spread over the joints"),
-            Fact("Boundary's share", percent(reversal.boundary_share), "of the spread, the rest"),
+            Fact(
+                "Modules' share",
+                formats.percent(reversal.module_share),
+                "of the spread over the joints",
+            ),
+            Fact(
+                "Boundary's share",
+                formats.percent(reversal.boundary_share),
+                "of the spread, the rest",
+            ),
             Fact("Gain bound", f"{formats.number(100 * reversal.gain_bound, 2)} %", _BOUND),
             Fact("Lag bound", f"{formats.number(lag_bound, 2)}°", _BOUND),
         ]
@@ -242,9 +249,21 @@ def _facts(experiment: Experiment) -> list[Fact]:
     if isinstance(coupling, LocalCoupling):
         valid = coupling.valid_to
         facts += [
-            Fact("Nonlinearity", percent(coupling.nonlinearity), "0 is linear, time-invariant"),
-            Fact("Asymmetry of X", percent(coupling.lti.asymmetry), "read as linear; 0 reciprocal"),
-            Fact("Within one joint", percent(coupling.lti.within_1), "of X's off-diagonal energy"),
+            Fact(
+                "Nonlinearity",
+                formats.percent(coupling.nonlinearity),
+                "0 is linear, time-invariant",
+            ),
+            Fact(
+                "Asymmetry of X",
+                formats.percent(coupling.lti.asymmetry),
+                "read as linear; 0 reciprocal",
+            ),
+            Fact(
+                "Within one joint",
+                formats.percent(coupling.lti.within_1),
+                "of X's off-diagonal energy",
+            ),
             Fact(
                 "Valid to",
                 formats.estimate(Estimate(valid), " rad"),

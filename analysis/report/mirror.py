@@ -11,7 +11,7 @@ import numpy as np
 from capture.arrays import FloatArray, frozen
 from capture.palette import joint_hex
 
-from ..results.analysis import Estimate
+from ..results.analysis import Estimate, leaves_out_zero
 from ..results.experiment import Experiment, Reversal
 from ..text.formats import (
     degrees,
@@ -178,7 +178,7 @@ def _differences(
     for k, (joint, value, color) in enumerate(zip(reversal.joints, values, colors, strict=True)):
         if value.value is None or value.ci95 is None:
             continue
-        away = value.ci95[0] > 0 or value.ci95[1] < 0
+        away = leaves_out_zero(value.ci95)
         axes.plot([k + 1] * 2, value.ci95, color=color, linewidth=2.2, zorder=2)
         gid = f"{what}-{k}"
         axes.plot(

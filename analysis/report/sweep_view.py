@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ..experiment.answer import percent
 from ..results.sweep import LinearCoupling
 from ..sweep.coupling import NONLINEAR
+from ..text import formats
 from .tables import Fact
 from .trials import Trial
 from .typeset import digits
@@ -36,10 +36,10 @@ def sweep_facts(coupling: LinearCoupling) -> list[Fact]:
                 coupling.contact
             ],
         ),
-        Fact("Asymmetry", percent(tone.asymmetry), f"of {what} at {at}; 0 is reciprocal"),
-        Fact("Between neighbours", percent(tone.within_1), of),
-        Fact("Within two joints", percent(tone.within_2), of),
-        Fact("Within three joints", percent(tone.within_3), of),
+        Fact("Asymmetry", formats.percent(tone.asymmetry), f"of {what} at {at}; 0 is reciprocal"),
+        Fact("Between neighbours", formats.percent(tone.within_1), of),
+        Fact("Within two joints", formats.percent(tone.within_2), of),
+        Fact("Within three joints", formats.percent(tone.within_3), of),
         Fact(
             "Condition number",
             "singular" if inverted is None else f"{inverted:.3g}",
@@ -69,7 +69,7 @@ def sweep_trials(coupling: LinearCoupling) -> list[Trial]:
             trials.append(
                 Trial(
                     f"Does every pair of joints act on one another alike, {at}?",
-                    f"asymmetry {percent(tone.asymmetry)}",
+                    f"asymmetry {formats.percent(tone.asymmetry)}",
                     None,
                     "no" if tone.asymmetry.ci95[0] > 0 else "a difference could not be shown",
                 )

@@ -107,7 +107,7 @@ def coupling_trials(coupling: Coupling) -> list[Trial]:
         found.append(
             Trial(
                 "Is the chain linear and time-invariant around this gait?",
-                f"nonlinearity {_percent(index)}",
+                f"nonlinearity {formats.percent(index)}",
                 None,
                 "a deviation could not be shown" if linear else "no: what H says is a reading only",
             )
@@ -193,7 +193,3 @@ def _worst(rows: tuple[RowCheck, ...]) -> str:
     off = abs((worst.total.value or 0.0) - worst.expected)
     digits = formats.decimals_for_values([off], 2)
     return f"{formats.number(off, digits)} ({formats.plain(worst.name)})"
-
-
-def _percent(share: Estimate) -> str:
-    return formats.estimate(formats.scaled(share, 100.0), " %", most=1)

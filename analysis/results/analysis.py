@@ -22,6 +22,18 @@ if TYPE_CHECKING:
 Interval = tuple[float, float]
 
 
+def leaves_out_zero(ci95: Interval | None) -> bool:
+    """Whether a value differs from zero beyond doubt.
+
+    Args:
+        ci95: Its 95 % interval, or None.
+
+    Returns:
+        False where there is no interval.
+    """
+    return ci95 is not None and (ci95[0] > 0 or ci95[1] < 0)
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A value with its 95 % interval.

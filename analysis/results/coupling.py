@@ -4,9 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from capture.arrays import FloatArray
+
 from .analysis import Coupling, Estimate
 
 Rows = tuple[tuple[float, ...], ...]
+
+
+def rows_of(values: FloatArray) -> Rows:
+    """A matrix as plain numbers.
+
+    Args:
+        values: Shape (m, n).
+
+    Returns:
+        Its rows.
+    """
+    return tuple(tuple(float(x) for x in row) for row in values)
+
 
 LTI_LABEL = (
     "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); how far it "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ..experiment.answer import percent
 from ..results.analysis import Coupling
 from ..results.sweep import LinearCoupling, Route, ToneCoupling
 from ..text import formats
@@ -33,8 +32,9 @@ def sweep_answer(coupling: Coupling) -> str:
     if first.asymmetry.value is None:
         return f"{told}: H can't be inverted"
     return (
-        f"{told}: {percent(first.within_1)} of it is between neighbours, {percent(first.within_2)} "
-        f"within two joints; asymmetry {percent(first.asymmetry)} ({_TOLD[first.route]})"
+        f"{told}: {formats.percent(first.within_1)} of it is between neighbours, "
+        f"{formats.percent(first.within_2)} within two joints; "
+        f"asymmetry {formats.percent(first.asymmetry)} ({_TOLD[first.route]})"
     )
 
 
@@ -107,10 +107,10 @@ def _tone(tone: ToneCoupling) -> str:
     if tone.asymmetry.value is not None:
         of = "X = H^-1" if tone.Z is None else "Z"
         bands = ", ".join(
-            f"{percent(share)} within {k}"
+            f"{formats.percent(share)} within {k}"
             for k, share in enumerate((tone.within_1, tone.within_2, tone.within_3), start=1)
         )
-        text += f"; {of}: asymmetry {percent(tone.asymmetry)}, off-diagonal energy {bands}"
+        text += f"; {of}: asymmetry {formats.percent(tone.asymmetry)}, off-diagonal energy {bands}"
     if tone.servo_difference is not None:
         text += (
             f"; Z behind the described servos is {formats.number(100 * tone.servo_difference, 1)} "

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from capture.arrays import ComplexArray
 from capture.errors import DataError
 from capture.robot import Servo
 
@@ -15,7 +15,7 @@ from ..as_run import robot_as_run
 from ..kicks.lti_reading import SINGULAR, reciprocity
 from ..reading import Warn
 from ..results.analysis import Coupling, Estimate
-from ..results.coupling import Rows
+from ..results.coupling import rows_of
 from ..results.sweep import (
     ComplexMatrix,
     LinearCoupling,
@@ -97,7 +97,7 @@ def sweep_coupling(
     return LinearCoupling(
         identifiable=True,
         why=f"{len(sweep.index)} runs of a {plan}: H = Y C^-1",
-        matrix=_rows(np.abs(first)),
+        matrix=rows_of(np.abs(first)),
         condition_number=tones[0].condition_number,
         plan=plan,
         joints=sweep.names,
@@ -213,12 +213,8 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
 
 def _matrix(matrix: Measured) -> ComplexMatrix:
     return ComplexMatrix(
-        _rows(matrix.value.real),
-        _rows(matrix.value.imag),
-        _rows(matrix.error),
-        _rows(matrix.half),
+        rows_of(matrix.value.real),
+        rows_of(matrix.value.imag),
+        rows_of(matrix.error),
+        rows_of(matrix.half),
     )
-
-
-def _rows(values: FloatArray) -> Rows:
-    return tuple(tuple(float(x) for x in row) for row in values)

@@ -17,6 +17,7 @@ from ..results.analysis import (
     Estimate,
     Index,
     JointResult,
+    leaves_out_zero,
 )
 from . import formats
 
@@ -121,7 +122,7 @@ def _verdict(analysis: Analysis) -> Verdict:
         # Different for certain they may be, but by less than the margins: that has the last word.
         return Verdict.ALIKE
     contrasts = [find(indices, f"boundary_contrast_{quantity}") for quantity in ("gain", "lag")]
-    if any(_leaves_out_zero(index) for kind in contrasts for index in kind.values()):
+    if any(leaves_out_zero(index.ci95) for kind in contrasts for index in kind.values()):
         return Verdict.UNLIKE
     tests = [i.p for i in find(indices, "common_response").values() if i.p is not None]
     return Verdict.UNLIKE if tests and _small(min(tests) * len(tests)) else Verdict.OPEN
@@ -129,10 +130,6 @@ def _verdict(analysis: Analysis) -> Verdict:
 
 def _small(p: float | None) -> bool:
     return p is not None and p < SIGNIFICANT
-
-
-def _leaves_out_zero(index: Index) -> bool:
-    return index.ci95 is not None and (index.ci95[0] > 0 or index.ci95[1] < 0)
 
 
 def _numbers(analysis: Analysis) -> str:

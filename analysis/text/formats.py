@@ -148,6 +148,18 @@ def scaled(quantity: Estimate, factor: float) -> Estimate:
     )
 
 
+def percent(share: Estimate) -> str:
+    """A share with its interval.
+
+    Args:
+        share: 0 to 1.
+
+    Returns:
+        For example ``97 % [91, 99]``; an en dash where it is missing.
+    """
+    return estimate(scaled(share, 100.0), " %", most=1)
+
+
 def relative(log_gain: Estimate) -> Estimate:
     """A ratio of gains, less one, in percent.
 
@@ -176,6 +188,19 @@ def p_value(p: float | None) -> str:
     if p is None or not math.isfinite(p):
         return MISSING
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def told_p(p: float | None) -> str:
+    """A p-value with its name.
+
+    Args:
+        p: 0 to 1, or None.
+
+    Returns:
+        For example ``p = 0.013`` or ``p < 0.001``.
+    """
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
 def utc(time_ns: int) -> str:
