@@ -12,6 +12,7 @@ from capture import SessionWriter
 
 built = runpy.run_path(str(Path(__file__).with_name("built_results.py")))
 chain = runpy.run_path(str(Path(__file__).with_name("linear_chain.py")))
+experiment = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["experiment"]
 
 EPOCH_NS = 1_735_689_600_123_456_789
 
@@ -176,16 +177,16 @@ def both_ways_files(tmp_path_factory):
 @pytest.fixture(scope="session")
 def both_ways(both_ways_files):
     """A wave and its reverse; the second joint is weak."""
-    return chain["analysed"](both_ways_files)
+    return experiment(both_ways_files)
 
 
 @pytest.fixture(scope="session")
 def kicked(tmp_path_factory):
     """Every joint's command kicked in phase and amplitude, and a pattern held out."""
-    return chain["analysed"](chain["kicked"](tmp_path_factory.mktemp("kicks")))
+    return experiment(chain["kicked"](tmp_path_factory.mktemp("kicks")))
 
 
 @pytest.fixture(scope="session")
 def swept(tmp_path_factory):
     """A lag sweep: the commands of the runs are the columns of a DFT."""
-    return chain["analysed"](chain["swept"](tmp_path_factory.mktemp("sweep")))
+    return experiment(chain["swept"](tmp_path_factory.mktemp("sweep")))

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from analysis import analyse_experiment
-from capture import Session, SessionWriter
+from capture import SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("j1", "j2", "j3", "j4", "j5")
@@ -30,15 +29,6 @@ def write_run(path, command, answer, seed, sigma):
             commands.write(t_ns, np.real(command * turn))
             states.write(t_ns, np.real(answer * turn) + noise[k])
     return path
-
-
-def analysed(paths):
-    def opened():
-        for path in paths:
-            with Session.open(path) as session:
-                yield session
-
-    return analyse_experiment(opened())
 
 
 def both_ways(folder):

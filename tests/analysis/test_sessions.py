@@ -1,16 +1,17 @@
 """Whole sessions of known truth, written by a foreign writer: open, analyse, compare."""
 
 import json
+import runpy
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from analysis.analyse import analyse_session
 from analysis.stretch import Options
-from capture import Session
 from capture.errors import DataError, MissingChannelError, UsageError
+
+analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "data"
 SIGMA = 0.01
@@ -25,11 +26,6 @@ def write_wave(bag, wave, noise, *, offsets=True):
         if offsets and tick % 10 == 0:  # holds until the next
             bag.write("/joint_sample_offset", t_ns, wave.names, wave.skew_s)
     bag.close()
-
-
-def analysed(path, options=None):
-    with Session.open(path) as session:
-        return analyse_session(session, options)
 
 
 def lags(result):

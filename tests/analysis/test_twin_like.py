@@ -1,12 +1,13 @@
 """Sessions to the whole contract: gait log, settling, head pose, motor power, two planes."""
 
 import json
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import undulog
-from analysis.analyse import analyse_session
 from analysis.body.null import (
     SAMPLES,
     one_cycle,
@@ -16,6 +17,8 @@ from analysis.body.null import (
 from analysis.stretch import Options
 from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane
+
+analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 
 EPOCH_NS = 1_735_689_600_000_000_000
 TICK_NS = 10_000_000
@@ -97,11 +100,6 @@ def write_twin(
                 )
         w.set_verdict("good")
     return path
-
-
-def analysed(path, options=None):
-    with Session.open(path) as session:
-        return analyse_session(session, options)
 
 
 @pytest.fixture(scope="module")

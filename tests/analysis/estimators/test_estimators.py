@@ -1,21 +1,14 @@
 """Lag, gain and their intervals over the grid: noise, rate, length, skew, lost samples."""
 
-import importlib.util
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-
-def load_tables():
-    path = Path(__file__).parents[3] / "docs" / "estimator_tables.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-TABLES = load_tables()
+DOCS = Path(__file__).parents[3] / "docs"
+TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "estimator_tables.py")))
 GUESS = 2 * np.pi * 1.002  # the truth is 1 Hz
 
 

@@ -3,18 +3,21 @@
 import dataclasses
 import json
 import math
+import runpy
 import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import undulog
-from analysis import analyse_experiment
 from analysis.experiment.runs import mirror_fault
 from analysis.experiment.table import render_experiment
-from capture import Session, SessionWriter, load_robot
+from capture import SessionWriter, load_robot
 from capture.errors import UsageError
 from capture.robot import Plane
+
+experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")
@@ -75,15 +78,6 @@ def write_ways(folder, runs=6, **how):
         for k in range(runs)
         for way, wave in enumerate(("head-to-tail", "tail-to-head"))
     ]
-
-
-def experiment(paths):
-    def opened():
-        for path in paths:
-            with Session.open(path) as session:
-                yield session
-
-    return analyse_experiment(opened())
 
 
 @pytest.fixture(scope="module")

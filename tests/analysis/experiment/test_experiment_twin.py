@@ -7,14 +7,13 @@ from pathlib import Path
 import pytest
 
 import undulog
-from analysis import analyse_experiment
-from capture import Session
 from sim import load_scenario
 from sim.record import record
 
 pytestmark = pytest.mark.slow
 
 shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
+experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
 ROBOT = shared["chain"](7, stall_torque=0.25)
 """Four yaw joints in two mirror pairs."""
@@ -48,12 +47,7 @@ def answered(tmp_path_factory):
                 paths.append(folder / f"{way}-{run}.mcap")
                 record(scenario.changed(seed=20 * k + run + 1), paths[-1])
 
-        def opened():
-            for path in paths:
-                with Session.open(path) as session:
-                    yield session
-
-        return analyse_experiment(opened())
+        return experiment(paths)
 
     return make
 

@@ -2,15 +2,18 @@
 
 import json
 import math
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import undulog
-from analysis import analyse_experiment
 from analysis.experiment.table import render_experiment
 from analysis.results.coupling import LocalCoupling
-from capture import Session, SessionWriter
+from capture import SessionWriter
+
+experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("j1", "j2", "j3", "j4", "j5")
@@ -62,15 +65,6 @@ def sessions(tmp_path_factory):
         name: write_run(folder / f"{name}.mcap", off, seed)
         for seed, (name, off) in enumerate(deviations().items())
     }
-
-
-def experiment(paths):
-    def opened():
-        for path in paths:
-            with Session.open(path) as session:
-                yield session
-
-    return analyse_experiment(opened())
 
 
 @pytest.fixture(scope="module")

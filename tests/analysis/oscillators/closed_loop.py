@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis import analyse_experiment
 from analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
 from analysis.oscillators.phase_log import read_phases
 from analysis.results.experiment import Experiment
@@ -22,6 +21,7 @@ from sim.physics.engine import Kernels
 from sim.record import Driver, record
 
 shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
+together = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
 AMPLITUDE, FREQUENCY_HZ, LAG = 0.4, 0.5, math.pi / 3
 OMEGA = 2.0 * math.pi * FREQUENCY_HZ
@@ -104,12 +104,7 @@ def open_loop(folder, m, held_out=()):
         driver = Driver(Sines(base * np.exp(1j * off)), {"driven.by": label}, {})
         record(scenario, paths[-1], driver=driver, kernels=Kernels.NUMBA)
 
-    def opened():
-        for path in paths:
-            with Session.open(path) as session:
-                yield session
-
-    return analyse_experiment(opened())
+    return together(paths)
 
 
 def closed_loop(folder, experiment: Experiment):

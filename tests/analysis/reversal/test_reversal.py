@@ -1,7 +1,8 @@
 """The reversal test on arrays: foreign tests of one joint, invariances, level, power, shares."""
 
-import importlib.util
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,16 +16,8 @@ from analysis.reversal.modules import reversal_of, weak_modules
 from analysis.reversal.shares import variance_shares
 from capture.errors import UsageError
 
-
-def load_tables():
-    path = Path(__file__).parents[3] / "docs" / "heterogeneity_tables.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-TABLES = load_tables()
+DOCS = Path(__file__).parents[3] / "docs"
+TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "heterogeneity_tables.py")))
 
 
 def scattered(rng, profile, runs, scatter):

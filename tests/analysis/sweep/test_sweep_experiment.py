@@ -2,18 +2,21 @@
 
 import dataclasses
 import json
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import undulog
-from analysis import analyse_experiment
 from analysis.experiment.table import render_experiment
 from analysis.plan.sweep_designs import tones
 from analysis.results.sweep import LinearCoupling, Route
 from analysis.sweep.chain import servo_side
 from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane
+
+experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")
@@ -90,15 +93,6 @@ def sweep(tmp, *, omegas=(2 * np.pi * F0,), **how):
         write_run(tmp / f"run{k}.mcap", omegas, [s * column for s in strength], seed=k, **how)
         for k, column in enumerate(dft())
     ]
-
-
-def experiment(paths):
-    def opened():
-        for path in paths:
-            with Session.open(path) as session:
-                yield session
-
-    return analyse_experiment(opened())
 
 
 def close(matrix, truth):
