@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -127,18 +126,9 @@ def _view_file(
         _report(recording, duration_s, json=json)
         return
 
-    from . import viewer
+    from .stream.cli import view_session
 
-    if not web:
-        viewer.require_display()
-    with tempfile.TemporaryDirectory(prefix="undulog-view-") as folder:
-        recording, _ = _convert(file, Path(folder) / f"{file.stem}.rrd", single)
-        for warning in recording.warnings:
-            print(f"note: {warning}")
-        if web:
-            viewer.serve(recording.path, lambda address: print(address, flush=True))
-        else:
-            viewer.show(recording.path)
+    view_session(file, single, web=web)
 
 
 def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording, float]:

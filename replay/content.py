@@ -65,6 +65,19 @@ class Start:
 
 
 @dataclass(frozen=True)
+class AwaitedMap:
+    """A map that is still to be computed.
+
+    Attributes:
+        entity: Path of its entities.
+        title: What it will show, with unit.
+    """
+
+    entity: str
+    title: str
+
+
+@dataclass(frozen=True)
 class Content:
     """What a recording holds.
 
@@ -103,5 +116,5 @@ class Content:
     signals: tuple[Signal, ...]
     live: bool = False
     cycles: tuple[tuple[Quantity, tuple[Series, ...]], ...] = ()
-    maps: tuple[HeatMap, ...] = ()
+    maps: tuple[HeatMap | AwaitedMap, ...] = ()
     mean: MeanCycle | None = None

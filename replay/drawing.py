@@ -210,10 +210,13 @@ class Drawing:
         )
         self.content = replace(self.content, cycles=cycles, mean=mean)
 
-    def write_facts(self, layer: Layer, content: Content, *, awaited: bool = False) -> list[str]:
+    def write_facts(
+        self, session: Session, layer: Layer, content: Content, *, awaited: bool = False
+    ) -> list[str]:
         """Write the session in words; what was written before is replaced.
 
         Args:
+            session: All of the session.
             layer: What is known of it.
             content: What the recording holds, or will.
             awaited: Whether its numbers are still to come.
@@ -221,7 +224,6 @@ class Drawing:
         Returns:
             What is missing or was assumed by now, a sentence each.
         """
-        session = self._sources.session
         notes = [*layer.notes, *self._sources.warnings, *session.warnings]
         told = list(dict.fromkeys(notes))
         text = facts.markdown(

@@ -36,3 +36,15 @@ class Layer:
     steady: CycleMaps | None = None
     named: tuple[Named, ...] = ()
     notes: tuple[str, ...] = ()
+
+    def with_numbers(self, computed: Layer) -> Layer:
+        """Put numbers to what results say without them.
+
+        Args:
+            computed: The session's analysis, or a note why there is none.
+
+        Returns:
+            Both.
+        """
+        notes = (*self.notes, *computed.notes)
+        return Layer(computed.analysis, computed.steady, self.named, notes)

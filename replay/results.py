@@ -63,6 +63,24 @@ def saved(session: Session, paths: Sequence[Path], options: Options | None = Non
         DataError: If one holds no result, one that names no session, one of other sessions, or a
             second one with numbers of this session.
     """
+    known = found_before(session, paths)
+    return known if known.analysis is not None else known.with_numbers(computed(session, options))
+
+
+def found_before(session: Session, paths: Sequence[Path]) -> Layer:
+    """Read what was found of a session before, and compute nothing.
+
+    Args:
+        session: The session, open.
+        paths: As for :func:`saved`.
+
+    Returns:
+        The layer; without numbers where no result holds them.
+
+    Raises:
+        LogError: As :func:`saved`.
+        DataError: As :func:`saved`.
+    """
     analysis: Analysis | None = None
     named: dict[str, list[str]] = {}
     notes: list[str] = []
@@ -85,10 +103,7 @@ def saved(session: Session, paths: Sequence[Path], options: Options | None = Non
         ):
             named.setdefault(one.joint, []).append(f"{one.why} ({path.name})")
     found = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
-    if analysis is not None:
-        return Layer(analysis, named=found, notes=tuple(notes))
-    now = computed(session, options)
-    return Layer(now.analysis, now.steady, found, (*notes, *now.notes))
+    return Layer(analysis, named=found, notes=tuple(notes))
 
 
 def _own(

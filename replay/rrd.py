@@ -109,7 +109,7 @@ def write_recording(
             drawing.write_words()
             drawing.write_others()
             drawing.write_cycles(layer)
-            told = drawing.write_facts(layer, drawing.content)
+            told = drawing.write_facts(session, layer, drawing.content)
             rec.send_blueprint(layout(drawing.content))
         finally:
             rec.disconnect()

@@ -26,11 +26,11 @@ from capture.interruption import StopRequest, interruptible
 from capture.part_file import part_file
 
 from ..rrd import APPLICATION, recording_id, require_whole
+from ..viewer import Viewer
 from .decode import LiveLog
 from .inbox import Datagram, Inbox
 from .plot import LiveStream
 from .scene import LiveScene
-from .target import LiveViewer
 
 BATCH_S = 0.03
 """How often what has come is drawn [s]."""
@@ -238,7 +238,7 @@ def live_recording_id(session_id: str) -> str:
     return str(uuid.UUID(recording_id(f"{session_id}/live")))
 
 
-def relay_to_viewer(path: Path, viewer: LiveViewer | None, address: str) -> RelayReport:
+def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayReport:
     """Draw sessions in a viewer until it is closed or we are told to stop.
 
     Args:
@@ -311,7 +311,7 @@ class _Painter(threading.Thread):
 
 
 def _run(
-    relay: Relay, request: StopRequest, viewer: LiveViewer | None, *, until_end: bool = False
+    relay: Relay, request: StopRequest, viewer: Viewer | None, *, until_end: bool = False
 ) -> RelayReport:
     """Draw until told to stop, or until the viewer or (if so wanted) the session has ended."""
     painter = _Painter(relay)

@@ -187,11 +187,12 @@ def analysis(snake25):
 class Recorded:
     """A recording read back with Rerun's own reader."""
 
-    def __init__(self, path):
+    def __init__(self, path, identity=None):
         from rerun.chunk import RrdReader
 
         self._reader = RrdReader(path)
-        self._chunks = self._reader.stream().to_chunks()
+        stores = [one for one in self._reader.recordings() if one.recording_id == identity]
+        self._chunks = self._reader.stream(store=next(iter(stores), None)).to_chunks()
 
     @property
     def stores(self):

@@ -1,0 +1,81 @@
+"""The verb ``view`` with one session and a viewer: the picture comes while it is converted."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+
+from capture import Session
+from capture.console import progress
+from capture.interruption import interruptible
+
+from .. import viewer
+from ..layer import Layer
+from ..samples.renamed import COMMANDS, STATES, RenamedSession
+from ..single import SingleOptions
+
+_FIRST = "the beginning"
+
+
+def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
+    """Show a session until the viewer is closed or an end is asked for.
+
+    Args:
+        file: The session.
+        single: How it is shown.
+        web: Serve the viewer to browsers on this machine instead of opening a window.
+
+    Raises:
+        UsageError: If there is no display for a window.
+        LogError: If the session or a result can't be read.
+        DataError: If it holds nothing that can be drawn.
+        UndulogError: If the viewer fails.
+    """
+    if not web:
+        viewer.require_display()
+    command = single.command_topic or COMMANDS
+    response = single.response_topic or STATES
+    with ExitStack() as stack:
+        stop = stack.enter_context(interruptible())
+        session = stack.enter_context(_open(file, command, response))
+        known = _known(session, single)
+        if web:
+            process, page = viewer.open_server(viewer.WHOLE_IN_MEMORY)
+        else:
+            process, page = viewer.open_window(), ""
+        stack.enter_context(process)
+        if page:
+            process.wait_until_it_listens()
+            print(page, flush=True)
+        # Rerun would tell a closed window as errors of its own, in colours.
+        os.environ.setdefault("RUST_LOG", "off")
+        from .apart import Analysing
+        from .show import NoLongerWantedError, Task, show_session, steps
+
+        analysing = stack.enter_context(Analysing(file, (command, response)))
+        try:
+            with progress("view", total=steps(session)) as bar:
+                bar.update(0, note=_FIRST)
+                task = Task(session, known, analysing, single.tab or "session", bar)
+                notes = show_session(task, process, stop)
+        except NoLongerWantedError:
+            return
+        for note in notes:
+            print(f"note: {note}", flush=True)
+        process.wait(stop)
+
+
+def _known(session: Session, single: SingleOptions) -> Layer:
+    """What results say of it."""
+    if not single.result:
+        return Layer(None)
+    from ..results import found_before
+
+    return found_before(session, single.result)
+
+
+def _open(file: Path, command: str, response: str) -> Session:
+    if (command, response) == (COMMANDS, STATES):
+        return Session.open(file)
+    return RenamedSession.with_joints(file, command_topic=command, response_topic=response)

@@ -1,0 +1,308 @@
+"""A session converted stretch by stretch while the viewer shows it.
+
+The viewer gets a layout and the session's first stretch within seconds: what colours and scales
+need of the rest is taken from a glimpse into it. The rest follows, and the session's numbers as
+soon as an analysis in another process has them. Nothing is sent before the viewer has taken what
+was sent before it, so one that is slow, or stands still, costs no memory.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+
+import rerun as rr
+
+from capture import Session
+from capture.console import Progress
+from capture.errors import DataError, MissingChannelError, UndulogError
+from capture.interruption import StopRequest
+
+from ..blueprint import build_blueprint
+from ..drawing import Drawing, Sources, clock_of
+from ..layer import Layer
+from ..plots.gait import MODE
+from ..rrd import open_recording, recording_id, send_properties
+from ..samples.stretches import STRETCH_NS, Span, Stretch, stretches
+from ..samples.survey import GAIT, Survey, survey
+from ..samples.tracks import wanted_fields
+from ..scene.motion import BODY_RATE_HZ
+from ..single import Tab
+from ..viewer import Viewer
+from .apart import Analysing
+from .excerpt import Excerpt, Glimpse
+from .foresight import foreseen, same_arrangement
+
+_TAKE_S = 0.1
+"""How long to wait for the viewer between two looks at whether it is still wanted [s]."""
+_FEW_WORDS = 5000
+"""Modes and events that are read before the first picture, at most."""
+
+
+class NoLongerWantedError(Exception):
+    """The viewer was closed, or an end was asked for."""
+
+
+class _UnforeseenError(Exception):
+    """The glimpse missed a line."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be shown.
+
+    Attributes:
+        session: The session, open.
+        known: What results say of it; its numbers are computed where they don't.
+        analysing: Its analysis, not started.
+        front: The tab in front once its views are filled; until then it is the session's.
+        bar: Told how far it is, of :func:`steps`.
+    """
+
+    session: Session
+    known: Layer
+    analysing: Analysing
+    front: Tab
+    bar: Progress
+
+
+@dataclass(frozen=True)
+class _Foresight:
+    """What is known of the session before its first stretch is drawn.
+
+    Attributes:
+        found: What it holds, as far as it was looked into.
+        seen: (topic, field) to the joints that came; None where all of it was looked through.
+    """
+
+    found: Survey
+    seen: dict[tuple[str, str], set[str]] | None
+
+    def check(self, stretch: Stretch) -> None:
+        """Look whether a stretch has only what was foreseen.
+
+        Args:
+            stretch: Its samples.
+
+        Raises:
+            _UnforeseenError: If it has more.
+        """
+        if self.seen is None:
+            return
+        for (topic, part), tracks in stretch.columns.items():
+            known = self.seen.get((topic, part), set())
+            new = [track.name for track in tracks if track.name not in known]
+            if new:
+                raise _UnforeseenError(f"{topic} ({part}) of {', '.join(new)}")
+
+
+@dataclass
+class _Sink:
+    """The viewer's end of a recording stream."""
+
+    viewer: Viewer
+    stop: StopRequest
+    streams: list[rr.RecordingStream] = field(default_factory=list[rr.RecordingStream])
+
+    def open(self, identity: str) -> rr.RecordingStream:
+        """A recording stream into the viewer."""
+        self.viewer.wait_until_it_listens()
+        rec = open_recording(identity)
+        rec.connect_grpc(self.viewer.address)
+        self.streams.append(rec)
+        return rec
+
+    def look(self) -> None:
+        """Whether it is still wanted.
+
+        Raises:
+            NoLongerWantedError: If it isn't.
+            UndulogError: If the viewer has failed.
+        """
+        if self.stop.requested:
+            raise NoLongerWantedError
+        if self.viewer.ended:
+            self.viewer.check()
+            raise NoLongerWantedError
+
+    def hand_over(self, rec: rr.RecordingStream) -> None:
+        """Wait until the viewer has taken all of it, as long as it is wanted.
+
+        Args:
+            rec: The recording.
+
+        Raises:
+            NoLongerWantedError: If it isn't.
+            UndulogError: If the viewer has failed, or takes nothing any more.
+        """
+        while True:
+            self.look()
+            begun = time.monotonic()
+            try:
+                rec.flush(timeout_sec=_TAKE_S)
+            except RuntimeError as error:
+                if time.monotonic() - begun < 0.5 * _TAKE_S:  # it did not run out of time
+                    time.sleep(_TAKE_S)  # a viewer that ends takes nothing some time before
+                    self.look()
+                    why = "the viewer runs but takes no more of the session"
+                    raise UndulogError(f"{why}: {error}") from error
+            else:
+                return
+
+
+def steps(session: Session) -> int:
+    """How many steps it takes.
+
+    Args:
+        session: The session.
+
+    Returns:
+        The number: one a stretch, and one for the analysis.
+    """
+    return max(1, round((session.end_ns - session.start_ns) / STRETCH_NS)) + 1
+
+
+def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ...]:
+    """Send a session to a viewer, the beginning first.
+
+    Args:
+        task: What is to be shown.
+        viewer: The viewer, which may still be starting.
+        stop: Looked at now and then.
+
+    Returns:
+        What is missing or was assumed, a sentence each.
+
+    Raises:
+        NoLongerWantedError: If the viewer was closed, or an end asked for, before all was sent.
+        DataError: If the session holds nothing that can be drawn.
+        UndulogError: If the viewer fails.
+    """
+    session = task.session
+    sink = _Sink(viewer, stop)
+    try:
+        glimpse = Glimpse.of(session)
+        found = Sources.of(glimpse).found
+        seen = None if glimpse.is_whole else glimpse.seen
+        try:
+            return _send(task, sink, _Foresight(found, seen), recording_id(session.session_id))
+        except _UnforeseenError as late:
+            note = f"drawn anew, as a second recording: the session begins without {late}"
+            again = replace(task, known=replace(task.known, notes=(*task.known.notes, note)))
+            whole = _Foresight(survey(session, BODY_RATE_HZ), None)
+            return _send(again, sink, whole, recording_id(f"{session.session_id}/anew"))
+    except BaseException:
+        viewer.close()  # else what it has not taken would be waited for
+        raise
+    finally:
+        for rec in sink.streams:
+            rec.disconnect()
+
+
+def _send(task: Task, sink: _Sink, foresight: _Foresight, identity: str) -> tuple[str, ...]:
+    """Draw all of it in one recording."""
+    session = task.session
+    clock = clock_of(session)
+    parts = stretches(session, foresight.found.wanted, foresight.found.context_ns)
+    first = next(parts)
+    before = first.span.stop_ns if first.span.known_ns is not None else None
+    start = Excerpt.until(session, first.span.known_ns)
+    rec = sink.open(identity)
+    send_properties(rec, session)
+    sources = Sources.of(start, foresight.found)
+    trail = Span() if before is None else Span(stop_ns=before)
+    drawing = Drawing(rec, clock, sources, task.known.named, trail=trail)
+    words_first = _words(session) <= _FEW_WORDS
+    if words_first:
+        drawing.write_words()
+    else:
+        drawing.content = replace(drawing.content, modes=2, has_events=True)
+    early = foreseen(drawing.content, clock.rhythm)
+    rec.send_blueprint(build_blueprint(early))
+    drawing.write_facts(session, task.known, early, awaited=task.known.analysis is None)
+    drawing.write(first)
+    sink.hand_over(rec)
+    del first
+
+    if task.known.analysis is None:
+        task.analysing.start()
+    if before is not None:
+        whole = _whole(session, sources, foresight)
+        drawing.widen(whole, Span(start_ns=before))
+    if not words_first:
+        drawing.write_words()
+    drawing.write_others()
+    numbers = _Numbers(task, drawing)
+    done = 1
+    for stretch in parts:
+        foresight.check(stretch)
+        drawing.write(stretch)
+        sink.hand_over(rec)
+        numbers.draw()
+        done += 1
+        task.bar.update(done, note="the rest")
+    task.bar.update(done, note="analysis")
+    while (layer := numbers.draw()) is None:
+        sink.look()
+        time.sleep(_TAKE_S)
+    told = drawing.write_facts(session, layer, drawing.content)
+    keeps = task.front == "session" and same_arrangement(early, drawing.content)
+    # A layout that turned out right is left as it is: the user keeps his tabs and his cameras.
+    rec.send_blueprint(build_blueprint(drawing.content, task.front), make_active=not keeps)
+    sink.hand_over(rec)
+    return tuple(told)
+
+
+class _Numbers:
+    """The session's numbers, drawn as soon as they are known."""
+
+    def __init__(self, task: Task, drawing: Drawing) -> None:
+        self._task, self._drawing = task, drawing
+        self._drawn: Layer | None = None
+
+    def draw(self) -> Layer | None:
+        """Draw them, unless they are drawn; None as long as they aren't known."""
+        if self._drawn is None:
+            known = self._known()
+            if known is not None:
+                self._drawing.write_response(known)
+                self._drawing.write_cycles(known)
+                self._drawing.write_facts(self._task.session, known, self._drawing.content)
+                self._drawn = known
+        return self._drawn
+
+    def _known(self) -> Layer | None:
+        known = self._task.known
+        if known.analysis is not None:
+            return known
+        computed = self._task.analysing.layer
+        return None if computed is None else known.with_numbers(computed)
+
+
+def _whole(session: Session, sources: Sources, foresight: _Foresight) -> Sources:
+    """The whole session's sources, those of its beginning given."""
+    found = foresight.found
+    if foresight.seen is not None:
+        _require_nothing_else(session, found)
+        if "/odom" not in session.channels:  # the joints' times say when the body is drawn
+            found = replace(found, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
+    return Sources(session, found, sources.warnings)
+
+
+def _require_nothing_else(session: Session, found: Survey) -> None:
+    """Look for fields that begin after all that the glimpse saw."""
+    for topic, fields in wanted_fields(session).items():
+        for one in fields if topic != GAIT else ():
+            if one in found.wanted.get(topic, ()):
+                continue
+            try:
+                session.joints(topic, one)
+            except (MissingChannelError, DataError):
+                continue  # it never comes
+            raise _UnforeseenError(f"{topic} ({one})")
+
+
+def _words(session: Session) -> int:
+    """How many modes and events there are."""
+    channels = session.channels
+    return sum(channels[topic].count for topic in (MODE, "/rosout") if topic in channels)
