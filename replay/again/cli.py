@@ -95,7 +95,7 @@ def replay(
         raise UsageError("--arm, --robot and --recorder are for a bus")
     if output is None:
         raise UsageError("a run of the twin is recorded: name the session with -o, e.g. -o b.mcap")
-    from .run import find_repetition, replay_in_twin
+    from .run import find_repetition, replay_in_twin, what_next
 
     changes = _changes(change or [])
     repetition = find_repetition(file, world or None, changes, duration)
@@ -117,6 +117,8 @@ def replay(
         comparison = again.comparison
         if comparison is not None and not (again.same and again.same.exact):
             _show(comparison)
+        comparable = comparison is not None
+        print(what_next(file, again.recording.path, comparable=comparable))
     return 0
 
 

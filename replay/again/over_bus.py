@@ -13,7 +13,7 @@ from sim.drive.bus_cli import drive_armed, drive_on_bus
 from sim.drive.driven import find_driven
 from sim.drive.over_bus import bus_address
 
-from .run import compared
+from .run import compared, what_next
 
 
 def replay_on_bus(
@@ -91,4 +91,5 @@ def replay_on_bus(
             show(comparison)
         elif run.complete:
             print(f"Not compared: {why}")
+        print(what_next(file, run.plan.output, comparable=comparison is not None))
     return run.complain()

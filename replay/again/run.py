@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,3 +140,19 @@ def compared(first: Session, second: Session) -> tuple[Comparison | None, str | 
         return compare_sessions(first, second), None
     except (DataError, MissingChannelError) as error:
         return None, str(error)
+
+
+def what_next(original: Path, again: Path, *, comparable: bool) -> str:
+    """What to do with a session and its repetition.
+
+    Args:
+        original: The session.
+        again: The new one.
+        comparable: Whether they can be compared.
+
+    Returns:
+        Commands, ready to be typed, a line each.
+    """
+    both = shlex.join([str(original), str(again)])
+    verbs = ("view", "compare") if comparable else ("view",)
+    return "Next: " + "\n      ".join(f"undulog {verb} {both}" for verb in verbs)

@@ -13,6 +13,7 @@ from capture.part_file import check_stop
 
 from .alignment import Align, align
 from .side import convert, names_of, read_side
+from .stoppable import StoppableSession
 from .write import Beside, Converted, Place, write_beside
 
 
@@ -58,7 +59,8 @@ def bring_together(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-beside-")))
         pairs: list[tuple[Session, str]] = []
         for file, name in zip(files, called, strict=True):
-            session = Session.open(file, column_folder=folder)
+            session = StoppableSession.open(file, column_folder=folder)
+            session.heed(path, stop)
             pairs.append((stack.enter_context(session), name))
         step("angles")
         # Aligned before the long part, since that may refuse.

@@ -61,7 +61,8 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     told = capsys.readouterr().out.splitlines()
     assert told[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
     assert told[1].startswith("The same to the last bit: all ")
-    assert len(told) == 2
+    both = f"{room / 'run.mcap'} {path}"
+    assert told[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]
     with Session.open(path) as session, Session.open(room / "run.mcap") as first:
         facts = session.metadata["undulog"]
         assert facts["driven.session_id"] == first.session_id
@@ -123,7 +124,9 @@ def commands(room):
 
 def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_path, capsys):
     plain = again(commands, tmp_path / "plain.mcap", source="plain.mcap")
-    assert "plain.mcap has commands and no response" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "plain.mcap has commands and no response" in told
+    assert told.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
     altered = again(commands, tmp_path / "altered.mcap", source="altered.mcap")
     found = sameness(plain, altered)
     assert found.differs_s["/joint_commands"] == pytest.approx(2.0)

@@ -18,6 +18,8 @@ from capture.palette import joint_colors
 from replay.beside.alignment import Align, align, times_of
 from replay.beside.layout import all_views
 from replay.beside.side import convert, read_side
+from replay.beside.stoppable import StoppableSession
+from replay.beside.together import bring_together
 from replay.beside.write import Converted, write_beside
 from replay.samples.timeline import Rhythm
 
@@ -494,6 +496,35 @@ def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
         write_beside(converted, path, Align.TIME, stop=stop)
     assert path.read_bytes() == b"mine"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path):
+    path, stop, steps = tmp_path / "x.rrd", StopRequest(), []
+    with StoppableSession.open(files[0]) as session:
+        session.heed(path, stop)
+        assert session.joints("/joint_states").names
+        stop.signal = signal.SIGTERM
+        for read in (
+            lambda: next(session.messages("/joint_states")),
+            lambda: session.joints("/joint_states"),
+            lambda: session.table("/joint_states"),
+            lambda: session.columns({"/joint_states": ["position"]}, {}),
+            session.forget,
+        ):
+            with pytest.raises(LogWriteError, match="stopped on request"):
+                read()
+
+    stop.signal = None
+
+    def at_the_first_recording(done, note):
+        steps.append(note)
+        stop.signal = signal.SIGTERM if done else None
+
+    with pytest.raises(LogWriteError, match="stopped on request"):
+        bring_together(files, path, stop=stop, on_step=at_the_first_recording)
+    assert steps[0] == "angles"
+    assert len(steps) == 2
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")
