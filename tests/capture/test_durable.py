@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,35 +20,18 @@ from capture.daemon.tapped_sink import TappedSink
 from capture.errors import DataError, LogWriteError, OutputExistsError
 from capture.log.diagnostics import ERROR, OK, DiagnosticStatus
 from capture.log.durable_sink import DurableSink
-from capture.log.raw_log import RawLog
 from capture.log.schemas import schema_text
 from capture.log.session_check import check_session
 
 CHILD = Path(__file__).with_name("durable_child.py")
 recorder = SimpleNamespace(**runpy.run_path(str(CHILD)))
+read = runpy.run_path(str(Path(__file__).with_name("read_back.py")))["read"]
+wait_for = runpy.run_path(str(Path(__file__).with_name("patience.py")))["wait_for"]
 EPOCH_NS = recorder.EPOCH_NS
-
-
-def read(path):
-    """All messages of a log in the order they were written, and what the reader warns of."""
-    with RawLog(Path(path)) as log:
-        topics = {key: channel.topic for key, channel in log.file.channels.items()}
-        found = [
-            (topics[m.channel_id], m.sequence, m.log_time_ns, m.publish_time_ns, m.data)
-            for m in log.messages(topics, 0, 1 << 64)
-        ]
-        return found, log.warnings
 
 
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
-
-
-def wait_for(condition, what):
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.01)
 
 
 def record_some(path, sink):
@@ -121,7 +103,7 @@ def test_a_quiet_session_reaches_the_file_by_itself(tmp_path):
         sink.tick()
         return path.stat().st_size > empty + 100 and sink.backlog == 0
 
-    wait_for(grown, "the chunk never reached the file")
+    wait_for(grown, "the chunk in the file")
     shutil.copy(path, tmp_path / "copy.mcap")  # without the write-ahead log
     with Session(tmp_path / "copy.mcap") as session:
         assert session.channels["/a"].count == 1
@@ -142,7 +124,7 @@ def test_the_disk_is_waited_for_by_another_thread(tmp_path, monkeypatch):
     for number in range(10_000):
         recorder.write(sink, number)
     assert sink.part > 1
-    wait_for(lambda: sink.backlog == 0, "the disk's thread stands still")
+    wait_for(lambda: sink.backlog == 0, "the disk's thread")
     assert threads
     assert threading.get_ident() not in threads
     sink.close(())
@@ -226,19 +208,9 @@ def test_a_closed_session_takes_nothing(tmp_path):
 
 
 @pytest.fixture
-def small_disk(tmp_path):
+def small_disk(disk_of):
     """A file system of 4 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(place)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        pytest.skip(f"no mount: {error}")
-    if done.returncode:
-        pytest.skip(f"mounting is not permitted here: {done.stderr.strip()}")
-    yield place
-    subprocess.run(["umount", str(place)], check=True)
+    return disk_of("4m")
 
 
 # In a child, for the failure to be feared is a SIGBUS.

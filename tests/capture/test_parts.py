@@ -17,22 +17,11 @@ from capture.log.cut import cut_log
 from capture.log.durable_sink import DurableSink
 from capture.log.merge import merge_logs
 from capture.log.part_names import later_parts, part_path, split_part_path
-from capture.log.raw_log import RawLog
 from capture.log.session_check import check_session
 
 recorder = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("durable_child.py"))))
+read = runpy.run_path(str(Path(__file__).with_name("read_back.py")))["read"]
 EPOCH_NS = recorder.EPOCH_NS
-
-
-def read(path):
-    """All messages of a log in the order they were written, and what the reader warns of."""
-    with RawLog(Path(path)) as log:
-        topics = {key: channel.topic for key, channel in log.file.channels.items()}
-        found = [
-            (topics[m.channel_id], m.sequence, m.log_time_ns, m.publish_time_ns, m.data)
-            for m in log.messages(topics, 0, 1 << 64)
-        ]
-        return found, log.warnings
 
 
 def split_session(path, count=900, parts=3, **options):

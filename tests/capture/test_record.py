@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import shutil
 import signal
 import socket
@@ -26,14 +27,7 @@ from capture.log.session_check import check_session
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
-
-
-def wait_for(condition, what, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
-        time.sleep(0.02)
-    return found
+wait_for = runpy.run_path(str(Path(__file__).with_name("patience.py")))["wait_for"]
 
 
 def command(output, *arguments):

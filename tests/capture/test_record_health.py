@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import signal
 import socket
 import subprocess
@@ -20,13 +21,7 @@ from capture.sources.packets import HEAD
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
-
-
-def wait_for(condition, what: str, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
-        time.sleep(0.01)
+wait_for = runpy.run_path(str(Path(__file__).with_name("patience.py")))["wait_for"]
 
 
 def send(path: Path, seconds: float, lost: int) -> int:

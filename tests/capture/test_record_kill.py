@@ -6,6 +6,7 @@ when; what is in the session is held against those logs and against the frames t
 
 import os
 import random
+import runpy
 import signal
 import struct
 import subprocess
@@ -22,15 +23,10 @@ from capture import Session
 
 ROOT = Path(__file__).parents[2]
 SENDER = ROOT / "bench" / "bus_sender.py"
+wait_for = runpy.run_path(str(Path(__file__).with_name("patience.py")))["wait_for"]
+
 SAFE_NS = 50_000_000
 RATE = 3000  # frames a second and bus: a loaded machine must still keep up
-
-
-def wait_for(condition, what, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
-        time.sleep(0.01)
 
 
 def accepted_before(log, moment_ns):

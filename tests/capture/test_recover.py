@@ -22,23 +22,12 @@ from capture import Session
 from capture.errors import LogError, NotALogError, OutputExistsError, UndulogError, UsageError
 from capture.log.cut import cut_log
 from capture.log.merge import merge_logs
-from capture.log.raw_log import RawLog
 from capture.log.recover import recover_log, recovered_path
 from capture.log.session_check import check_session
 
 CHILD = Path(__file__).with_name("durable_child.py")
 recorder = SimpleNamespace(**runpy.run_path(str(CHILD)))
-
-
-def read(path):
-    """All messages of a log in the order they were written, and what the reader warns of."""
-    with RawLog(Path(path)) as log:
-        topics = {key: channel.topic for key, channel in log.file.channels.items()}
-        found = [
-            (topics[m.channel_id], m.sequence, m.log_time_ns, m.publish_time_ns, m.data)
-            for m in log.messages(topics, 0, 1 << 64)
-        ]
-        return found, log.warnings
+read = runpy.run_path(str(Path(__file__).with_name("read_back.py")))["read"]
 
 
 def fingerprint(folder):

@@ -4,11 +4,11 @@ import functools
 import json
 import os
 import random
+import runpy
 import shutil
 import subprocess
 import sys
 import threading
-import time
 import tracemalloc
 from operator import itemgetter
 from pathlib import Path
@@ -32,18 +32,12 @@ EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 SECOND = 1000 * MS
 PATIENCE_S = 60.0
-
-
-def until(condition):
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+wait_for = runpy.run_path(str(Path(__file__).with_name("patience.py")))["wait_for"]
 
 
 def written(ring):
     """The marks, once every one is written."""
-    until(lambda: not ring.waiting)
+    wait_for(lambda: not ring.waiting, "the marks")
     return ring.take_marks()
 
 
@@ -385,7 +379,7 @@ def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):
     assert storage.mark("slipped") == {"file": str(path), "messages": 2, "seconds": 1.0}
     with pytest.raises(UsageError, match="a ring has no parts"):
         storage.split()
-    until(lambda: not ring.waiting)
+    wait_for(lambda: not ring.waiting, "the marks")
     storage.tick()
     assert storage.size == path.stat().st_size
     ((level, text),) = storage.take_events()
@@ -393,7 +387,7 @@ def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):
     assert "run_mark0001.mcap is written: 2 messages" in text
     shutil.rmtree(folder)
     storage.mark()
-    until(lambda: not ring.waiting)
+    wait_for(lambda: not ring.waiting, "the marks")
     storage.tick()
     ((level, text),) = storage.take_events()
     assert level == "error"
