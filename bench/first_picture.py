@@ -1,10 +1,17 @@
-"""Time from starting the viewer to the first whole picture of a long session.
+"""Time from a command to the first whole picture of a long session, held to a bar.
 
-``python bench/first_picture.py [MINUTES]`` writes a session of 25 joints at 100 Hz (an hour by
-default), converts it, and starts Rerun's viewer three times, without a window, on the recording;
-then once on the MCAP file itself, which Rerun reads without us, as a peer. The first picture of the
-recording is the body's, of the session itself the first view that Rerun makes of it. A picture is
-whole when it is the one that the viewer still shows five seconds after it came to rest.
+``python bench/first_picture.py [MINUTES | SESSION.mcap]`` takes a session of 25 joints at 100 Hz,
+an hour by default, and starts
+
+* ``undulog view SESSION``, three times, from the command to the first whole picture of the body,
+* Rerun's viewer on a recording that was converted before, three times, and
+* once Rerun's viewer on the MCAP file itself, which Rerun reads without us, as a peer.
+
+All without a window, of the same size. The first picture of a recording is the body's, of the
+session itself the first view that Rerun makes of it. A picture is whole when it is the one that
+the viewer still shows five seconds after it came to rest, standing still at its first moment.
+``undulog view`` goes on converting in the meantime: how long until all of it is in the viewer is
+printed beside. Other work on the machine delays all of these alike.
 """
 
 import subprocess
@@ -20,8 +27,26 @@ from capture import Session
 from replay import write_recording
 from replay.viewer import LOOPBACK, free_ports, viewer_binary
 
+BAR_S = 3.0
 REST_S = 5.0
 PATIENCE_S = 600.0
+SIZE = "--window-size=1440x900"
+
+# The verb as it is, but for the window, which a machine without a display can't open.
+VIEW = f"""
+import sys
+import undulog
+from replay import viewer
+
+def without_window(*options):
+    window = viewer.Viewer(["--headless", "{SIZE}", "--hide-welcome-screen", *options])
+    print(window.address, flush=True)
+    return window
+
+viewer.open_window = without_window
+viewer.require_display = lambda: None
+undulog.main()
+"""
 
 
 def connect(address: str, deadline: float) -> ViewerClient:
@@ -38,18 +63,79 @@ def connect(address: str, deadline: float) -> ViewerClient:
             return client
 
 
-def first_picture(file: Path, scene: str) -> tuple[float, float]:
-    """Open a file and look until nothing changes any more.
+def look(address: str, start: float) -> tuple[float, float]:
+    """Look at a viewer until nothing changes any more.
 
     Args:
-        file: The recording or session.
-        scene: Class of the view to look at; the first view where there is none.
+        address: Where it is.
+        start: When the command was given.
 
     Returns:
-        Seconds until the viewer had this view, and until its picture was whole.
+        Seconds until the viewer had a view, and until its picture was whole.
     """
+    deadline = start + PATIENCE_S
+    client = connect(address, deadline)
+    while not client.get_state().views:
+        if time.monotonic() > deadline:
+            sys.exit(f"nothing shows within {PATIENCE_S:g} s")
+        time.sleep(0.02)
+    had_s = time.monotonic() - start
+    last, changed_s = b"", had_s
+    while time.monotonic() - start < changed_s + REST_S or client.get_state().loading:
+        picture = picture_of_body(client)
+        if picture != last:
+            stand_still(client, deadline)  # again, for it may have begun to play after the first
+            last, changed_s = picture, time.monotonic() - start
+        if time.monotonic() > deadline:
+            sys.exit(f"nothing is at rest within {PATIENCE_S:g} s")
+    return had_s, changed_s
+
+
+def picture_of_body(client: ViewerClient) -> bytes:
+    """The body; of a session that Rerun reads without us a view in space, or the first view."""
+    views = client.get_state().views
+    spatial = [view for view in views if view.view_class == "3D"]
+    bodies = [view for view in spatial if view.name.startswith("Body")]
+    try:
+        return client.take_screenshot((bodies or spatial or views)[0].view_id)
+    except ConnectionError:  # Rerun has thought of another layout in between
+        return b""
+
+
+def stand_still(client: ViewerClient, deadline: float) -> None:
+    """Pause, as soon as there is a moment to pause at."""
+    while True:
+        try:
+            client.set_time(play_state="paused")
+        except ConnectionError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
+        else:
+            return
+
+
+def of_command(session: Path) -> tuple[float, float, float]:
+    """``undulog view``: view, whole picture, and all of the session, each after so many seconds."""
+    start = time.monotonic()
+    command = [sys.executable, "-c", VIEW, "view", str(session)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        had_s, whole_s = look(process.stdout.readline().strip(), start)
+        said = process.stdout.readline()
+        if "all of it" not in said:
+            sys.exit(f"undulog view ended early: {said}")
+        return had_s, whole_s, time.monotonic() - start
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def of_viewer(file: Path) -> tuple[float, float]:
+    """Rerun's viewer on a file: view and whole picture, each after so many seconds."""
     (port,) = free_ports(1)
-    serve = ("--bind", LOOPBACK, "--port", str(port), "--window-size", "1440x900")
+    serve = ("--bind", LOOPBACK, "--port", str(port), SIZE)
     start = time.monotonic()
     process = subprocess.Popen(
         [str(viewer_binary()), str(file), "--headless", *serve],
@@ -57,46 +143,56 @@ def first_picture(file: Path, scene: str) -> tuple[float, float]:
         stderr=subprocess.DEVNULL,
     )
     try:
-        deadline = start + PATIENCE_S
-        client = connect(f"rerun+http://{LOOPBACK}:{port}/proxy", deadline)
-        while not (views := client.get_state().views):
-            if time.monotonic() > deadline:
-                sys.exit(f"{file.name} doesn't show within {PATIENCE_S:g} s")
-            time.sleep(0.02)
-        had_s = time.monotonic() - start
-        view = next((view for view in views if view.view_class == scene), views[0])
-        client.set_time(play_state="paused")
-        last, changed_s = b"", 0.0
-        while time.monotonic() - start < changed_s + REST_S or client.get_state().loading:
-            picture = client.take_screenshot(view.view_id)
-            if picture != last:
-                last, changed_s = picture, time.monotonic() - start
-            if time.monotonic() > deadline:
-                sys.exit(f"{file.name} isn't at rest within {PATIENCE_S:g} s")
-        return had_s, changed_s
+        return look(f"rerun+http://{LOOPBACK}:{port}/proxy", start)
     finally:
         process.terminate()
         process.wait()
 
 
-def main(minutes: float) -> None:
-    """Write, convert, open, print."""
+def measure(log: Path, recording: Path) -> bool:
+    """Open and print; whether the bar is met."""
+    print(f"{log.stat().st_size / 1e6:.0f} MB of MCAP")
+    best_s = PATIENCE_S
+    for _ in range(3):
+        had_s, whole_s, all_s = of_command(log)
+        best_s = min(best_s, whole_s)
+        print(
+            f"undulog view: view after {had_s:.2f} s, whole picture after {whole_s:.2f} s, "
+            f"all of it after {all_s:.1f} s",
+            flush=True,
+        )
+    good = best_s <= BAR_S
+    print(
+        f"{'ok  ' if good else 'FAIL'}  undulog view, best of three: {best_s:.2f} s, bar {BAR_S} s"
+    )
+    start = time.monotonic()
+    with Session.open(log) as session:
+        write_recording(session, recording)
+    print(
+        f"converted once in {time.monotonic() - start:.1f} s to "
+        f"{recording.stat().st_size / 1e6:.0f} MB"
+    )
+    for name, file, times in (("recording", recording, 3), ("MCAP itself", log, 1)):
+        for _ in range(times):
+            had_s, whole_s = of_viewer(file)
+            print(
+                f"{name}: view after {had_s:.2f} s, whole picture after {whole_s:.2f} s",
+                flush=True,
+            )
+    return good
+
+
+def main(what: str) -> None:
+    """Write if need be, open, print."""
     with tempfile.TemporaryDirectory() as folder:
         log, recording = Path(folder) / "bench.mcap", Path(folder) / "bench.rrd"
-        write(log, round(minutes * 60), can=False)
-        start = time.monotonic()
-        with Session.open(log) as session:
-            write_recording(session, recording)
-        print(
-            f"{minutes:g} min, {log.stat().st_size / 1e6:.0f} MB of MCAP; "
-            f"converted once in {time.monotonic() - start:.1f} s to "
-            f"{recording.stat().st_size / 1e6:.0f} MB"
-        )
-        for name, file, times in (("recording", recording, 3), ("MCAP itself", log, 1)):
-            for _ in range(times):
-                had_s, whole_s = first_picture(file, "3D")
-                print(f"{name}: view after {had_s:.2f} s, whole picture after {whole_s:.2f} s")
+        if what.endswith(".mcap"):
+            log = Path(what)
+        else:
+            write(log, round(float(what) * 60), can=False)
+        good = measure(log, recording)
+    sys.exit(0 if good else 1)
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0)
+    main(sys.argv[1] if len(sys.argv) > 1 else "60")

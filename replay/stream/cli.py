@@ -61,6 +61,7 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return
+        print(f"{file}: {session.duration_s:.1f} s, all of it in the viewer", flush=True)
         for note in notes:
             print(f"note: {note}", flush=True)
         process.wait(stop)

@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass, field, replace
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from capture import Session
 from capture.console import Progress
@@ -105,12 +106,25 @@ class _Sink:
     streams: list[rr.RecordingStream] = field(default_factory=list[rr.RecordingStream])
 
     def open(self, identity: str) -> rr.RecordingStream:
-        """A recording stream into the viewer."""
-        self.viewer.wait_until_it_listens()
+        """A recording stream, which keeps what is written until it is connected."""
         rec = open_recording(identity)
-        rec.connect_grpc(self.viewer.address)
         self.streams.append(rec)
         return rec
+
+    def connect(self, rec: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+        """Give the viewer its layout, and then the stream: else it makes a layout of its own.
+
+        Args:
+            rec: The recording.
+            layout: How it is laid out at first.
+
+        Raises:
+            UndulogError: If the viewer doesn't start.
+        """
+        self.viewer.wait_until_it_listens()
+        rec.connect_grpc(self.viewer.address, default_blueprint=layout)
+        # The default alone would give way to the last one; an active one is the user's own.
+        rec.send_blueprint(layout)
 
     def look(self) -> None:
         """Whether it is still wanted.
@@ -218,7 +232,7 @@ def _send(task: Task, sink: _Sink, foresight: _Foresight, identity: str) -> tupl
     else:
         drawing.content = replace(drawing.content, modes=2, has_events=True)
     early = foreseen(drawing.content, clock.rhythm)
-    rec.send_blueprint(build_blueprint(early))
+    sink.connect(rec, build_blueprint(early))
     drawing.write_facts(session, task.known, early, awaited=task.known.analysis is None)
     drawing.write(first)
     sink.hand_over(rec)

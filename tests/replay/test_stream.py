@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
+from capture import Session
 from capture.errors import UndulogError
 from capture.interruption import StopRequest
 from replay.layer import Layer
@@ -63,44 +63,6 @@ def receive(tmp_path, read_back):
         return notes, read_back(path, identity)
 
     return stream
-
-
-@pytest.fixture(scope="module")
-def write_long(snake25):
-    """Writes 400 s of all joints at 5 Hz: more than a glimpse reads."""
-
-    def write_session(path, *, heat_from_s=0.0, last_from_s=0.0):
-        names = snake25.joint_names
-        t = np.arange(LONG_S * RATE_HZ) / RATE_HZ
-        phase = 2 * np.pi * 0.25 * t
-        wave = phase[:, None] - np.arange(25) * np.pi / 6
-        swing = np.where(np.arange(25) % 2, 0.3, 0.4)  # one plane moves more
-        epoch_ns = 1_735_689_600 * NS
-        with SessionWriter(path, session_id="long", epoch_ns=epoch_ns, robot=snake25) as w:
-            commands = w.joint_state("/joint_commands", names, unit="rad")
-            states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-            heat = w.joint_state("/joint_temperature", names, unit="degC")
-            gait = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-            odometry = w.odometry("/odom", frame="world", child="link01")
-            level = np.array([0.0, 0.0, 0.0, 1.0])
-            for i, second in enumerate(t):
-                t_ns = epoch_ns + round(second * NS)
-                commands.write(t_ns, swing * np.sin(wave[i]))
-                speed = 0.9 * swing * 0.5 * np.pi * np.cos(wave[i] - 0.1)
-                states.write(
-                    t_ns, 0.9 * swing * np.sin(wave[i] - 0.1), speed, 0.1 * np.cos(wave[i])
-                )
-                gait.write(t_ns, np.array([0.4, phase[i]]))
-                odometry.write(
-                    t_ns, np.array([0.1 * second, 0, 0]), level, np.zeros(3), np.zeros(3)
-                )
-                if second >= heat_from_s:
-                    degrees = np.full(25, 30.0) + 0.01 * second
-                    degrees[24] = degrees[24] if second >= last_from_s else np.nan
-                    heat.write(t_ns, degrees)
-        return path
-
-    return write_session
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +136,7 @@ def test_a_long_session_arrives_whole_after_a_glimpse(receive, long_file, tmp_pa
     assert received.static("/session", "TextDocument:text")[0].startswith("**")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", ["heat_from_s", "last_from_s"])
 def test_what_a_glimpse_missed_makes_a_second_recording(receive, write_long, tmp_path, late):
     from_s = 365  # in a stretch that it doesn't look into
