@@ -26,6 +26,8 @@ class BusReport:
         jitter: Lateness of the ticks; None where the robot set the pace.
         waits: Commands that were sent a little later, so that no joint was faster than it may.
         longest_wait_s: The longest of these waits [s].
+        malformed: Messages of the bus that could not be read.
+        dropped: Frames that came and were not fetched in time.
         wall_s: How long it took.
         first_frames: The commands of the first tick, as candump writes frames.
         told: Samples of the gait that the recorder took.
@@ -42,6 +44,8 @@ class BusReport:
     jitter: Jitter | None
     waits: int = 0
     longest_wait_s: float = 0.0
+    malformed: int = 0
+    dropped: int = 0
     wall_s: float = 0.0
     first_frames: list[str] = field(default_factory=list[str])
     told: int = 0
@@ -62,11 +66,15 @@ def remarks_of(report: BusReport) -> list[Remark]:
         remarks.append(Remark("info", str(report.jitter)))
     overruns = report.tally.overruns
     if overruns:
-        text = f"{overruns} control ticks were left out, as the one before took too long"
+        many = f"{overruns} control ticks were" if overruns > 1 else "1 control tick was"
+        text = f"{many} left out, as the one before took too long"
         remarks.append(Remark("warn", text))
+    for count, what in ((report.malformed, "could not be read"), (report.dropped, "were dropped")):
+        if count:
+            remarks.append(Remark("warn", f"messages of the bus that {what}: {count}"))
     if report.waits:
         text = (
-            f"{report.waits} commands followed a late one and waited up to "
+            f"commands that followed a late one and waited: {report.waits}, up to "
             f"{report.longest_wait_s * 1e3:.2f} ms, so that no joint was told to be too fast"
         )
         remarks.append(Remark("info", text))
@@ -102,6 +110,8 @@ def report_facts(report: BusReport) -> dict[str, Any]:
         "decoded": tally.decoded,
         "waits": report.waits,
         "longest_wait_s": report.longest_wait_s,
+        "malformed": report.malformed,
+        "dropped": report.dropped,
         "changed": report.cuts,
         "lateness": None if report.jitter is None else report.jitter.to_dict(),
         "real_time_factor": tally.loop_s / max(report.wall_s, 1e-3),

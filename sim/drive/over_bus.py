@@ -15,7 +15,7 @@ from capture.interruption import StopRequest
 from capture.log.frames import FrameArray
 from capture.robot import Bus, Direction, Quantity, Robot
 from capture.sources.address import parse_address
-from capture.sources.contract import SourceAddress
+from capture.sources.contract import SourceAddress, SourceCounts
 from capture.sources.events import Tally
 
 from ..garbage import quick_collections
@@ -187,7 +187,8 @@ def drive_bus(
     clock, robot = SessionClock(), plan.robot
     gait = plan.driven.make(robot, None)
     with ExitStack() as opened:
-        link = open_link(plan.address, Tally(clock.now_ns))
+        tally = Tally(clock.now_ns)
+        link = open_link(plan.address, tally)
         opened.callback(link.close)
         virtual = link if isinstance(link, VirtualRobotLink) else None
         if virtual is not None and virtual.robot_name != robot.name:
@@ -207,6 +208,7 @@ def drive_bus(
             plan,
             session,
             teller,
+            tally=tally,
             clock=clock,
             simulated_ns=epoch_ns if lockstep else None,
             on_tick=on_tick,
@@ -234,7 +236,7 @@ def drive_bus(
         try:
             tell.begin()
             loop.run(stop, each_tick, console)
-            report = _report(gate, loop.tally, spacing)
+            report = _report(gate, loop.tally, spacing, tally.counts)
             tell.end(report)
             session.close()
         except LogWriteError as error:
@@ -287,7 +289,7 @@ def _unwritten(
     return LogWriteError(error.path, "; ".join(said))
 
 
-def _report(gate: Gate, tally: LoopTally, spacing: Spacing | None) -> BusReport:
+def _report(gate: Gate, tally: LoopTally, spacing: Spacing | None, bus: SourceCounts) -> BusReport:
     outcome = gate.outcome or Outcome(How.STOPPED, "", "")
     began = gate.run_from
     return BusReport(
@@ -301,6 +303,8 @@ def _report(gate: Gate, tally: LoopTally, spacing: Spacing | None) -> BusReport:
         jitter=jitter(tally.late_s),
         waits=0 if spacing is None else spacing.waits,
         longest_wait_s=0.0 if spacing is None else spacing.longest_s,
+        malformed=bus.malformed,
+        dropped=bus.dropped or 0,
     )
 
 
@@ -313,6 +317,7 @@ class _Telling:
         session: BusSession,
         teller: GaitTeller | None,
         *,
+        tally: Tally,
         clock: SessionClock,
         simulated_ns: int | None,
         on_tick: Callable[[BusTick], None] | None,
@@ -320,6 +325,7 @@ class _Telling:
         """Nothing is told yet; ``simulated_ns`` is the time of tick 0 of a robot in lockstep."""
         self.first_frames: list[str] = []
         self._plan, self._session, self._teller = plan, session, teller
+        self._events = tally.events
         self._clock, self._simulated_ns, self._on_tick = clock, simulated_ns, on_tick
 
     def begin(self) -> None:
@@ -337,6 +343,8 @@ class _Telling:
         else:
             t_ns = self._simulated_ns + tick.tick * (_NS // CONTROL_RATE_HZ)
             self._session.write(stamped(tick, t_ns), t_ns)
+        for event in self._events.take():
+            self._session.say(event.level, event.text)
         if self._teller is not None:
             if tick.step.gait is not None:
                 self._teller.tell(tick.step.gait, time.time_ns())
@@ -346,6 +354,8 @@ class _Telling:
             self._on_tick(tick)
 
     def end(self, report: BusReport) -> None:
+        for event in self._events.flush():
+            self._session.say(event.level, event.text)
         self._session.finish(report.outcome, remarks_of(report))
         if report.jitter is not None:
             facts = {name: str(value) for name, value in report.jitter.to_dict().items()}

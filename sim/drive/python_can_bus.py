@@ -27,6 +27,36 @@ _SEND_S = 0.02
 waits 3 ms."""
 
 
+class _Complaints(logging.Handler):
+    """What python-can's socketcand logs, counted as ours is, instead of lines on the terminal."""
+
+    _LOGGER = logging.getLogger("can.interfaces.socketcand")
+    _UNREAD = ("Invalid Frame", "Bad data", "Incomplete message exceeds")
+    """The rest of it says nothing new: it reads 1024 bytes at a time, which end within a message
+    ("Got incomplete message"), and raises what fails."""
+
+    def __init__(self, tally: Tally) -> None:
+        """Listen to it.
+
+        Args:
+            tally: Where to count.
+        """
+        super().__init__(logging.WARNING)
+        self._tally = tally
+        self._LOGGER.propagate = False
+        self._LOGGER.addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Count a message that it could not read."""
+        if record.getMessage().startswith(self._UNREAD):
+            self._tally.malformed("malformed message", 1)
+
+    def end(self) -> None:
+        """Listen no more; safe to call twice."""
+        self._LOGGER.removeHandler(self)
+        self._LOGGER.propagate = True
+
+
 class PythonCanBus:
     """One bus of python-can.
 
@@ -54,11 +84,11 @@ class PythonCanBus:
         self.place = address.text
         self.clock = ClockDomain.DEVICE if device_time else ClockDomain.HOST
         kind = bus_class(address.text, interface)
+        self._complaints: _Complaints | None = None
         options: dict[str, object] = {"channel": cast_from_string(channel)}
         if interface == "socketcand":
             options["host"], options["port"] = server_of(address)
-            # It logs each message that comes in two pieces, and each error besides raising it.
-            logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
+            self._complaints = _Complaints(tally)
         else:
             if kind.__module__.startswith("can."):  # others' classes may take what they don't name
                 only(address, known_options(kind))
@@ -66,6 +96,8 @@ class PythonCanBus:
         try:
             self._bus = open_bus(address.text, kind, options)
         except OSError as error:
+            if self._complaints is not None:
+                self._complaints.end()
             reason = error.strerror or str(error)
             raise SourceError(address.text, f"can't open it: {reason}") from error
         self._link = PythonCanLink(self._bus, tally, device_time=device_time, detail="")
@@ -120,6 +152,8 @@ class PythonCanBus:
     def close(self) -> None:
         """Release it; safe to call twice."""
         self._link.close()
+        if self._complaints is not None:
+            self._complaints.end()
 
     def _lost(self, error: OSError) -> SourceError:
         reason = (error.strerror or str(error)).partition("\n")[0].strip()

@@ -26,6 +26,7 @@ from sim.control.build import build_gait
 from sim.drive.driven import find_driven
 from sim.drive.link import find_virtual_robot, sent_text
 from sim.drive.loop import CommandEncoder
+from sim.drive.open_link import open_link
 from sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
 from sim.drive.pace import WallPace
 from sim.gate.outcome import How
@@ -540,6 +541,27 @@ def test_ticks_and_frames_stay_in_order_however_the_stream_is_cut(cut):
             assert identifiers(link.receive()) == [0x203]
         finally:
             link.close()
+
+
+def test_what_python_can_can_not_read_is_counted_and_nothing_is_printed(capfd):
+    stream = (
+        b"< frame 201 1.000000 0102 >< frame 20",  # as its pieces of 1024 bytes end, too
+        b"2 1.000100 03 >< strange >",
+        b"< frame 203 1.010000 0A >",
+    )
+    tally = Tally(time.time_ns)
+    with plain_server(SOCKETCAND, stream) as (on, _):
+        bus = open_link(parse_address(f"{on}&plain=yes"), tally)
+        heard, deadline = [], time.monotonic() + 20
+        while 0x203 not in heard:
+            assert time.monotonic() < deadline, heard
+            heard += identifiers(bus.receive())
+            time.sleep(0.01)
+        bus.close()
+    assert heard == [0x201, 0x202, 0x203]
+    assert tally.counts.malformed == 1
+    assert [event.text for event in tally.events.flush()] == ["malformed message"]
+    assert capfd.readouterr() == ("", "")
 
 
 def identifiers(arrays):
