@@ -95,9 +95,11 @@ class PythonCanBus:
             options |= {key: cast_from_string(value) for key, value in address.options.items()}
         try:
             self._bus = open_bus(address.text, kind, options)
-        except OSError as error:
+        except (OSError, SourceError) as error:
             if self._complaints is not None:
                 self._complaints.end()
+            if isinstance(error, SourceError):
+                raise
             reason = error.strerror or str(error)
             raise SourceError(address.text, f"can't open it: {reason}") from error
         self._link = PythonCanLink(self._bus, tally, device_time=device_time, detail="")
