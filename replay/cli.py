@@ -36,9 +36,10 @@ def view(
 ) -> None:
     """See a session in Rerun, or several side by side: body, joints, power and response.
 
-    Opens the viewer and waits until its window is closed. The recording that it shows is a cache:
-    it can be made again from the session at any time. The session stays on this machine; the
-    viewer counts its own use on its makers' server, which `rerun analytics disable` ends.
+    Opens the viewer on the beginning, sends the rest and the session's numbers while one looks, and
+    waits until its window is closed. The recording that it shows is a cache: it can be made again
+    from the session at any time. The session stays on this machine; the viewer counts its own use
+    on its makers' server, which `rerun analytics disable` ends.
 
     With `--live` it shows a session while it is recorded; the recorder never waits for it.
 

@@ -16,6 +16,7 @@ from ..samples.renamed import COMMANDS, STATES, RenamedSession
 from ..single import SingleOptions
 
 _FIRST = "the beginning"
+_NICENESS = 5
 
 
 def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
@@ -57,7 +58,8 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         try:
             with progress("view", total=steps(session)) as bar:
                 bar.update(0, note=_FIRST)
-                task = Task(session, known, analysing, single.tab or "session", bar)
+                front = single.tab or "session"
+                task = Task(session, known, analysing, front, bar, begun=_make_way)
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return
@@ -65,6 +67,11 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         for note in notes:
             print(f"note: {note}", flush=True)
         process.wait(stop)
+
+
+def _make_way() -> None:
+    """Have what is looked at go before what is converted."""
+    os.nice(max(_NICENESS - os.nice(0), 0))
 
 
 def _known(session: Session, single: SingleOptions) -> Layer:

@@ -9,6 +9,7 @@ was sent before it, so one that is slow, or stands still, costs no memory.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import rerun as rr
@@ -58,6 +59,7 @@ class Task:
         analysing: Its analysis, not started.
         front: The tab in front once its views are filled; until then it is the session's.
         bar: Told how far it is, of :func:`steps`.
+        begun: Called when the viewer has the beginning.
     """
 
     session: Session
@@ -65,6 +67,7 @@ class Task:
     analysing: Analysing
     front: Tab
     bar: Progress
+    begun: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -237,15 +240,16 @@ def _send(task: Task, sink: _Sink, foresight: _Foresight, identity: str) -> tupl
     drawing.write(first)
     sink.hand_over(rec)
     del first
+    task.begun()
 
-    if task.known.analysis is None:
-        task.analysing.start()
     if before is not None:
         whole = _whole(session, sources, foresight)
         drawing.widen(whole, Span(start_ns=before))
     if not words_first:
         drawing.write_words()
     drawing.write_others()
+    if task.known.analysis is None:  # not before: the first picture is still being drawn
+        task.analysing.start()
     numbers = _Numbers(task, drawing)
     done = 1
     for stretch in parts:
