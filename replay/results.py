@@ -18,7 +18,7 @@ from analysis.null_model.result import ModelledAnalysis
 from analysis.results.analysis import Analysis
 from analysis.results.experiment import Experiment
 from analysis.stretch import Options
-from analysis.text.formats import p_value
+from analysis.text.formats import told_p
 from capture import Session
 from capture.errors import DataError, MissingChannelError, UndulogError
 
@@ -59,7 +59,7 @@ def saved(session: Session, paths: Sequence[Path], options: Options | None = Non
         The layer; its numbers are computed now where no result holds them.
 
     Raises:
-        LogError: If a file can't be read.
+        InputFileError: If a file can't be read.
         DataError: If one holds no result, one that names no session, one of other sessions, or a
             second one with numbers of this session.
     """
@@ -78,7 +78,7 @@ def found_before(session: Session, paths: Sequence[Path]) -> Layer:
         The layer; without numbers where no result holds them.
 
     Raises:
-        LogError: As :func:`saved`.
+        InputFileError: As :func:`saved`.
         DataError: As :func:`saved`.
     """
     analysis: Analysis | None = None
@@ -137,19 +137,14 @@ def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
     if isinstance(result, Experiment) and result.reversal is not None:
         for weak in result.reversal.weak:
             how = "less gain" if weak.by == "gain" else "more lag"
-            why = f"{how} than its mirror joint {weak.mirror}, p {_p(weak.p)}"
+            why = f"{how} than its mirror joint {weak.mirror}, {told_p(weak.p)}"
             yield Named(weak.name, why)
     elif isinstance(result, Comparison):
         for joint in result.named:
             if joint.size >= 1.0:  # in margins: what differs by less is there, but small
-                yield Named(joint.name, f"answers differently in A and B, p {_p(joint.p_holm)}")
+                yield Named(joint.name, f"answers differently in A and B, {told_p(joint.p_holm)}")
     elif isinstance(result, ModelledAnalysis):
         test = result.null_model
         for module in test.modules:
             if module.name in test.named:
-                yield Named(module.name, f"deviates from the others' model, p {_p(module.p)}")
-
-
-def _p(value: float) -> str:
-    text = p_value(value)
-    return text if text.startswith("<") else f"= {text}"
+                yield Named(module.name, f"deviates from the others' model, {told_p(module.p)}")

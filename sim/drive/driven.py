@@ -150,6 +150,7 @@ def find_driven(
 
     Raises:
         UsageError: If there is no such thing.
+        InputFileError: If there is no such file.
         FaultyFileError: If a file has faults; lists all of them.
         LogError: If a session can't be read, or has no commands.
         DataError: If a session's commands are of another robot, or of none.
