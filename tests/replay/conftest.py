@@ -148,7 +148,7 @@ def session_file(write, tmp_path_factory):
 def write_long(snake25):
     """Writes minutes of all joints at 5 Hz: more than a glimpse reads."""
 
-    def write_session(path, *, seconds=400, heat_from_s=0.0, last_from_s=0.0):
+    def write_session(path, *, seconds=400, odometry=True, heat_from_s=0.0, last_from_s=0.0):
         names = snake25.joint_names
         t = np.arange(5 * seconds) / 5
         phase = 2 * np.pi * 0.25 * t
@@ -159,7 +159,8 @@ def write_long(snake25):
             states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
             heat = w.joint_state("/joint_temperature", names, unit="degC")
             gait = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-            odometry = w.odometry("/odom", frame="world", child="link01")
+            if odometry:
+                odom = w.odometry("/odom", frame="world", child="link01")
             level = np.array([0.0, 0.0, 0.0, 1.0])
             for i, second in enumerate(t):
                 t_ns = EPOCH_NS + round(second * 1e9)
@@ -169,9 +170,9 @@ def write_long(snake25):
                     t_ns, 0.9 * swing * np.sin(wave[i] - 0.1), speed, 0.1 * np.cos(wave[i])
                 )
                 gait.write(t_ns, np.array([0.4, phase[i]]))
-                odometry.write(
-                    t_ns, np.array([0.1 * second, 0, 0]), level, np.zeros(3), np.zeros(3)
-                )
+                if odometry:
+                    head = np.array([0.1 * second, 0.0, 0.0])
+                    odom.write(t_ns, head, level, np.zeros(3), np.zeros(3))
                 if second >= heat_from_s:
                     degrees = np.full(25, 30.0) + 0.01 * second
                     degrees[24] = degrees[24] if second >= last_from_s else np.nan

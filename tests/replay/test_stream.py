@@ -2,6 +2,7 @@
 
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ import pytest
 from capture import Session
 from capture.errors import UndulogError
 from capture.interruption import StopRequest
+from replay.drawing import clock_of
 from replay.layer import Layer
 from replay.results import computed
 from replay.rrd import recording_id, write_recording
 from replay.stream.apart import Analysing
 from replay.stream.excerpt import Excerpt
+from replay.stream.foresight import foreseen, same_arrangement
 from replay.stream.show import NoLongerWantedError, Task, show_session
 from replay.viewer import Viewer
 
@@ -153,6 +156,33 @@ def test_what_a_glimpse_missed_makes_a_second_recording(receive, write_long, tmp
     known = [row[names.index("joint25")] for row in received.column(last, "Scalars:scalars")]
     assert np.count_nonzero(np.isfinite(known)) == (LONG_S - from_s) * RATE_HZ
     assert at_s.max() == LONG_S - 1 / RATE_HZ
+
+
+@pytest.mark.slow
+def test_without_odometry_the_body_is_drawn_throughout(receive, write_long, tmp_path, read_back):
+    file = write_long(tmp_path / "still.mcap", odometry=False)
+    notes, received = receive(file)
+    with Session.open(file) as session:
+        write_recording(session, tmp_path / "saved.rrd")
+    saved = read_back(tmp_path / "saved.rrd")
+    assert "no /odom in the session: the head is held at the origin" in notes
+    for entity in ("/world/snake/measured", "/world/snake/commanded"):
+        np.testing.assert_array_equal(
+            np.sort(received.times(entity)), np.sort(saved.times(entity)), entity
+        )
+
+
+def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
+    with Session.open(Path(__file__).with_name("golden") / "session.mcap") as session:
+        layer = computed(session)
+        written = write_recording(session, tmp_path / "a.rrd", analysis=layer.analysis)
+        rhythm = clock_of(session).rhythm
+    content = written.content
+    before = replace(content, charts=(), cycles=(), maps=(), mean=None)
+    assert same_arrangement(foreseen(before, rhythm), content)
+    assert not same_arrangement(foreseen(before, None), content)
+    assert not same_arrangement(before, content)
+    assert foreseen(replace(before, commanded=()), rhythm) == replace(before, commanded=())
 
 
 def test_an_excerpt_ends_where_it_was_told_to(long_file):

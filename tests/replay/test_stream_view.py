@@ -232,4 +232,5 @@ def test_who_looks_at_the_served_session_late_gets_its_beginning(view, long_file
         until(lambda: glows(shown.picture(rgb, body)) > 300)
         (recording,) = shown.client.get_state().recordings
         spans = {one.name: (one.start, one.end) for one in recording.timelines}
-        assert spans["session_time"] == (0, round((LONG_S - 0.2) * 1e9))
+        assert spans["session_time"][0] == 0
+        assert spans["session_time"][1] >= round((LONG_S - 0.2) * 1e9)
