@@ -80,7 +80,11 @@ class Viewer:
         Args:
             arguments: Of the viewer's command line, its port and address left out.
             port: Where it takes data; None for a free port.
+
+        Raises:
+            MissingExtraError: If Rerun is not installed.
         """
+        binary = viewer_binary()
         self._port = free_ports(1)[0] if port is None else port
         self.address = f"rerun+http://{LOOPBACK}:{self._port}/proxy"
         """Where a recording stream connects to."""
@@ -90,7 +94,7 @@ class Viewer:
         self._told_to_end = False
         self._process = subprocess.Popen(  # noqa: S603  our own arguments
             [
-                str(viewer_binary()),
+                str(binary),
                 *("--bind", LOOPBACK, "--port", str(self._port)),
                 *arguments,
             ],
