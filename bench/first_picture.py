@@ -25,6 +25,7 @@ from rerun.experimental import ViewerClient
 
 from capture import Session
 from replay import write_recording
+from replay.headless import client_of
 from replay.viewer import LOOPBACK, free_ports, viewer_binary
 
 BAR_S = 3.0
@@ -49,20 +50,6 @@ undulog.main()
 """
 
 
-def connect(address: str, deadline: float) -> ViewerClient:
-    """Wait until the viewer answers."""
-    while True:
-        try:
-            client = ViewerClient.connect(address)
-            client.get_state()
-        except (ConnectionError, RuntimeError, TimeoutError):
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.02)
-        else:
-            return client
-
-
 def look(address: str, start: float) -> tuple[float, float]:
     """Look at a viewer until nothing changes any more.
 
@@ -74,7 +61,7 @@ def look(address: str, start: float) -> tuple[float, float]:
         Seconds until the viewer had a view, and until its picture was whole.
     """
     deadline = start + PATIENCE_S
-    client = connect(address, deadline)
+    client = client_of(address, look_s=0.02)
     while not client.get_state().views:
         if time.monotonic() > deadline:
             sys.exit(f"nothing shows within {PATIENCE_S:g} s")

@@ -32,6 +32,7 @@ from rerun.experimental import ViewerClient
 
 from capture.daemon.live_feed import LiveFeed
 from capture.log.sink import Description
+from replay.headless import client_of
 from replay.samples.timeline import SESSION_TIME
 from replay.viewer import LOOPBACK, free_ports, viewer_binary
 
@@ -117,21 +118,6 @@ def send(feed: LiveFeed, messages: list[Message], epoch_ns: int, start_ns: int) 
         time.sleep(max(start_ns + tick * TICK_NS - time.monotonic_ns(), 0) * 1e-9)
 
 
-def connected(address: str) -> ViewerClient:
-    """The viewer, once it answers."""
-    deadline = time.monotonic() + 60
-    while True:
-        try:
-            client = ViewerClient.connect(address)
-            client.get_state()
-        except (ConnectionError, RuntimeError, TimeoutError):
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.2)
-        else:
-            return client
-
-
 def measure(session: Path, folder: Path, size: str) -> bool:
     """Show a session as it is recorded, and print how late; whether the bar is met."""
     (port,) = free_ports(1)
@@ -148,7 +134,7 @@ def measure(session: Path, folder: Path, size: str) -> bool:
     )
     feed = LiveFeed(path)
     try:
-        client = connected(address)
+        client = client_of(address)
         wait_for(path.is_socket)
         definitions, messages, epoch_ns = read(session)
         for one in definitions:

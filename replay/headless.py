@@ -5,10 +5,8 @@ Rerun's viewer draws off screen where there is a Vulkan driver, Mesa's software 
 
 from __future__ import annotations
 
-import os
-import subprocess
-import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -18,7 +16,7 @@ from rerun.experimental import View, ViewerClient
 from capture.errors import UndulogError
 
 from .samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
-from .viewer import LOOPBACK, free_ports, viewer_binary
+from .viewer import Viewer
 
 _START_S = 60.0
 _REST_S = 30.0
@@ -30,34 +28,20 @@ _GREETINGS_GONE = 8
 class HeadlessViewer:
     """A viewer without a window, which this machine only can reach."""
 
-    def __init__(self, size: tuple[int, int] = (1440, 900), *, log: Path | None = None) -> None:
+    def __init__(self, size: tuple[int, int] = (1440, 900)) -> None:
         """Start it.
 
         Args:
             size: Width and height of the window that isn't there [pixels].
-            log: File for what the viewer prints; None throws it away.
 
         Raises:
+            MissingExtraError: If Rerun is not installed.
             UndulogError: If it doesn't start, e.g. without a Vulkan driver.
         """
-        (port,) = free_ports(1)
-        # The viewer leaves a folder behind when it is told to end; here it goes with ours.
-        self._scratch = tempfile.TemporaryDirectory(prefix="undulog-viewer-")
-        window = ["--window-size", f"{size[0]}x{size[1]}"]
-        with Path(log or os.devnull).open("ab") as sink:
-            self._process = subprocess.Popen(  # noqa: S603  our own arguments
-                [
-                    str(viewer_binary()),
-                    *("--headless", "--hide-welcome-screen", *window),
-                    *("--bind", LOOPBACK, "--port", str(port)),
-                ],
-                stdout=sink,
-                stderr=sink,
-                env={**os.environ, "TMPDIR": self._scratch.name},
-                process_group=0,  # a Ctrl-C ends it through us, not in the middle of a picture
-            )
-        self._client = self._connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+        window = f"--window-size={size[0]}x{size[1]}"
+        self._viewer = Viewer(["--headless", "--hide-welcome-screen", window])
         try:
+            self._client = client_of(self._viewer.address, lambda: self._viewer.ended)
             self._let_greetings_pass()
         except BaseException:
             self.close()
@@ -78,10 +62,7 @@ class HeadlessViewer:
 
     def close(self) -> None:
         """End it; safe to call twice."""
-        if self._process.poll() is None:
-            self._process.terminate()
-        self._process.wait()
-        self._scratch.cleanup()
+        self._viewer.close()
 
     def open(self, recording: Path, seconds: float) -> None:
         """Show a recording in its own layout, standing still, instead of what was shown before.
@@ -178,20 +159,34 @@ class HeadlessViewer:
             shot = self._client.take_screenshot(max_size=64)
             last, equal = shot, equal + 1 if shot == last else 0
 
-    def _connect(self, address: str) -> ViewerClient:
-        """Wait until it answers."""
-        deadline = time.monotonic() + _START_S
-        while True:
-            try:
-                client = ViewerClient.connect(address)
-                client.get_state()
-            except (ConnectionError, RuntimeError, TimeoutError) as error:
-                if self._process.poll() is not None or time.monotonic() > deadline:
-                    self.close()
-                    raise UndulogError(
-                        "the headless viewer did not start; it needs a Vulkan driver "
-                        "(Debian: mesa-vulkan-drivers libvulkan1)"
-                    ) from error
-                time.sleep(_LOOK_AGAIN_S)
-            else:
-                return client
+
+def client_of(
+    address: str, ended: Callable[[], bool] = lambda: False, *, look_s: float = _LOOK_AGAIN_S
+) -> ViewerClient:
+    """Wait until a viewer answers.
+
+    Args:
+        address: Where it takes data.
+        ended: Whether it has ended, so that waiting is in vain.
+        look_s: How often to look [s].
+
+    Returns:
+        What asks it for its state and its pictures.
+
+    Raises:
+        UndulogError: If it ends before, or doesn't answer within a minute.
+    """
+    deadline = time.monotonic() + _START_S
+    while True:
+        try:
+            client = ViewerClient.connect(address)
+            client.get_state()
+        except (ConnectionError, RuntimeError, TimeoutError) as error:
+            if ended() or time.monotonic() > deadline:
+                raise UndulogError(
+                    "the headless viewer did not start; it needs a Vulkan driver "
+                    "(Debian: mesa-vulkan-drivers libvulkan1)"
+                ) from error
+            time.sleep(look_s)
+        else:
+            return client

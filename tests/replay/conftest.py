@@ -326,15 +326,14 @@ def vulkan(display_tests_required):
 
 
 @pytest.fixture(scope="module")
-def show(vulkan, tmp_path_factory):
+def show(vulkan):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
     from replay.headless import HeadlessViewer
 
-    log = tmp_path_factory.mktemp("viewer") / "viewer.log"
     with ExitStack() as stack:
 
         def start(recording, seconds):
-            viewer = stack.enter_context(HeadlessViewer(log=log))
+            viewer = stack.enter_context(HeadlessViewer())
             viewer.open(recording, seconds)
             return viewer
 
