@@ -10,7 +10,7 @@ import numpy as np
 from .estimators.harmonic import HarmonicFit, fit_at, fit_shared
 from .estimators.series import Series
 from .estimators.settling import worst_drift
-from .estimators.spectrum import Noise, omega_variance, residual_noise
+from .estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
 from .gait import (
     MIN_CYCLES,
     MIN_EXPLAINED,
@@ -108,7 +108,7 @@ def fit_gait(
         warn(f"too few response samples for {', '.join(silent)}: gain and lag are null")
     channels = chosen + [responses[name] for name in answered]
     fit = fit_shared(channels, rhythm.omega, allowed_model(channels, rhythm.omega))
-    noise = residual_noise(channels, fit)
+    noise, bins = residual_spectrum(channels, fit)
     variance, dof = omega_variance(fit, noise)
     commanded = np.array([moved.index(name) for name in answered], dtype=np.int64)
     responded = np.arange(len(moved), len(channels))
@@ -127,6 +127,7 @@ def fit_gait(
             _pick(noise, responded),
             omega_variance=variance,
             delay_between_s=fit.mean_time_s[responded] - fit.mean_time_s[commanded],
+            bins=(bins.select(commanded), bins.select(responded)),
         )
         drift = worst_drift(channels[len(moved) :], fit, responded.tolist())
         if drift is not None:

@@ -15,7 +15,8 @@ from scipy.special import stdtrit
 
 from capture.arrays import ComplexArray, FloatArray
 
-from .estimators.spectrum import Noise
+from .estimators.contrasts import ResponseErrors, response_errors
+from .estimators.spectrum import Noise, ResidualBins
 from .results.analysis import Estimate, Interval
 
 CONFIDENCE = 0.95
@@ -30,12 +31,15 @@ class Response:
         log_gain_variance: Variance of ln|H|, shape (m,).
         lag_variance: Variance of arg H [rad^2], shape (m,).
         dof: Degrees of freedom of both, shape (m,).
+        errors: What contrasts between the joints are judged by, whether or not their noise is
+            independent; None where it isn't known.
     """
 
     ratio: ComplexArray
     log_gain_variance: FloatArray
     lag_variance: FloatArray
     dof: FloatArray
+    errors: ResponseErrors | None = None
 
     @property
     def gain(self) -> FloatArray:
@@ -63,6 +67,7 @@ class Response:
             self.log_gain_variance[index],
             self.lag_variance[index],
             self.dof[index],
+            None if self.errors is None else self.errors.select(index),
         )
 
 
@@ -74,6 +79,7 @@ def respond(
     *,
     omega_variance: float = 0.0,
     delay_between_s: FloatArray | float = 0.0,
+    bins: tuple[ResidualBins, ResidualBins] | None = None,
 ) -> Response:
     """Response of each joint to its command.
 
@@ -87,6 +93,7 @@ def respond(
         response_noise: Their noise.
         omega_variance: Variance of the shared frequency [(rad/s)^2].
         delay_between_s: Mean sampling time of the response minus that of the command [s], (m,).
+        bins: Residuals of the commands and of the responses, for the contrasts between joints.
 
     Returns:
         ln H and its variances; where a command is zero, H is NaN.
@@ -105,11 +112,22 @@ def respond(
     dof = welch_satterthwaite(
         np.stack(lag_parts), np.stack([command_noise.dof, response_noise.dof])
     )
+    errors = None
+    if bins is not None:
+        errors = response_errors(
+            command,
+            bins[0],
+            response,
+            bins[1],
+            omega_variance=omega_variance,
+            delay_between_s=delay_between_s,
+        )
     return Response(
         ratio=ratio,
         log_gain_variance=gain_parts[0] + gain_parts[1],
         lag_variance=lag_variance + omega_variance * np.square(delay_between_s),
         dof=dof,
+        errors=errors,
     )
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray, IntArray
+from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from .harmonic import HarmonicFit
 from .harmonic_moments import (
@@ -33,6 +33,9 @@ BINS_PER_SIDE = 6
 """At most six bins on either side: 24 degrees of freedom, whose t factor is 5 % above normal."""
 
 _BLOCKS = 4096
+
+SAME_SPAN = 1.05
+"""Records whose lengths differ by no more than this factor have the same bins."""
 
 KEPT_POWER = 0.5
 """A bin of which the fit has removed more than half says too little about the noise."""
@@ -81,6 +84,39 @@ def bins_per_side(cycles: float) -> int:
     return int(np.clip(round(2 * cycles / 3), 1, BINS_PER_SIDE))
 
 
+@dataclass(frozen=True)
+class ResidualBins:
+    """Demodulated residuals of K channels in L bins beside omega, which all channels share.
+
+    Bin l of channel k is sum_n e_k(t_n) exp(-j (omega + nu_l) t_n), over the root of what the fit
+    left of a unit there. t is true time from the common origin, so products between channels are
+    cross spectra, also between channels that were sampled at different times or rates.
+
+    Attributes:
+        values: In the channel's unit, shape (K, L). The mean of |value|^2 over the bins is the
+            channel's noise level: the variance per sample of white noise of the same power.
+        offset: nu_l [rad/s], in pairs +nu, -nu, shape (L,).
+        spread: Trace of the covariance of (Re a, Im a) for a level of one, shape (K,): the mean
+            of ``spread |value|^2`` is E|error of a|^2.
+    """
+
+    values: ComplexArray
+    offset: FloatArray
+    spread: FloatArray
+
+    def select(self, chosen: Sequence[int] | IntArray) -> ResidualBins:
+        """Some of the channels.
+
+        Args:
+            chosen: Indices, k of them; an index may come more than once.
+
+        Returns:
+            Their bins.
+        """
+        index = np.asarray(chosen, dtype=np.int64)
+        return ResidualBins(self.values[index], self.offset, self.spread[index])
+
+
 def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
     """Noise of each channel's fundamental.
 
@@ -96,23 +132,65 @@ def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
     Returns:
         Level, degrees of freedom and covariance.
     """
+    return residual_spectrum(series, fit)[0]
+
+
+def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise, ResidualBins]:
+    """Noise of each channel's fundamental, and the bins that it comes from.
+
+    Bins lie whole multiples of 2 pi / T beside omega. For the bins that all channels share, T is
+    the shortest channel's; the noise of a channel that is longer by more than ``SAME_SPAN`` comes
+    from bins of its own.
+
+    Args:
+        series: The channels that were fitted.
+        fit: Their fit.
+
+    Returns:
+        The noise, as from :func:`residual_noise`, and the common bins.
+    """
     level, dof = np.zeros((2, len(series)))
-
-    def bins(members: list[int]) -> tuple[FloatArray, FloatArray]:
-        return _bins([series[k] for k in members], fit, members)
-
     groups = shared_times(series)
-    found = in_threads(bins, groups, sum(one.count for one in series))
-    for members, (power, kept) in zip(groups, found, strict=True):
-        usable = kept > KEPT_POWER * fit.count[members[0]]
-        if not np.any(usable):
-            usable = kept == kept.max()
-        level[members] = np.mean(power[:, usable] / kept[usable], axis=1)
+    spans = {members[0]: _span(series[members[0]]) for members in groups}
+    shortest = min(spans.values())
+
+    def demodulated(members: list[int]) -> tuple[_Demodulated, _Demodulated]:
+        group = [series[k] for k in members]
+        common = _demodulated(group, fit, members, shortest)
+        if spans[members[0]] <= SAME_SPAN * shortest:
+            return common, common
+        return common, _demodulated(group, fit, members, spans[members[0]])
+
+    found = in_threads(demodulated, groups, sum(one.count for one in series))
+    for members, (_, own) in zip(groups, found, strict=True):
+        usable = own.usable()
+        level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
-    level = np.maximum(level, RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0))
+    rounding = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
+    level = np.maximum(level, rounding)
     first = fit.model.trend + 1
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
-    return Noise(level, dof, level[:, None, None] * block)
+    noise = Noise(level, dof, level[:, None, None] * block)
+    spread = np.trace(block, axis1=1, axis2=2)
+    return noise, _common_bins(groups, [common for common, _ in found], shortest, spread)
+
+
+def _common_bins(
+    groups: Sequence[Sequence[int]],
+    found: Sequence[_Demodulated],
+    span: float,
+    spread: FloatArray,
+) -> ResidualBins:
+    """The bins of all groups in the order of the channels; a pair that a fit took is left out."""
+    left = np.min([one.kept / one.count for one in found], axis=0)
+    pairs = left.reshape(-1, 2).min(axis=1)
+    usable = np.repeat(pairs > min(KEPT_POWER, 0.999 * float(pairs.max())), 2)
+    values = np.zeros((spread.size, np.count_nonzero(usable)), dtype=np.complex128)
+    for members, one in zip(groups, found, strict=True):
+        values[members] = one.transform[:, usable] / np.sqrt(one.kept[usable])
+    offset: FloatArray = np.repeat(np.arange(1.0, pairs.size + 1), 2) * (2 * np.pi / span)
+    offset[1::2] *= -1
+    return ResidualBins(values, offset[usable], spread)
 
 
 def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
@@ -179,12 +257,32 @@ def residuals(
         yield Residual(part, rows, rows[first : first + 2, None] * residual)
 
 
-def _bins(
-    group: Sequence[Series], fit: HarmonicFit, members: Sequence[int]
-) -> tuple[FloatArray, FloatArray]:
-    """Residual power in each bin, shape (k, L), and what the fit left of a unit there, (L,)."""
+@dataclass(frozen=True)
+class _Demodulated:
+    """Residuals of a group of k channels in L bins, in pairs +nu, -nu."""
+
+    transform: ComplexArray  # (k, L)
+    kept: FloatArray  # what the fit left of a unit there, (L,)
+    count: int
+
+    def power(self) -> FloatArray:
+        return np.abs(self.transform) ** 2
+
+    def usable(self) -> BoolArray:
+        usable = self.kept > KEPT_POWER * self.count
+        return usable if np.any(usable) else self.kept == self.kept.max()
+
+
+def _span(one: Series) -> float:
+    """Length of a record, the last sample's own interval included [s]."""
+    return float(one.t_s[-1] - one.t_s[0]) * one.count / max(one.count - 1, 1)
+
+
+def _demodulated(
+    group: Sequence[Series], fit: HarmonicFit, members: Sequence[int], span: float
+) -> _Demodulated:
+    """Residuals in the bins of a record of this length."""
     t_s = group[0].t_s
-    span = float(t_s[-1] - t_s[0]) * t_s.size / max(t_s.size - 1, 1)
     side = bins_per_side(fit.omega * span / (2 * np.pi))
     transform = np.zeros((len(group), 2 * side), dtype=np.complex128)
     overlap = np.zeros((fit.model.size, 2 * side), dtype=np.complex128)
@@ -200,7 +298,7 @@ def _bins(
         transform += (real + 1j * imaginary) @ waves.T
         overlap += _turned_rows(one.rows, edges, fit.model) @ waves.T
     removed = np.einsum("pl,pq,ql->l", overlap.conj(), fit.inverse_gram[members[0]], overlap).real
-    return np.abs(transform) ** 2, t_s.size - removed
+    return _Demodulated(transform, t_s.size - removed, t_s.size)
 
 
 def _turned_rows(rows: FloatArray, edges: IntArray, model: HarmonicModel) -> ComplexArray:

@@ -1,0 +1,134 @@
+"""Variance of contrasts between joints whose noise is not independent.
+
+Noise that joints share (of a clock, a bus, a body that rocks) cancels in one contrast of their
+responses and adds up in another, and no sum of the joints' own variances shows which. But each
+joint's residual is there in the same bins beside omega, so a contrast has bins of its own: the
+weighted sum of the joints' bins. Their mean power is the contrast's variance, with two degrees
+of freedom a bin, whatever is shared by whom.
+
+The error of ln H = ln a - ln c is, to first order, e = da / a - dc / c: a complex number whose
+real part is the error of log gain and whose imaginary part is that of arg H, minus the lag. The
+noise near omega is taken to be stationary, so the two parts have the same variance, half of
+E|e|^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import ComplexArray, FloatArray, IntArray
+
+from .spectrum import ResidualBins
+
+
+@dataclass(frozen=True)
+class ResponseErrors:
+    """What the errors of ln H of m joints would be in each of L bins beside omega.
+
+    Attributes:
+        bins: Complex, shape (m, L), scaled so that E[e_i conj(e_j)] of the errors e of ln H of
+            joints i and j is the mean over l of ``bins[i, l] * conj(bins[j, l])``. The real part
+            of that is twice the covariance of their log gains and twice that of their lags.
+        own: Variance of ln|H|, and of arg H [rad^2], that is not in the bins and that no two
+            joints share, shape (m,).
+        turn: Lag error that one standard error of the shared frequency makes [rad], shape (m,);
+            it is the same error in all joints.
+    """
+
+    bins: ComplexArray
+    own: FloatArray
+    turn: FloatArray
+
+    def select(self, chosen: Sequence[int] | IntArray) -> ResponseErrors:
+        """Some of the joints.
+
+        Args:
+            chosen: Indices, k of them.
+
+        Returns:
+            Their errors.
+        """
+        index = np.asarray(chosen, dtype=np.int64)
+        return ResponseErrors(self.bins[index], self.own[index], self.turn[index])
+
+
+def response_errors(
+    command: ComplexArray,
+    command_bins: ResidualBins,
+    response: ComplexArray,
+    response_bins: ResidualBins,
+    *,
+    omega_variance: float = 0.0,
+    delay_between_s: FloatArray | float = 0.0,
+) -> ResponseErrors:
+    """Errors of ln H in each bin: response_bins / a - command_bins / c, scaled to the estimate.
+
+    Args:
+        command: Fundamentals c of the commands, shape (m,).
+        command_bins: Their residuals.
+        response: Fundamentals a of the responses, shape (m,).
+        response_bins: Their residuals, in the same bins.
+        omega_variance: Variance of the shared frequency [(rad/s)^2].
+        delay_between_s: Mean sampling time of the response minus that of the command [s], (m,).
+
+    Returns:
+        The errors; NaN for a joint whose command or response is zero.
+    """
+    parts: list[ComplexArray] = []
+    for amplitude, found in ((response, response_bins), (command, command_bins)):
+        known = np.abs(amplitude) > 0
+        scale = np.divide(
+            np.sqrt(found.spread), amplitude, out=np.full_like(amplitude, np.nan), where=known
+        )
+        parts.append(scale[:, None] * found.values)
+    count = response.size
+    turn = np.broadcast_to(omega_variance**0.5 * np.asarray(delay_between_s), (count,))
+    return ResponseErrors(parts[0] - parts[1], np.zeros(count), np.array(turn, dtype=np.float64))
+
+
+def contrast_variance(errors: ResponseErrors, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance of weighted sums of the joints' log gains.
+
+    Args:
+        errors: Of m joints.
+        weights: Real, shape (..., m).
+
+    Returns:
+        Variance of sum_i w_i ln|H_i| and its degrees of freedom, each of shape (...). Bins have
+        two degrees of freedom each; what is not in them is known without error.
+    """
+    summed = weights @ errors.bins
+    found = np.mean(np.abs(summed) ** 2, axis=-1) / 2
+    dof = np.full(found.shape, 2.0 * errors.bins.shape[1])
+    return _with_known(found, dof, weights**2 @ errors.own)
+
+
+def lag_contrast_variance(
+    errors: ResponseErrors, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Variance of weighted sums of the joints' lags.
+
+    It is that of the log gains, and what the error of the shared frequency adds where commands
+    and responses were sampled at different times.
+
+    Args:
+        errors: Of m joints.
+        weights: Real, shape (..., m).
+
+    Returns:
+        Variance [rad^2] and its degrees of freedom, each of shape (...).
+    """
+    found, dof = contrast_variance(errors, weights)
+    return _with_known(found, dof, (weights @ errors.turn) ** 2)
+
+
+def _with_known(
+    found: FloatArray, dof: FloatArray, known: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """An estimated variance plus a known one, and the degrees of freedom of the sum (Welch)."""
+    total = found + known
+    share = np.divide(found, total, out=np.ones_like(found), where=total > 0)
+    return total, dof / np.maximum(share, 1e-6) ** 2

@@ -1,0 +1,14 @@
+"""Joints that do not follow their command: which, since when, and what kinds of fault fit.
+
+Pure functions on arrays (:mod:`~capture.following.find`), so that the health of a log, its
+analysis and its replay name the same joints.
+"""
+
+from __future__ import annotations
+
+from .fault import KINDS, Fault
+from .find import joints_not_following
+from .motion import JointMotion
+from .session import faults_in_session
+
+__all__ = ["KINDS", "Fault", "JointMotion", "faults_in_session", "joints_not_following"]

@@ -1,0 +1,206 @@
+"""Times at which a joint leaves its own usual response, and what it does meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import BoolArray, FloatArray
+from .fault import Span
+from .kinds import Symptom
+from .motion import JointMotion, Response, predicted
+
+FAR = 6.0
+"""Robust standard deviations of the residual that make an excursion."""
+
+FAR_SHARE = 0.2
+"""An excursion is also farther than this share of the usual amplitude."""
+
+FEW = 4
+"""Samples that an excursion has at least."""
+
+SHORT = 0.04
+"""Share of a cycle that an excursion lasts at least."""
+
+JOIN = 0.3
+"""Excursions closer than this share of a cycle are one: a residual passes through zero."""
+
+HELD = 0.25
+"""A joint that moves less than this share of what it should stands still."""
+
+NOISY = 0.6
+"""Von Neumann ratio above which a residual is noise, not motion: 1 for white noise
+(von Neumann, Ann. Math. Stat. 12, 1941; halved, so that it is 1 minus the autocorrelation)."""
+
+STEPPED = 0.35
+"""A residual whose standard deviation is below this share of its mean is a shifted zero."""
+
+SETTLING = 1.5
+"""Cycles from the start in which a departure is a transient."""
+
+AGAIN = 3
+"""Short departures that make a fault."""
+
+DRIFT_SHARE = 0.15
+"""Drift of the offset, as a share of the amplitude, that is no fault."""
+
+DRIFT_RAD = float(np.radians(1.0))
+DRIFT_EXPLAINED = 0.6
+TURN = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class Excursions:
+    """Departures of one joint from its usual response.
+
+    Attributes:
+        t_s: Sampling times [s], shape (n,).
+        residual: Position less what the usual response gives [rad], shape (n,).
+        expected: What the usual response gives [rad], shape (n,).
+        amplitude: Usual amplitude of the response [rad].
+        threshold: Residuals beyond it are departures [rad].
+        spans_s: The departures.
+    """
+
+    t_s: FloatArray
+    residual: FloatArray
+    expected: FloatArray
+    amplitude: float
+    threshold: float
+    spans_s: tuple[Span, ...]
+
+
+def find_excursions(
+    motion: JointMotion, response: Response, follows: BoolArray, ratio: complex, offset: float
+) -> Excursions:
+    """Find the times at which a joint leaves its usual response.
+
+    Args:
+        motion: The joint.
+        response: Its windowed response.
+        follows: Windows that follow the command, shape (w,).
+        ratio: Its usual H.
+        offset: Its usual offset [rad].
+
+    Returns:
+        The departures: longer than ``SHORT`` of a cycle, beyond ``FAR`` robust standard
+        deviations of the residual and beyond ``FAR_SHARE`` of the amplitude.
+    """
+    period_s = response.period_s
+    begin = max(motion.command.t_s[0] + period_s / 4, motion.position.t_s[0])
+    end = min(motion.command.t_s[-1], motion.position.t_s[-1])
+    i, j = np.searchsorted(motion.position.t_s, (begin, end), side="left")
+    t_s, values = motion.position.t_s[i:j], motion.position.values[i:j]
+    expected = predicted(motion, period_s, ratio, offset, t_s)
+    residual = values - expected
+    if t_s.size < 2 * FEW:
+        return Excursions(t_s, residual, expected, 0.0, np.inf, ())
+    centre = float(np.median(residual))
+    scale = 1.4826 * float(np.median(np.abs(residual - centre)))
+    amplitude = abs(ratio) * float(np.median(response.asked[follows])) * 2**0.5
+    threshold = max(FAR * scale, FAR_SHARE * amplitude)
+    far = np.abs(residual - centre) > threshold
+    spans = _joined(t_s, far, JOIN * period_s)
+    step = motion.position.period_s
+    long = tuple(
+        (a, b)
+        for a, b in spans
+        if b - a + step >= max(SHORT * period_s, (FEW - 1) * step)
+        and np.count_nonzero(far[slice(*np.searchsorted(t_s, (a, b + step / 2)))]) >= FEW
+    )
+    return Excursions(t_s, residual - centre, expected + centre, amplitude, threshold, long)
+
+
+def departures(response: Response, found: Excursions, alone: Sequence[bool]) -> list[Symptom]:
+    """Describe what a joint does in each of its departures.
+
+    Args:
+        response: The joint's windowed response.
+        found: All its departures.
+        alone: Of each, whether no other joint departs at the same time.
+
+    Returns:
+        One symptom a kind of departure.
+    """
+    end = float(found.t_s[-1]) if found.t_s.size else 0.0
+    settled = (float(found.t_s[0]) if found.t_s.size else 0.0) + SETTLING * response.period_s
+    by_kind: dict[str, list[Span]] = {}
+    texts: dict[str, str] = {}
+    for span, own in zip(found.spans_s, alone, strict=True):
+        kind, text = _described(found, span, end, response.period_s)
+        if kind in ("astray", "opposite") and (span[1] < settled or not own):
+            continue  # the start of the motion, or something that happened to the body
+        by_kind.setdefault(kind, []).append(span)
+        texts.setdefault(kind, text)
+    if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s):
+        del by_kind["astray"]
+    symptoms = [Symptom(kind, tuple(own), texts[kind]) for kind, own in by_kind.items()]
+    if not found.spans_s and (drift := _drift(response, found)):
+        symptoms.append(drift)
+    return symptoms
+
+
+def _lasting(spans: Sequence[Span], period_s: float) -> bool:
+    """Whether departures come again and again, or one of them lasts a cycle."""
+    return len(spans) >= AGAIN or any(stop - start > period_s for start, stop in spans)
+
+
+def _described(found: Excursions, span: Span, end: float, period_s: float) -> tuple[str, str]:
+    """Kind of symptom of one departure, and its size in words."""
+    i, j = np.searchsorted(found.t_s, span, side="left")
+    j = min(j + 1, found.t_s.size)
+    residual, expected = found.residual[i:j], found.expected[i:j]
+    position = residual + expected
+    swing = float(np.ptp(expected))
+    moved = float(np.percentile(position, 95) - np.percentile(position, 5))
+    steps = np.diff(residual)
+    variance = float(np.var(residual))
+    rough = float(np.mean(steps**2)) / (2 * variance) if variance > 0 else 0.0
+    mean, spread = float(np.mean(residual)), variance**0.5
+    long = span[1] - span[0] > period_s or end - span[1] < period_s / 4
+    if long and spread < STEPPED * abs(mean):
+        turns = mean / TURN
+        if abs(turns) > 0.5 and abs(turns - round(turns)) < 0.05:
+            return "wrapped", f"off by {round(turns)} turns"
+        return "stepped", f"off by {np.degrees(mean):+.1f} degrees"
+    if rough > NOISY and residual.size >= 2 * FEW:
+        return "noisy", f"residual of {np.degrees(variance**0.5):.2g} degrees"
+    if swing > 0.5 * found.amplitude and moved < HELD * swing:
+        level = float(np.median(position))
+        return "held", f"position constant at {np.degrees(level):.1f} degrees"
+    if float(residual @ expected) < 0 and moved > 0.5 * swing:
+        along = np.corrcoef(position, expected)[0, 1] if position.size > 2 else 0.0
+        if along < -0.7:
+            return "opposite", "moves against its command"
+    return "astray", f"off by up to {np.degrees(np.abs(residual).max()):.1f} degrees"
+
+
+def _drift(response: Response, found: Excursions) -> Symptom | None:
+    """A zero that moves steadily over the record."""
+    valid = response.valid
+    if np.count_nonzero(valid) < 12:
+        return None
+    t_s, offset = (response.start_s + response.stop_s)[valid] / 2, response.offset[valid]
+    centred = t_s - t_s.mean()
+    slope = float(centred @ (offset - offset.mean()) / (centred @ centred))
+    total = slope * float(np.ptp(t_s))
+    rest = offset - offset.mean() - slope * centred
+    power = float(np.sum((offset - offset.mean()) ** 2))
+    explained = 1 - float(rest @ rest) / power if power > 0 else 0.0
+    least = max(DRIFT_SHARE * found.amplitude, DRIFT_RAD)
+    if abs(total) < least or explained < DRIFT_EXPLAINED:
+        return None
+    return Symptom("drifting", (), f"offset drifts by {np.degrees(total):+.1f} degrees")
+
+
+def _joined(t_s: FloatArray, marked: BoolArray, gap_s: float) -> tuple[Span, ...]:
+    """Marked samples as time spans; those closer than a gap are one."""
+    at = np.flatnonzero(marked)
+    if not at.size:
+        return ()
+    breaks = np.flatnonzero(np.diff(t_s[at]) > gap_s)
+    first = np.concatenate(([0], breaks + 1))
+    last = np.concatenate((breaks, [at.size - 1]))
+    return tuple(zip(t_s[at[first]].tolist(), t_s[at[last]].tolist(), strict=True))

@@ -1,0 +1,301 @@
+"""From symptoms to the kinds of fault that fit: what effort, velocity and a second sensor decide.
+
+A position alone can't tell a jammed joint from a frozen sensor. A kind is ruled out only by
+another quantity that was recorded; otherwise all kinds that fit are named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..arrays import FloatArray
+from .fault import Fault, Span
+from .motion import FEW_SAMPLES, JointMotion, Samples
+
+if TYPE_CHECKING:
+    from .find import Judged
+
+MOVING = 0.5
+"""Correlation of a velocity or second sensor with the command that shows motion."""
+
+AT_REST = 0.3
+"""Share of its usual motion below which a velocity or second sensor shows rest."""
+
+NO_EFFORT = 0.15
+"""Share of the usual effort below which a motor does not push."""
+
+PUSHING = 1.3
+"""Share of the usual effort above which a motor pushes against something."""
+
+CONSTANT = 0.1
+"""Standard deviation over mean below which an effort is constant."""
+
+MOSTLY = 0.5
+"""Share of exact repeats above which a sensor may be frozen."""
+
+LIMIT_SHARE = 0.02
+"""Nearer to a limit than this share of the range is at it."""
+
+_KINDS: dict[str, tuple[str, ...]] = {
+    "still": ("dead", "jammed", "frozen_sensor"),
+    "held": ("jammed", "dead", "frozen_sensor"),
+    "opposite": ("inverted", "inverted_sensor"),
+    "incoherent": ("dead", "noisy_sensor"),
+    "astray": ("intermittent",),
+    "noisy": ("noisy_sensor",),
+    "stepped": ("slipped", "slipped_sensor"),
+    "wrapped": ("wrapped_sensor",),
+    "drifting": ("slipped", "drifting_sensor"),
+    "scaled": ("scaled_sensor",),
+    "swapped": ("swapped",),
+    "lost": ("lost_samples",),
+    "stale": ("stale_sensor", "lost_samples"),
+}
+"""Symptom to the kinds that fit where nothing else was recorded, the likeliest first."""
+
+_PHRASES = {
+    "still": "does not move with its command",
+    "held": "stands still while its command moves",
+    "opposite": "moves against its command",
+    "incoherent": "does not follow its command",
+    "astray": "leaves its usual response",
+    "noisy": "has bursts of noise",
+    "stepped": "has shifted",
+    "wrapped": "is off by whole turns",
+    "drifting": "drifts",
+    "scaled": "differs in unit or scale",
+    "swapped": "is swapped",
+    "lost": "lacks samples",
+    "stale": "repeats old samples",
+}
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """What a joint's position shows.
+
+    Attributes:
+        name: One of the keys above.
+        spans_s: When [s]; empty for the whole record.
+        text: Its size in words; may be empty.
+    """
+
+    name: str
+    spans_s: tuple[Span, ...]
+    text: str
+
+
+def fault_of(
+    motion: JointMotion,
+    judged: Judged | None,
+    symptoms: list[Symptom],
+    usual_effort: FloatArray,
+) -> Fault | None:
+    """Turn the symptoms of one joint into its fault.
+
+    Args:
+        motion: The joint.
+        judged: Its judged windows; None where it could not be judged.
+        symptoms: What it shows, at least one.
+        usual_effort: Root mean square effort of the joints that follow, shape (k,).
+
+    Returns:
+        The fault.
+    """
+    main = symptoms[0]
+    begin, end = _record(motion)
+    spans = tuple(sorted(span for each in symptoms for span in each.spans_s))
+    whole = any(not each.spans_s for each in symptoms)
+    kinds: list[str] = list(_KINDS[main.name])
+    decided = ""
+    if main.name in ("still", "held") and judged is not None:
+        kinds, decided = _standing(motion, judged, main, usual_effort)
+        if main.name == "held" and _again(main, begin, end):
+            kinds = ["intermittent", *(k for k in kinds if k != "dead")]
+    elif main.name == "opposite":
+        kinds, decided = _opposite(motion)
+    elif main.name in ("stepped", "drifting"):
+        kinds, decided = _shifted(motion, main, kinds)
+    for each in symptoms[1:]:
+        kinds += [kind for kind in _KINDS[each.name] if kind not in kinds]
+    cycle = judged.response.period_s if judged is not None else 0.0
+    since = None if whole or not spans or spans[0][0] - begin < cycle / 2 else spans[0][0]
+    until = None if whole or not spans or end - spans[-1][1] < cycle / 2 else spans[-1][1]
+    length = sum(b - a for a, b in spans)
+    share = 1.0 if whole or end <= begin else min(1.0, length / (end - begin))
+    phrase = _PHRASES[main.name]
+    parts = [phrase, main.text, *(each.text or _PHRASES[each.name] for each in symptoms[1:])]
+    evidence = ", ".join(part for part in dict.fromkeys(parts) if part)
+    if decided:
+        evidence += f"; {decided}"
+    return Fault(motion.name, tuple(kinds), spans, since, until, share, evidence)
+
+
+def _again(main: Symptom, begin: float, end: float) -> bool:
+    """Whether a joint starts to follow again after it stood still."""
+    last = max((stop for _, stop in main.spans_s), default=end)
+    return len(main.spans_s) > 1 or end - last > 0.1 * (end - begin)
+
+
+def _standing(
+    motion: JointMotion,
+    judged: Judged,
+    main: Symptom,
+    usual_effort: FloatArray,
+) -> tuple[list[str], str]:
+    """Kinds of a joint that stands still, by what else was recorded."""
+    spans = main.spans_s or (_record(motion),)
+    for samples, name in ((motion.reference, "second sensor"), (motion.velocity, "velocity")):
+        if samples is None:
+            continue
+        speed = name == "velocity"
+        shown = _shows_motion(motion, samples, spans, judged, speed=speed)
+        if shown is True:
+            return ["frozen_sensor"], f"the {name} shows that it moves"
+        if shown is False and not speed:  # a velocity may be the position's own derivative
+            kinds, why = _by_effort(motion, spans, main, usual_effort)
+            kept = [kind for kind in kinds if kind != "frozen_sensor"]
+            return kept, f"the second sensor stands still, too{'; ' + why if why else ''}"
+    return _by_effort(motion, spans, main, usual_effort)
+
+
+def _by_effort(
+    motion: JointMotion,
+    spans: tuple[Span, ...],
+    main: Symptom,
+    usual_effort: FloatArray,
+) -> tuple[list[str], str]:
+    """Kinds of a joint that stands still, by its noise and its effort."""
+    kinds = list(_KINDS[main.name])
+    if not _repeats(motion, spans):  # new noise in each sample: the sensor measures
+        kinds.remove("frozen_sensor")
+    at_limit = _at_limit(motion, spans)
+    if at_limit:
+        kinds = ["at_limit", *kinds]
+    if motion.effort is None:
+        return kinds, ""
+    inside = _inside(motion.effort.t_s, spans)
+    here, outside = motion.effort.values[inside], motion.effort.values[~inside]
+    own = main.spans_s and outside.size >= FEW_SAMPLES
+    usual = float(np.sqrt(np.mean(outside**2))) if own else _typical(usual_effort)
+    if here.size < FEW_SAMPLES or not usual > 0:
+        return kinds, ""
+    size = float(np.sqrt(np.mean(here**2)))
+    mean, spread = float(np.mean(here)), float(np.std(here))
+    decided: tuple[list[str], str] = (kinds, "")
+    if size < NO_EFFORT * usual:
+        decided = ["dead"], "its effort is near zero"
+    elif abs(mean) > 0.5 * usual and spread < CONSTANT * abs(mean):
+        decided = ["stalled", "jammed"], "it pushes with constant effort"
+    elif size > PUSHING * usual:
+        text = f"its effort is {size / usual:.1f} times the usual one"
+        decided = ["jammed", "stalled"], text
+    if at_limit and decided[1]:
+        decided = ["at_limit", *decided[0]], decided[1]
+    return decided
+
+
+def _repeats(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
+    """Whether most positions are, to the bit, the one before."""
+    inside = motion.position.values[_inside(motion.position.t_s, spans)]
+    repeated = int(np.count_nonzero(np.diff(inside) == 0))
+    return inside.size < 2 or repeated > MOSTLY * (inside.size - 1)
+
+
+def _typical(usual_effort: FloatArray) -> float:
+    return float(np.median(usual_effort)) if usual_effort.size else 0.0
+
+
+def _opposite(motion: JointMotion) -> tuple[list[str], str]:
+    """Kinds of a joint that moves the opposite way."""
+    if motion.reference is not None and motion.reference.values.size > 8:
+        along = _correlation(motion.reference.at(motion.position.t_s), motion.position.values)
+        if along < -MOVING:
+            return ["inverted_sensor"], "the second sensor moves with the command"
+        if along > MOVING:
+            return ["inverted"], "the second sensor moves against the command, too"
+    if motion.velocity is not None and motion.velocity.values.size > 8:
+        rate = np.gradient(motion.position.values, motion.position.t_s)
+        if _correlation(motion.velocity.at(motion.position.t_s), rate) < -MOVING:
+            return ["inverted_sensor"], "its velocity has the opposite sign of its position"
+    return list(_KINDS["opposite"]), ""
+
+
+def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list[str], str]:
+    """Kinds of a zero that moved: by a second sensor, or by the velocity at a step."""
+    sensor = {"stepped": "slipped_sensor", "drifting": "drifting_sensor"}[main.name]
+    if motion.reference is not None and motion.reference.values.size > 8:
+        gap = motion.position.values - motion.reference.at(motion.position.t_s)
+        inside = _inside(motion.position.t_s, main.spans_s or (_record(motion),))
+        moved = float(np.ptp(gap)) if main.name == "drifting" else 0.0
+        if main.name == "stepped" and inside.any() and not inside.all():
+            moved = abs(float(np.median(gap[inside]) - np.median(gap[~inside])))
+        if moved > 0.1 * motion.position.range:
+            return [sensor], "the second sensor does not show it"
+        return ["slipped"], "the second sensor shows it, too"
+    return kinds, ""
+
+
+def _shows_motion(
+    motion: JointMotion,
+    samples: Samples,
+    spans: tuple[Span, ...],
+    judged: Judged,
+    *,
+    speed: bool,
+) -> bool | None:
+    """Whether another quantity shows motion (True) or rest (False); None where it is unclear."""
+    inside = _inside(samples.t_s, spans)
+    t_s, values = samples.t_s[inside], samples.values[inside]
+    if t_s.size < 8:
+        return None
+    command, delayed = (
+        motion.command.at(t_s - back) for back in (0.0, judged.response.period_s / 4)
+    )
+    usual = abs(judged.ratio) * float(np.std(command))
+    if speed:
+        usual *= 2 * np.pi / judged.response.period_s
+    if usual <= 0:
+        return None
+    size = float(np.std(values))
+    design = np.stack([np.ones_like(t_s), command, delayed], axis=1)
+    rest = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    explained = 1 - float(np.var(rest)) / size**2 if size > 0 else 0.0
+    if size > AT_REST * usual and explained > MOVING:
+        return True
+    return False if size < AT_REST * usual else None
+
+
+def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
+    """Whether the joint stands at a limit of its description."""
+    if motion.limits is None:
+        return False
+    inside = _inside(motion.position.t_s, spans)
+    if not inside.any():
+        return False
+    level = float(np.median(motion.position.values[inside]))
+    lower, upper = motion.limits
+    slack = LIMIT_SHARE * (upper - lower)
+    return level <= lower + slack or level >= upper - slack
+
+
+def _inside(t_s: FloatArray, spans: tuple[Span, ...]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    marked = np.zeros(t_s.size, dtype=np.bool_)
+    for start, stop in spans:
+        i, j = np.searchsorted(t_s, (start, stop))
+        marked[i : j + 1] = True
+    return marked
+
+
+def _record(motion: JointMotion) -> Span:
+    t_s = motion.position.t_s if motion.position.t_s.size else motion.command.t_s
+    return (float(t_s[0]), float(t_s[-1])) if t_s.size else (0.0, 0.0)
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> float:
+    if np.ptp(first) == 0 or np.ptp(second) == 0:
+        return 0.0
+    return float(np.corrcoef(first, second)[0, 1])

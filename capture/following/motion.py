@@ -1,0 +1,224 @@
+"""The signals of one joint, and its response to the command cycle by cycle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+BLOCKS = 4
+"""Blocks a cycle: windows of one cycle start at every quarter of it."""
+
+FEW_SAMPLES = 8
+"""A window with fewer samples is not judged."""
+
+FULL_SHARE = 0.6
+"""A window with less than this share of its usual samples is not judged."""
+
+QUIET = 0.25
+"""A window whose command moves less than this share of its usual range is not judged."""
+
+RIDGE = 1e-6
+"""Relative ridge on the normal equations: a ramp and its delayed copy are collinear."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """One quantity of one joint: finite samples at increasing times.
+
+    Attributes:
+        t_s: Times from the common origin [s], strictly increasing, shape (n,).
+        values: Shape (n,).
+    """
+
+    t_s: FloatArray
+    values: FloatArray
+
+    def at(self, t_s: FloatArray) -> FloatArray:
+        """Values at other times, interpolated linearly; the ends are held."""
+        if t_s is self.t_s:
+            return self.values
+        return np.interp(t_s, self.t_s, self.values).astype(np.float64)
+
+    @property
+    def range(self) -> float:
+        """Largest minus smallest value."""
+        return float(np.ptp(self.values)) if self.values.size else 0.0
+
+    @cached_property
+    def period_s(self) -> float:
+        """Median sampling interval [s]."""
+        return float(np.median(np.diff(self.t_s))) if self.t_s.size > 1 else float("nan")
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """What was recorded of one joint; None for a quantity that was not.
+
+    Attributes:
+        name: Joint name.
+        command: Commanded position [rad].
+        position: Measured position [rad].
+        velocity: [rad/s].
+        effort: Torque [N m], or motor current [A] where no torque was recorded.
+        reference: Position by a second sensor [rad].
+        limits: Lower and upper limit of the joint [rad], or None.
+        missing: Positions that are not finite.
+    """
+
+    name: str
+    command: Samples
+    position: Samples
+    velocity: Samples | None = None
+    effort: Samples | None = None
+    reference: Samples | None = None
+    limits: tuple[float, float] | None = None
+    missing: int = 0
+
+
+def cycle_s(command: Samples) -> float:
+    """Median length of the command's cycles.
+
+    Args:
+        command: The command.
+
+    Returns:
+        Time from one upward crossing of its middle to the next, with hysteresis [s]; a tenth of
+        the record where there are fewer than three crossings.
+    """
+    middle = (float(command.values.max()) + float(command.values.min())) / 2
+    far = np.abs(command.values - middle) > 0.2 * command.range
+    high = command.values[far] > middle
+    times = command.t_s[far][1:][high[1:] & ~high[:-1]]
+    if times.size < 3:
+        return float(command.t_s[-1] - command.t_s[0]) / 10
+    return float(np.median(np.diff(times)))
+
+
+@dataclass(frozen=True)
+class Response:
+    """Least squares of a position on its command, over windows of one cycle.
+
+    In each window the position is ``o + a c(t) + b c(t - T/4)``; for a sine of period T the
+    response is H = a - j b.
+
+    Attributes:
+        start_s: Start of each window [s], shape (w,).
+        stop_s: Its end [s], shape (w,).
+        valid: Windows with enough samples and a command that moves, shape (w,).
+        ratio: H, shape (w,).
+        offset: o minus what the mean command explains by H, i.e. the mean of the position less
+            that of the command [rad], shape (w,).
+        explained: Share of the position's variance that is explained, 0 to 1, shape (w,).
+        spread: Standard deviation of the position [rad], shape (w,).
+        asked: Standard deviation of the command [rad], shape (w,).
+        period_s: T [s].
+    """
+
+    start_s: FloatArray
+    stop_s: FloatArray
+    valid: BoolArray
+    ratio: ComplexArray
+    offset: FloatArray
+    explained: FloatArray
+    spread: FloatArray
+    asked: FloatArray
+    period_s: float
+
+
+def windowed_response(command: Samples, position: Samples, period_s: float) -> Response:
+    """Fit the response in every window of one cycle, a quarter of a cycle apart.
+
+    Args:
+        command: The command [rad].
+        position: The measured position [rad].
+        period_s: Cycle of the command T [s].
+
+    Returns:
+        The response; no windows where the record is shorter than one cycle.
+    """
+    start = max(command.t_s[0], position.t_s[0])
+    stop = min(command.t_s[-1], position.t_s[-1])
+    block = period_s / BLOCKS
+    count = int((stop - start) / block + 1e-9) if block > 0 else 0
+    windows = max(count - BLOCKS + 1, 0)
+    i, j = np.searchsorted(position.t_s, (start, start + count * block))
+    t_s, p = position.t_s[i:j], position.values[i:j]
+    index: IntArray = np.minimum(((t_s - start) / block).astype(np.int64), max(count - 1, 0))
+    c, d = command.at(t_s), command.at(t_s - period_s / BLOCKS)
+    middle = float(np.median(p)) if p.size else 0.0
+    level = float(np.median(c)) if c.size else 0.0
+    rows = np.stack([np.ones_like(c), c - level, d - level, p - middle])
+
+    def windowed(weights: FloatArray) -> FloatArray:
+        sums = np.bincount(index, weights, minlength=max(count, 1))[:count]
+        total = np.concatenate(([0.0], np.cumsum(sums)))
+        return total[BLOCKS : BLOCKS + windows] - total[:windows]
+
+    moments = np.zeros((windows, 4, 4))
+    for row in range(4):
+        for column in range(row, 4):
+            moments[:, row, column] = windowed(rows[row] * rows[column])
+            moments[:, column, row] = moments[:, row, column]
+    return _solved(moments, start, block, period_s, middle - level)
+
+
+def _solved(
+    moments: FloatArray, start: float, block: float, period_s: float, shift: float
+) -> Response:
+    """Solve the normal equations of each window."""
+    count = np.maximum(moments[:, 0, 0], 1.0)
+    mean = moments[:, 0, 1:] / count[:, None]
+    centred = moments[:, 1:, 1:] - count[:, None, None] * mean[:, :, None] * mean[:, None, :]
+    asked = np.sqrt(np.maximum(centred[:, 0, 0] / count, 0.0))
+    spread = np.sqrt(np.maximum(centred[:, 2, 2] / count, 0.0))
+    usual = float(np.median(moments[:, 0, 0])) if len(moments) else 0.0
+    valid = (moments[:, 0, 0] >= FEW_SAMPLES) & (moments[:, 0, 0] >= FULL_SHARE * usual)
+    lively = np.percentile(asked[valid], 75) if valid.any() else 0.0
+    valid &= (asked >= QUIET * lively) & (asked > 0)
+    gram = centred[:, :2, :2] + RIDGE * np.trace(centred[:, :2, :2], axis1=1, axis2=2)[
+        :, None, None
+    ] * np.eye(2)
+    gram[~valid] = np.eye(2)
+    target = centred[:, :2, 2]
+    solved: FloatArray = np.linalg.solve(gram, target[:, :, None])
+    ab = solved[:, :, 0]
+    power = centred[:, 2, 2]
+    explained = np.divide(
+        np.sum(ab * target, axis=1), power, out=np.zeros_like(power), where=power > 0
+    )
+    starts = start + block * np.arange(len(moments), dtype=np.float64)
+    return Response(
+        start_s=starts,
+        stop_s=starts + BLOCKS * block,
+        valid=valid,
+        ratio=np.asarray(ab[:, 0] - 1j * ab[:, 1], dtype=np.complex128),
+        offset=mean[:, 2] - mean[:, 0] + shift,
+        explained=np.clip(explained, 0.0, 1.0),
+        spread=spread,
+        asked=asked,
+        period_s=period_s,
+    )
+
+
+def predicted(
+    motion: JointMotion, period_s: float, ratio: complex, offset: float, t_s: FloatArray
+) -> FloatArray:
+    """The position that a response would give.
+
+    Args:
+        motion: The joint.
+        period_s: Cycle of its command T [s].
+        ratio: H.
+        offset: Mean of the position less that of the command [rad].
+        t_s: Times [s], shape (n,).
+
+    Returns:
+        Positions [rad], shape (n,).
+    """
+    c, d = motion.command.at(t_s), motion.command.at(t_s - period_s / BLOCKS)
+    level = float(np.mean(c)) if c.size else 0.0
+    return level + offset + ratio.real * (c - level) - ratio.imag * (d - level)

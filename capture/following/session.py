@@ -1,0 +1,115 @@
+"""The joints of a session that do not follow their command, read from its columns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import DataError, LogError, MissingChannelError
+from ..log.session import Session
+from ..log.signals import Signal
+from .fault import Fault
+from .find import joints_not_following
+from .motion import JointMotion, Samples
+
+COMMANDS = "/joint_commands"
+STATES = "/joint_states"
+
+
+def samples_of(signal: Signal | None, origin_ns: int) -> Samples | None:
+    """Take a recorded signal as finite samples at increasing times.
+
+    Args:
+        signal: The signal, or None.
+        origin_ns: Unix time that becomes 0 s.
+
+    Returns:
+        The samples; None for no signal or one without finite values.
+    """
+    if signal is None or not signal.values.size:
+        return None
+    t_ns, values = signal.t_ns, signal.values
+    finite = np.isfinite(values)
+    if not finite.all():
+        t_ns, values = t_ns[finite], values[finite]
+    if t_ns.size > 1 and (np.diff(t_ns) <= 0).any():
+        order = np.argsort(t_ns, kind="stable")
+        t_ns, values = t_ns[order], values[order]
+        first = np.concatenate(([True], np.diff(t_ns) > 0))
+        t_ns, values = t_ns[first], values[first]
+    if not t_ns.size:
+        return None
+    return Samples((t_ns - np.int64(origin_ns)).astype(np.float64) * 1e-9, values)
+
+
+def faults_in_session(session: Session) -> tuple[Fault, ...]:
+    """Find the joints of a session that do not follow their command.
+
+    Args:
+        session: An open session.
+
+    Returns:
+        The faults, in chain order, times from the session's start; none where the session lacks
+        commands or states.
+    """
+    quantities = {
+        "command": (COMMANDS, "position"),
+        "position": (STATES, "position"),
+        "velocity": (STATES, "velocity"),
+        "effort": (STATES, "effort"),
+        "current": ("/joint_current", "position"),
+    }
+    columns: dict[str, dict[str, Signal]] = {}
+    for quantity, (topic, field) in quantities.items():
+        if topic not in session.channels:
+            continue
+        try:
+            signals = session.joints(topic, field)
+        except (MissingChannelError, DataError, LogError):
+            continue  # the health check itself reports a channel that can't be read
+        columns[quantity] = {name: signals.signal(name) for name in signals.names}
+    if "command" not in columns or "position" not in columns:
+        return ()
+    return joints_not_following(motions_of(columns, session, session.start_ns))
+
+
+def motions_of(
+    columns: dict[str, dict[str, Signal]], session: Session, origin_ns: int
+) -> list[JointMotion]:
+    """The joints' signals, in chain order.
+
+    Args:
+        columns: ``command``, ``position`` and whichever of ``velocity``, ``effort``, ``current``
+            and ``reference`` there are, to signals by joint name.
+        session: The session, for its robot.
+        origin_ns: Unix time that becomes 0 s.
+
+    Returns:
+        The joints that have a command; a joint without positions has an empty record.
+    """
+    robot = session.robot
+    limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
+    empty = Samples(np.zeros(0), np.zeros(0))
+    motions: list[JointMotion] = []
+    for name, signal in columns["command"].items():
+        command = samples_of(signal, origin_ns)
+        if command is None:
+            continue
+
+        def other(quantity: str, joint: str = name) -> Samples | None:
+            return samples_of(columns.get(quantity, {}).get(joint), origin_ns)
+
+        raw = columns["position"].get(name)
+        effort = other("effort")
+        motions.append(
+            JointMotion(
+                name=name,
+                command=command,
+                position=other("position") or empty,
+                velocity=other("velocity"),
+                effort=effort if effort is not None else other("current"),
+                reference=other("reference"),
+                limits=limits.get(name),
+                missing=0 if raw is None else int(np.count_nonzero(~np.isfinite(raw.values))),
+            )
+        )
+    return motions
