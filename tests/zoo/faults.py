@@ -235,7 +235,7 @@ def _(robot, rng, j):
     kinds = frozenset({"frozen_sensor", "stale_sensor", "lost_samples"})
     kinds |= frozenset() if robot.channels.second else STOPPED
     return (Change(j, telemetry=lambda one: _hold(one, acts)),), Truth(
-        (JointTruth(j, frozenset({"frozen_sensor"}), kinds, since_s=since),)
+        (JointTruth(j, frozenset({"frozen_sensor", "stale_sensor"}), kinds, since_s=since),)
     )
 
 
@@ -393,7 +393,7 @@ def _slip(robot, rng, j):
 @fault("encoder slips")
 def _(robot, rng, j):
     since, step = _slip(robot, rng, j)
-    kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped_sensor")
+    kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped_sensor", fast=True)
     return (Change(j, reading=lambda read: read + step),), Truth(
         (JointTruth(j, frozenset({"slipped_sensor"}), kinds, OFFSET, since_s=since, checked=False),)
     )
@@ -500,7 +500,7 @@ def _(robot, rng, j):
 @fault("gain less from half-way on")
 def _(robot, rng, j):
     _, acts = _onset(robot, j, rng, 0.4, 0.6)
-    size = min(2.5 * _relative(robot, j, rng, 0.2), 0.7)
+    size = min(2.5 * _relative(robot, j, rng, 0.2), 0.5)
     change = Change(j, position=robot.moved(j, gain=np.where(acts, 1 - size, 1.0)))
     return (change,), _responds(j, GAIN)
 

@@ -62,11 +62,7 @@ def judge(output: str, said: Statement, truth: Truth, robot: Robot) -> Judgement
     if said.error:
         return Judgement((f"error: {said.error}",))
     planted = {robot.names[one.joint]: one for one in truth.joints}
-    expected = [
-        name
-        for name, one in planted.items()
-        if (output != "log check" or one.checked) and (output != "compare" or one.compared)
-    ]
+    expected = [name for name, one in planted.items() if _must_name(output, one)]
     first = named_in(said.text, robot.names)
     listed = [*(said.not_following or {}), *(said.stands_out or {})]
     sound = tuple(dict.fromkeys(n for n in [*listed, *first] if n not in planted))
@@ -91,6 +87,15 @@ def judge(output: str, said: Statement, truth: Truth, robot: Robot) -> Judgement
     return Judgement(tuple(missing), sound, narrow)
 
 
+def _must_name(output: str, truth: JointTruth) -> bool:
+    """Whether an output has to name a joint; what a joint stands out by is not for all."""
+    if output == "log check":
+        return truth.checked
+    if output == "compare":
+        return truth.compared
+    return output != "detection" or not truth.stands_out
+
+
 def _undecided(said: Statement, named: Sequence[str]) -> Judgement:
     """Of too few joints none may be named; any that is may as well be sound."""
     missing = ["does not say that no joint can be named"] if said.undecided is False else []
@@ -106,6 +111,8 @@ def _of_joint(
     stated = (said.not_following or {}).get(name)
     outside = (said.stands_out or {}).get(name, frozenset())
     if stated is None:
+        if said.stands_out is None and (truth.stands_out or not truth.names):
+            return [], False  # left to another output
         if outside & truth.stands_out:
             return [], False
         if outside:

@@ -80,7 +80,9 @@ def standing(channels: Channels, cause: str) -> frozenset[str]:
     return STOPPED if channels.second else STOPPED | {"frozen_sensor"}
 
 
-def either(channels: Channels, mechanics: str, sensor: str, *, cause: str) -> frozenset[str]:
+def either(
+    channels: Channels, mechanics: str, sensor: str, *, cause: str, fast: bool = False
+) -> frozenset[str]:
     """Kinds of a fault that mechanics and sensor show alike, effort included.
 
     Args:
@@ -88,12 +90,13 @@ def either(channels: Channels, mechanics: str, sensor: str, *, cause: str) -> fr
         mechanics: Kind of the mechanical fault.
         sensor: Kind of the sensor's fault.
         cause: Which of both was planted.
+        fast: Whether it happens between two samples: no velocity need show it.
 
     Returns:
         Both, or the one that a second sensor or, for the sensor's fault, a true velocity proves.
     """
     if channels.second:
         return frozenset({cause})
-    if cause == sensor and channels.velocity == "true":
+    if cause == sensor and channels.velocity == "true" and not fast:
         return frozenset({sensor})
     return frozenset({mechanics, sensor})
