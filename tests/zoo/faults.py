@@ -141,6 +141,7 @@ def _jam(robot, rng, j, acts, since, *, exact=None):
 
 
 def _plant_jam(robot, rng, j):
+    """The position stands still while the command moves; an effort pushes."""
     since, acts = _onset(robot, j, rng)
     return _jam(robot, rng, j, acts, since)
 
@@ -154,12 +155,14 @@ for _place in ("head", "middle", "tail", None):
     channels=(Channels(velocity="true"), Channels(velocity="derived")),
 )
 def _(robot, rng, j):
+    """As above; no noise any more, and the velocity is zero."""
     since, acts = _onset(robot, j, rng)
     return _jam(robot, rng, j, acts, since, exact=True)
 
 
 @fault("jam late")
 def _(robot, rng, j):
+    """As above, but only in the last fifth or so."""
     left = max(2.6 * 2 * np.pi / robot.omega / robot.duration_s, 0.15)
     since, acts = _onset(robot, j, rng, 1 - left - 0.02, 1 - left)
     return _jam(robot, rng, j, acts, since)
@@ -167,12 +170,14 @@ def _(robot, rng, j):
 
 @fault("jam from the beginning")
 def _(robot, rng, j):
+    """The position never moves."""
     acts = np.ones(len(robot.t_s), dtype=bool)
     return _jam(robot, rng, j, acts, None)
 
 
 @fault("stall at constant effort", channels=WITH_EFFORT)
 def _(robot, rng, j):
+    """The position stands still, the effort stays at one value while the command travels."""
     since, acts = _onset(robot, j, rng)
     position = _hold(robot.moved(j), acts)
     # The integral part of the loop has run to its limit: constant, whatever the command does.
@@ -192,18 +197,21 @@ def _dead(robot, j, acts, since, position):
 
 @fault("dead from the beginning")
 def _(robot, rng, j):
+    """The position stays at a rest angle; an effort is zero."""
     rest = np.full(len(robot.t_s), robot.bias[j] + rng.choice([0.0, 1.0]) * rng.uniform(-0.2, 0.2))
     return _dead(robot, j, np.ones(len(robot.t_s), dtype=bool), None, rest)
 
 
 @fault("dead half-way, holds its place")
 def _(robot, rng, j):
+    """The gearbox holds the angle that it has; an effort is zero from then on."""
     since, acts = _onset(robot, j, rng)
     return _dead(robot, j, acts, since, _hold(robot.moved(j), acts))
 
 
 @fault("dead half-way, sags to rest")
 def _(robot, rng, j):
+    """The position falls to a rest angle within a second and stays; an effort is zero."""
     since, acts = _onset(robot, j, rng)
     moved, t = robot.moved(j), robot.t_s[:, j]
     rest = rng.uniform(-0.3, 0.3)
@@ -213,6 +221,7 @@ def _(robot, rng, j):
 
 @fault("sensor frozen half-way")
 def _(robot, rng, j):
+    """The position repeats one value to the bit; all else goes on."""
     since, acts = _onset(robot, j, rng)
     kinds = standing(robot.channels, "sensor")
     return (Change(j, reading=lambda read: _hold(read, acts)),), Truth(
@@ -222,6 +231,7 @@ def _(robot, rng, j):
 
 @fault("sensor frozen from the beginning")
 def _(robot, rng, j):
+    """The position is one value; all else is as usual."""
     kinds = standing(robot.channels, "sensor")
     return (Change(j, reading=lambda read: np.full_like(read, read[0])),), Truth(
         (JointTruth(j, frozenset({"frozen_sensor"}), kinds),)
@@ -230,6 +240,7 @@ def _(robot, rng, j):
 
 @fault("whole telemetry of a servo frozen half-way")
 def _(robot, rng, j):
+    """Position, velocity and effort of one servo each repeat one value."""
     since, acts = _onset(robot, j, rng)
     # A constant effort is what a stall shows; a second sensor, of another make, goes on.
     kinds = frozenset({"frozen_sensor", "stale_sensor", "lost_samples"})
@@ -241,6 +252,7 @@ def _(robot, rng, j):
 
 @fault("intermittent, a fifth of the time")
 def _(robot, rng, j):
+    """The position stands still for a part of a cycle, again and again; the effort is zero then."""
     acts = _bouts(robot, j, rng, 0.2)
     change = Change(j, position=_hold(robot.moved(j), acts), power=np.where(acts, 0.0, 1.0))
     kinds = standing(robot.channels, "dead") | PAUSED
@@ -249,6 +261,7 @@ def _(robot, rng, j):
 
 @fault("sensor frozen at times, a fifth of the time")
 def _(robot, rng, j):
+    """The position repeats one value for a part of a cycle, again and again; all else goes on."""
     acts = _bouts(robot, j, rng, 0.2)
     kinds = standing(robot.channels, "sensor") | {"stale_sensor"}
     if not (robot.channels.effort or robot.channels.second or robot.channels.velocity == "true"):
@@ -260,6 +273,7 @@ def _(robot, rng, j):
 
 @fault("commands don't reach a servo for a while")
 def _(robot, rng, j):
+    """For two cycles the position stands still, with the small effort of a held command."""
     start = float(rng.uniform(0.25, 0.5)) * robot.duration_s
     long = rng.uniform(1.5, 2.5) * 2 * np.pi / robot.omega
     t = robot.t_s[:, j]
@@ -279,6 +293,7 @@ def _(robot, rng, j):
 
 @fault("a third of the joints dead", joints=(6, 40))
 def _(robot, rng, j):
+    """Several positions stay at rest angles."""
     count = min(robot.m // 3, robot.m - 4)
     joints = sorted(rng.permutation(robot.m)[:count].tolist())
     changes, truths = [], []
@@ -295,6 +310,7 @@ def _(robot, rng, j):
 
 @fault("inverted")
 def _(robot, rng, j):
+    """The position is the mirror image of what it should be."""
     about = robot.bias[j]
     position = 2 * about - robot.moved(j)
     # Turned as a whole: its servo sees what it always saw, and so does its effort.
@@ -307,6 +323,7 @@ def _(robot, rng, j):
 
 @fault("sensor inverted")
 def _(robot, rng, j):
+    """The same; a velocity of its own has the other sign."""
     kinds = either(robot.channels, "inverted", "inverted_sensor", cause="inverted_sensor")
     return (Change(j, reading=lambda read: -read),), Truth(
         (JointTruth(j, frozenset({"inverted_sensor"}), kinds),)
@@ -315,6 +332,7 @@ def _(robot, rng, j):
 
 @fault("sensor of wrong scale")
 def _(robot, rng, j):
+    """The position has a gain of its own, in its constant part too."""
     size = _relative(robot, j, rng, 0.5)
     scale = 1 - min(size, 0.6) if rng.random() < 0.5 else 1 + size
     return (Change(j, reading=lambda read: scale * read),), Truth(
@@ -332,10 +350,15 @@ def _(robot, rng, j):
 
 @fault("sensor in degrees")
 def _(robot, rng, j):
+    """The position is 180/pi times as large."""
     return (Change(j, reading=np.degrees),), Truth(
         (
             JointTruth(
-                j, frozenset({"scaled_sensor"}), frozenset({"scaled_sensor"}), GAIN, checked=False
+                j,
+                frozenset({"scaled_sensor"}),
+                frozenset({"scaled_sensor"}),
+                GAIN | OFFSET,
+                checked=False,
             ),
         )
     )
@@ -343,6 +366,7 @@ def _(robot, rng, j):
 
 @fault("swapped cables")
 def _(robot, rng, j):
+    """Two joints carry out each other's command."""
     other = j + 1 if j + 1 < robot.m else j - 1
     changes = tuple(
         Change(a, position=robot.moved(a, of=b), wanted=robot.wanted(b, at=a))
@@ -359,6 +383,7 @@ def _(robot, rng, j):
 
 @fault("stale samples")
 def _(robot, rng, j):
+    """Every value is repeated some times."""
     every = int(np.ceil(rng.uniform(4, 8)))
     old = np.arange(len(robot.t_s)) // every * every
     kinds = frozenset({"stale_sensor", "frozen_sensor", "lost_samples"})
@@ -371,6 +396,7 @@ def _(robot, rng, j):
 
 @fault("wrapped counter")
 def _(robot, rng, j):
+    """The position jumps by a whole turn in a part of each cycle."""
     # The counter wraps at half the amplitude, on one side of the middle.
     at = robot.bias[j] + rng.choice([-1, 1]) * rng.uniform(0.1, 0.6) * robot.swing(j)
     side = np.sign(at - robot.bias[j])
@@ -392,6 +418,7 @@ def _slip(robot, rng, j):
 
 @fault("encoder slips")
 def _(robot, rng, j):
+    """The position makes a step and goes on from there."""
     since, step = _slip(robot, rng, j)
     kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped_sensor", fast=True)
     return (Change(j, reading=lambda read: read + step),), Truth(
@@ -401,6 +428,7 @@ def _(robot, rng, j):
 
 @fault("horn slips")
 def _(robot, rng, j):
+    """The same; a second sensor shows it too."""
     since, step = _slip(robot, rng, j)
     kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped")
     change = Change(j, position=robot.moved(j) + step, wanted=robot.wanted(j) + step)
@@ -411,6 +439,7 @@ def _(robot, rng, j):
 
 @fault("sensor drifts")
 def _(robot, rng, j):
+    """The mean of the position wanders."""
     size = 2 * _offset(robot, j, rng, 0.4)
     drift = size * robot.t_s[:, j] / robot.duration_s
     kinds = frozenset({"drifting_sensor"})
@@ -423,6 +452,7 @@ def _(robot, rng, j):
 
 @fault("noise bursts")
 def _(robot, rng, j):
+    """The position is noisy for half a second, some times."""
     t = robot.t_s[:, j]
     starts = rng.uniform(0.05, 0.9, 4) * robot.duration_s
     acts = ((t[:, None] >= starts) & (t[:, None] < starts + 0.5)).any(axis=1)
@@ -437,6 +467,7 @@ def _(robot, rng, j):
 
 @fault("packets of one servo lost")
 def _(robot, rng, j):
+    """Samples of one joint are missing at random."""
     lost = rng.random(len(robot.t_s)) < rng.uniform(0.1, 0.5)
     kinds = frozenset({"lost_samples"})
     return (Change(j, lost=lost),), Truth((JointTruth(j, kinds, kinds, compared=False),))
@@ -444,6 +475,7 @@ def _(robot, rng, j):
 
 @fault("one servo silent for a while")
 def _(robot, rng, j):
+    """Samples of one joint are missing for seconds."""
     start = float(rng.uniform(0.25, 0.5)) * robot.duration_s
     t = robot.t_s[:, j]
     lost = (t >= start) & (t < start + rng.uniform(0.15, 0.3) * robot.duration_s)
@@ -462,6 +494,7 @@ def _responds(j, quantities, **more):
 
 
 def _weak(robot, rng, j):
+    """The position is smaller."""
     size = min(_relative(robot, j, rng, 0.5), 0.6)
     return (Change(j, position=robot.moved(j, gain=1 - size)),), _responds(j, GAIN)
 
@@ -474,24 +507,28 @@ fault("gain less, of forty", joints=(40, 40))(_weak)
 
 @fault("gain more")
 def _(robot, rng, j):
+    """The position is larger."""
     size = _relative(robot, j, rng, 0.4)
     return (Change(j, position=robot.moved(j, gain=1 + size)),), _responds(j, GAIN)
 
 
 @fault("lag more")
 def _(robot, rng, j):
+    """The position is later."""
     size = _relative(robot, j, rng, 0.5)
     return (Change(j, position=robot.moved(j, more_lag=size)),), _responds(j, LAG)
 
 
 @fault("offset only")
 def _(robot, rng, j):
+    """The position is off by a constant."""
     size = _offset(robot, j, rng, 0.3)
     return (Change(j, position=robot.moved(j) + size),), _responds(j, OFFSET)
 
 
 @fault("gain fades")
 def _(robot, rng, j):
+    """The position becomes smaller from cycle to cycle."""
     size = min(2 * _relative(robot, j, rng, 0.25), 0.9)
     gain = 1 - size * robot.t_s[:, j] / robot.duration_s
     return (Change(j, position=robot.moved(j, gain=gain)),), _responds(j, GAIN)
@@ -499,6 +536,7 @@ def _(robot, rng, j):
 
 @fault("gain less from half-way on")
 def _(robot, rng, j):
+    """The position becomes smaller at once."""
     _, acts = _onset(robot, j, rng, 0.4, 0.6)
     size = min(2.5 * _relative(robot, j, rng, 0.2), 0.5)
     change = Change(j, position=robot.moved(j, gain=np.where(acts, 1 - size, 1.0)))
@@ -513,6 +551,7 @@ def _clipped(robot):
 
 @fault("saturates at both ends")
 def _(robot, rng, j):
+    """Flat tops at both ends of the motion."""
     level = rng.uniform(0.5, 0.75) * robot.swing(j)
     about = robot.bias[j]
     position = about + np.clip(robot.moved(j) - about, -level, level)
@@ -523,6 +562,7 @@ def _(robot, rng, j):
 
 @fault("at its limit on one side")
 def _(robot, rng, j):
+    """Flat tops at one end of the motion."""
     level = rng.uniform(-0.2, 0.4) * robot.swing(j)
     side, about = rng.choice([-1, 1]), robot.bias[j]
     position = about + side * np.minimum(side * (robot.moved(j) - about), level)
@@ -535,6 +575,7 @@ def _(robot, rng, j):
 
 @fault("speed limited")
 def _(robot, rng, j):
+    """A triangle instead of a sine."""
     moved, t = robot.moved(j), robot.t_s[:, j]
     most = rng.uniform(0.3, 0.55) * robot.swing(j) * robot.omega
     position = moved.copy()
@@ -546,6 +587,7 @@ def _(robot, rng, j):
 
 @fault("backlash")
 def _(robot, rng, j):
+    """Flat for a moment at both reversals, then in step again."""
     half = max(rng.uniform(0.08, 0.3), _relative(robot, j, rng, 0.1)) * robot.swing(j)
     moved = robot.moved(j)
     position = moved.copy()
@@ -556,6 +598,7 @@ def _(robot, rng, j):
 
 @fault("sticks at both reversals")
 def _(robot, rng, j):
+    """Flat for a moment at both reversals, then a jump."""
     band = max(rng.uniform(0.1, 0.35), _relative(robot, j, rng, 0.1)) * robot.swing(j)
     moved = robot.moved(j)
     position, moves = moved.copy(), True
@@ -577,6 +620,7 @@ def _both(first: str, second: str):
         two = FAULTS[second].plant(robot, rng, other)
         return one[0] + two[0], Truth(one[1].joints + two[1].joints)
 
+    plant.__doc__ = "Both, at two joints."
     return plant
 
 
@@ -591,10 +635,12 @@ for _pair in (
 
 @fault("three joints, one weak", joints=(3, 3))
 def _(robot, rng, j):
+    """One of three positions is smaller."""
     changes, truth = _weak(robot, rng, j)
     return changes, Truth(truth.joints, undecided=True)
 
 
 @fault("healthy")
 def _(robot, rng, j):
+    """All is as usual."""
     return (), Truth()

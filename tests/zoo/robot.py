@@ -140,21 +140,34 @@ class Robot:
     def half(self, joint: int, count: float | None = None) -> tuple[float, float]:
         """Half widths of simultaneous 95 % intervals of a joint's deviation from the others.
 
+        Bonferroni over 3 m deviations; each from what a common value, a trend and a parabola
+        through the other joints predict (as many of them as m allows).
+
         Args:
             joint: The joint.
             count: Samples; None: all.
 
         Returns:
-            Of gain (relative) and lag [rad], which are the same number, and of the offset [rad]:
-            Bonferroni over 3 m deviations, each from the mean of the others.
+            Of gain (relative) and lag [rad], which are the same number, and of the offset [rad].
         """
         n = len(self.t_s) if count is None else count
         noise = float(np.hypot(self.sigma, self.step / 12**0.5))
-        factor = float(norm.ppf(1 - 0.025 / (3 * self.m))) * (1 + 2 / self.m) ** 0.5
-        return (
-            factor * noise * (2 / n) ** 0.5 / self.swing(joint),
-            factor * noise / n**0.5,
-        )
+        factor = float(norm.ppf(1 - 0.025 / (3 * self.m))) * (1 + leverage(self.m, joint)) ** 0.5
+        return factor * noise * (2 / n) ** 0.5 / self.swing(joint), factor * noise / n**0.5
+
+
+def leverage(m: int, joint: int) -> float:
+    """Variance of what the other joints predict for one, in variances of one joint.
+
+    Args:
+        m: Joints.
+        joint: The one that is left out.
+    """
+    place = np.linspace(-1.0, 1.0, m)
+    terms = 3 if m >= 7 else 2 if m >= 5 else 1
+    basis = np.stack([place**k for k in range(terms)], axis=1)
+    others = np.delete(basis, joint, axis=0)
+    return float(basis[joint] @ np.linalg.solve(others.T @ others, basis[joint]))
 
 
 def draw(

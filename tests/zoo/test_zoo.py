@@ -1,11 +1,14 @@
 """The zoo itself: bags that others can read, faults that are what they claim to be."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from zoo.bags import write_bag
 from zoo.faults import FAULTS, plant
+from zoo.page import lines
 from zoo.robot import Channels, draw, record
 from zoo.run import robot_for, run_all, seed_of, table
 
@@ -73,6 +76,11 @@ def test_a_healthy_robot_answers_as_drawn():
 
 def test_there_are_faults_enough():
     assert len([name for name in FAULTS if name != "healthy"]) >= 30
+
+
+def test_the_manual_lists_the_kinds_of_every_fault():
+    page = Path(__file__).parents[2] / "docs" / "faults.md"
+    assert "\n".join(lines()) in page.read_text(), "renew it: python -m zoo.page"
 
 
 @pytest.mark.slow
