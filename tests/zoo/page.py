@@ -30,7 +30,8 @@ def lines() -> Iterator[str]:
         shown = cells[:1] + [
             "same" if cell == cells[0] and cell != "-" else cell for cell in cells[1:]
         ]
-        yield f"| {name.split(', head')[0]} | {str(fault.plant.__doc__).rstrip('.')} | {' | '.join(shown)} |"
+        looks = str(fault.plant.__doc__).rstrip(".")
+        yield " | ".join([f"| {name.split(', head')[0]}", looks, *shown]) + " |"
 
 
 def _cell(fault: Fault, channels: Channels) -> str:
