@@ -11,7 +11,7 @@ DEMO   := out/demo
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow check format bench docs pictures golden lock clean
+.PHONY: help demo test slow zoo check format bench docs pictures golden lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -49,6 +49,9 @@ test: $(READY)  ## all tests but the slow ones
 
 slow: $(READY)  ## the slow tests
 	$(BIN)/python -m pytest -m slow
+
+zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
+	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)
 
 check: $(READY)  ## lint, format, types, layers
 	$(BIN)/ruff check .

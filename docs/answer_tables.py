@@ -1,0 +1,243 @@
+"""The tables of docs/faults.md on errors: how often an answer names what is not there.
+
+``.venv/bin/python docs/answer_tables.py [SESSIONS]`` prints them as Markdown; with 2,000 sessions
+a cell it takes about a quarter of an hour. Nothing is written to files: commands and positions are
+made in memory and given to the same functions as those of a session.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.stats import norm
+
+from analysis.estimators.series import Series
+from analysis.fitting import fit_gait
+from capture.following import JointMotion, joints_not_following
+from capture.following.motion import Samples
+
+GAIN, LAG = 0.95, np.radians(10.0)
+JOINTS = 9
+"""In each plane."""
+
+SIGMA = 4e-3
+"""Standard deviation of the noise [rad]."""
+
+STEP = np.radians(0.088)
+"""Of a 12-bit encoder [rad]."""
+
+AR = 0.9
+SHARED = 0.9
+"""Share of the noise's variance that all joints have in common."""
+
+MARGIN_GAIN, MARGIN_LAG_RAD = 0.02, np.radians(1.0)
+NOISES = ("white", "AR(0.9)", "shared", "quantised")
+STATEMENTS = ("not following", "stands out", "shape")
+
+
+class Recorded(NamedTuple):
+    """One session in memory.
+
+    Attributes:
+        names: Of the joints, head to tail.
+        planes: Plane of each joint.
+        t_s: Sampling times [s], shape (n,).
+        command: [rad], shape (m, n).
+        position: [rad], shape (m, n).
+    """
+
+    names: tuple[str, ...]
+    planes: tuple[str, ...]
+    t_s: np.ndarray
+    command: np.ndarray
+    position: np.ndarray
+
+
+def session(random, noise, planes, *, odd=None, quantity="gain"):
+    """Identical joints in one kind of noise, one of them off if wanted.
+
+    Args:
+        random: Generator.
+        noise: One of ``NOISES``.
+        planes: 1 or 2, each with ``JOINTS`` joints, in turn along the body.
+        odd: Index of the joint that is off by three half widths, or None.
+        quantity: ``gain`` or ``lag``: by what it is off.
+
+    Returns:
+        The session.
+    """
+    m, rate = JOINTS * planes, 50.0
+    frequency = 0.5 if noise == "quantised" else random.uniform(0.4, 1.2)
+    t = np.arange(round(15.0 * rate)) / rate
+    omega = 2 * np.pi * frequency
+    by_plane = np.arange(m) % planes
+    amplitude = random.uniform(0.2, 0.6) * np.where(by_plane == 0, 1.0, random.uniform(0.6, 1.0))
+    phase = (
+        random.uniform(-np.pi, np.pi)
+        - np.arange(m) * random.uniform(0.4, 1.6)
+        + by_plane * random.uniform(-np.pi, np.pi)
+    )
+    gain, lag = np.full(m, GAIN), np.full(m, LAG)
+    if odd is not None:
+        half = half_width(
+            noise,
+            planes,
+            odd,
+            t,
+            omega=omega,
+            response=gain * amplitude * np.exp(1j * (phase - lag)),
+        )
+        margin = MARGIN_GAIN if quantity == "gain" else MARGIN_LAG_RAD
+        size = max(3 * half, margin + 2 * half) * random.choice([-1.0, 1.0])
+        gain[odd] *= np.exp(size) if quantity == "gain" else 1.0
+        lag[odd] += size if quantity == "lag" else 0.0
+    angle = omega * t + phase[:, None]
+    offset = random.uniform(-0.3, 0.3, (m, 1)) * (noise == "quantised")
+    command = offset + amplitude[:, None] * np.sin(angle)
+    clean = offset + (gain * amplitude)[:, None] * np.sin(angle - lag[:, None])
+    position = clean + noise_of(random, noise, m, t.size)
+    if noise == "quantised":
+        position = np.round(position / STEP) * STEP
+    names = tuple(f"joint{i + 1:02d}" for i in range(m))
+    kinds = tuple("horizontal" if k == 0 else "vertical" for k in by_plane)
+    return Recorded(names, kinds, t, command, position)
+
+
+def noise_of(random, noise, m, n):
+    """Noise of the positions [rad], shape (m, n)."""
+    if noise == "quantised":  # of the encoder alone
+        return np.zeros((m, n))
+    if noise == "AR(0.9)":
+        drawn = random.normal(size=(m, n + 200))
+        return SIGMA * lfilter([(1 - AR**2) ** 0.5], [1.0, -AR], drawn)[:, 200:]
+    own = SIGMA * random.normal(size=(m, n))
+    if noise == "white":
+        return own
+    return (1 - SHARED) ** 0.5 * own + SHARED**0.5 * SIGMA * random.normal(size=n)
+
+
+def half_width(noise, planes, joint, t, *, omega, response):
+    """Half width of the simultaneous 95 % interval of one joint's log gain or lag [rad].
+
+    Of its deviation from what a common value, a trend and a parabola through the plane's other
+    joints predict; Bonferroni over all joints and three quantities. In closed form from the
+    spectrum of the noise, not from the code under test.
+    """
+    place = np.linspace(-1.0, 1.0, JOINTS)
+    basis = np.stack([place**k for k in range(3)], axis=1)
+    j = joint // planes
+    others = np.delete(np.arange(JOINTS), j)
+    weights = np.zeros(JOINTS)
+    weights[others] = -basis[j] @ np.linalg.pinv(basis[others])
+    weights[j] = 1.0
+    own = weights / response[joint % planes :: planes]
+    n, power = t.size, SIGMA**2
+    if noise == "AR(0.9)":
+        power *= (1 - AR**2) / abs(1 - AR * np.exp(-1j * omega * (t[1] - t[0]))) ** 2
+    if noise == "quantised":  # half-wave symmetry leaves so many distinct phases
+        n, power = round(np.pi / (omega * (t[1] - t[0]))), STEP**2 / 12
+    single = float(np.sum(np.abs(own) ** 2))
+    share = SHARED if noise == "shared" else 0.0
+    spread = (1 - share) * single + share * abs(np.sum(own)) ** 2
+    factor = norm.ppf(1 - 0.025 / (3 * JOINTS * planes))
+    return float(factor * (2 * power / n * spread) ** 0.5)
+
+
+def stated(recorded):
+    """What the answer states of a session: the only call of the code under test.
+
+    Args:
+        recorded: The session.
+
+    Returns:
+        The joints that are named by each of ``STATEMENTS``; for ``shape`` its kinds.
+    """
+    joints = range(len(recorded.names))
+    motions = [
+        JointMotion(
+            recorded.names[j],
+            Samples(recorded.t_s, recorded.command[j]),
+            Samples(recorded.t_s, recorded.position[j]),
+        )
+        for j in joints
+    ]
+    broken = tuple(fault.joint for fault in joints_not_following(motions))
+    series = [
+        {recorded.names[j]: Series(recorded.names[j], recorded.t_s, rows[j]) for j in joints}
+        for rows in (recorded.command, recorded.position)
+    ]
+    fit_gait(*series, float(recorded.t_s[-1]), lambda _: None)
+    return dict.fromkeys(STATEMENTS, ()) | {"not following": broken}
+
+
+def identical(sessions, seed=1):
+    """Share of sessions of identical joints with any statement, and with each.
+
+    Args:
+        sessions: Of each cell.
+        seed: Of all.
+
+    Returns:
+        Noise and planes to the share with any statement, then with each of ``STATEMENTS``.
+    """
+    rows = {}
+    for noise in NOISES:
+        for planes in (1, 2):
+            random = np.random.default_rng([seed, NOISES.index(noise), planes])
+            found = np.zeros(len(STATEMENTS) + 1)
+            for _ in range(sessions):
+                told = stated(session(random, noise, planes))
+                each = [bool(told[kind]) for kind in STATEMENTS]
+                found += [any(each), *each]
+            rows[noise, planes] = found / sessions
+    return rows
+
+
+def one_off(sessions, seed=2):
+    """Share of sessions in which the joint that is off is named, and in which another one is.
+
+    Args:
+        sessions: Of each cell.
+        seed: Of all.
+
+    Returns:
+        Noise, planes and quantity to both shares.
+    """
+    rows = {}
+    for noise in NOISES:
+        for planes in (1, 2):
+            for k, quantity in enumerate(("gain", "lag")):
+                random = np.random.default_rng([seed, NOISES.index(noise), planes, k])
+                found = np.zeros(2)
+                for _ in range(sessions):
+                    odd = int(random.integers(JOINTS * planes))
+                    made = session(random, noise, planes, odd=odd, quantity=quantity)
+                    told = stated(made)
+                    named = {*told["not following"], *told["stands out"]}
+                    own = made.names[odd]
+                    found += [own in named, bool(named - {own})]
+                rows[noise, planes, quantity] = found / sessions
+    return rows
+
+
+def main(sessions=2000):
+    """Print both tables."""
+    print(f"Identical joints, {sessions:,} sessions a line:\n")
+    print("| noise | planes | any statement | not following | stands out | shape |")
+    print("|---|---|---|---|---|---|")
+    for (noise, planes), shares in identical(sessions).items():
+        print(f"| {noise} | {planes} | " + " | ".join(f"{100 * x:.2f} %" for x in shares) + " |")
+    sessions = max(sessions // 4, 1)
+    print(f"\nOne joint off by three half widths, {sessions:,} sessions a line:\n")
+    print("| noise | planes | by | it is named | another is |")
+    print("|---|---|---|---|---|")
+    for (noise, planes, quantity), shares in one_off(sessions).items():
+        row = " | ".join(f"{100 * x:.1f} %" for x in shares)
+        print(f"| {noise} | {planes} | {quantity} | {row} |")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

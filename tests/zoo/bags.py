@@ -1,0 +1,113 @@
+"""ROS 2 bags of another make: MCAP by Foxglove's ``mcap``, JointStates in CDR by hand.
+
+The messages are laid out in NumPy, all of one topic at once: a hundred seeds of every fault are
+some hundred million numbers. A test reads them back with ``mcap_ros2``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from .robot import SECOND_TOPIC, Log
+
+EPOCH_NS = 1_700_000_000_000_000_000
+
+JOINT_STATE = """std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+def write_bag(log: Log, path: Path) -> Path:
+    """Write what was recorded.
+
+    Args:
+        log: The log.
+        path: A file, replaced if it exists.
+
+    Returns:
+        The file.
+    """
+    robot = log.robot
+    rows: list[tuple[int, int, bytes]] = []
+    topics = [
+        "/joint_commands",
+        "/joint_states",
+        *([SECOND_TOPIC] if log.second is not None else []),
+    ]
+    rows += _messages(0, robot.names, robot.sent_s, [robot.sent(), None, None])
+    for number, position, others in (
+        (1, log.position, (log.velocity, log.effort)),
+        (2, log.second, (None, None)),
+    ):
+        if position is None:
+            continue
+        groups = [[j] for j in range(robot.m)] if robot.per_servo else [list(range(robot.m))]
+        for group in groups:
+            times = robot.t_s[:, group[0]]
+            columns = [None if one is None else one[:, group] for one in (position, *others)]
+            if robot.per_servo:  # a message that was lost is not there
+                kept = np.isfinite(position[:, group[0]])
+                times = times[kept]
+                columns = [None if one is None else one[kept] for one in columns]
+            rows += _messages(number, [robot.names[j] for j in group], times, columns)
+    rows.sort(key=lambda row: row[:2])
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4)
+        writer.start(profile="ros2", library="fault zoo")
+        schema = writer.register_schema(
+            "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE.encode()
+        )
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in topics]
+        for t_ns, number, data in rows:
+            writer.add_message(channels[number], t_ns, data, t_ns)
+        writer.finish()
+    return path
+
+
+def _messages(number, names, times_s, columns):
+    """Time, topic's number and CDR of each message, in order of time."""
+    count = len(names)
+    text = b"".join(_text(name) for name in names)
+    # Offsets count from after the encapsulation: stamp 8, empty frame id 4 + 1 and 3 to align.
+    at = 8 + 8 + 4 + len(text)
+    fields = [("head", "V4"), ("sec", "<i4"), ("ns", "<u4"), ("frame", "V8"), ("names", "<u4")]
+    fields.append(("text", f"V{len(text)}"))
+    values = {}
+    for key, column in zip(("position", "velocity", "effort"), columns, strict=True):
+        fields.append((f"{key}_count", "<u4"))
+        at += 4
+        if column is not None:
+            fields += [(f"{key}_pad", f"V{-at % 8}")] if at % 8 else []
+            fields.append((key, "<f8", (count,)))
+            at += -at % 8 + 8 * count
+            values[key] = column
+    t_ns = EPOCH_NS + np.rint(np.asarray(times_s) * 1e9).astype(np.int64)
+    rows = np.zeros(len(t_ns), dtype=fields)
+    rows["head"] = b"\0\1\0\0"
+    rows["sec"], rows["ns"] = t_ns // 10**9, t_ns % 10**9
+    rows["frame"] = b"\1\0\0\0\0\0\0\0"
+    rows["names"] = count
+    rows["text"] = text
+    for key, column in values.items():
+        rows[f"{key}_count"] = count
+        rows[key] = column
+    return [(int(t), number, row.tobytes()) for t, row in zip(t_ns, rows, strict=True)]
+
+
+def _text(name: str) -> bytes:
+    data = name.encode() + b"\0"
+    return len(data).to_bytes(4, "little") + data + b"\0" * (-len(data) % 4)

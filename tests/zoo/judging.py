@@ -1,0 +1,148 @@
+"""Right or wrong: what an output says against the truth."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .outputs import Statement
+from .robot import Robot
+from .truth import JointTruth, Truth
+
+MOST_NAMED = 4
+"""So many joints a sentence must name; with more it may count the rest."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One output of one session.
+
+    Attributes:
+        missing: Why it is wrong, a phrase each; right if empty.
+        sound: Sound joints that it names.
+        narrow: Whether it states fewer kinds than the data can't tell apart, the true one among
+            them: right here, but a matter of luck.
+    """
+
+    missing: tuple[str, ...] = ()
+    sound: tuple[str, ...] = ()
+    narrow: bool = False
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing is wrong; sound joints are counted apart."""
+        return not self.missing
+
+
+def named_in(text: str, names: Sequence[str]) -> list[str]:
+    """Joints whose names a text contains as whole words, in order of their first place."""
+    found: dict[str, int] = {}
+    for name in names:
+        place = re.search(rf"(?<![\w/]){re.escape(name)}(?![\w/])", text)
+        if place is not None:
+            found[name] = place.start()
+    return sorted(found, key=found.__getitem__)
+
+
+def judge(output: str, said: Statement, truth: Truth, robot: Robot) -> Judgement:
+    """Judge what an output says.
+
+    Args:
+        output: Its name.
+        said: What it says.
+        truth: What was planted.
+        robot: The robot.
+
+    Returns:
+        The judgement.
+    """
+    if said.error:
+        return Judgement((f"error: {said.error}",))
+    planted = {robot.names[one.joint]: one for one in truth.joints}
+    expected = [name for name, one in planted.items() if _must_name(output, one)]
+    first = named_in(said.text, robot.names)
+    listed = [*(said.not_following or {}), *(said.stands_out or {})]
+    sound = tuple(dict.fromkeys(n for n in [*listed, *first] if n not in planted))
+    if truth.undecided and output != "compare":
+        return _undecided(said, [*listed, *first])
+    missing = [f"{name} not in its sentence" for name in expected[:MOST_NAMED] if name not in first]
+    if len(expected) > MOST_NAMED:  # any of them will do: the worst come first
+        short = len([name for name in expected if name in first]) < MOST_NAMED
+        missing = [f"names fewer than {MOST_NAMED} of {len(expected)} joints"] if short else []
+    if output == "compare" and expected and first and first[0] not in planted:
+        missing.append(f"names {first[0]} first")
+    if expected and output != "log check" and said.alike:
+        missing.append("claims alike")
+    if not planted and output == "log check" and not said.alike:
+        missing.append("calls a healthy bag less than good")
+    narrow = False
+    if said.not_following is not None:
+        for name, one in planted.items():
+            wrong, few = _of_joint(name, one, said, robot)
+            missing += wrong
+            narrow |= few
+    return Judgement(tuple(missing), sound, narrow)
+
+
+def _must_name(output: str, truth: JointTruth) -> bool:
+    """Whether an output has to name a joint; what a joint stands out by is not for all."""
+    if output == "log check":
+        return truth.checked
+    if output == "compare":
+        return truth.compared
+    return output != "detection" or not truth.stands_out
+
+
+def _undecided(said: Statement, named: Sequence[str]) -> Judgement:
+    """Of too few joints none may be named; any that is may as well be sound."""
+    missing = ["does not say that no joint can be named"] if said.undecided is False else []
+    if named:
+        missing.append(f"names {named[0]} although none can be named")
+    return Judgement(tuple(missing))
+
+
+def _of_joint(
+    name: str, truth: JointTruth, said: Statement, robot: Robot
+) -> tuple[list[str], bool]:
+    """What is wrong in the lists about one planted joint; whether its kinds are too few."""
+    stated = (said.not_following or {}).get(name)
+    outside = (said.stands_out or {}).get(name, frozenset())
+    if stated is None:
+        if said.stands_out is None and (truth.stands_out or not truth.names):
+            return [], False  # left to another output
+        if outside & truth.stands_out:
+            return [], False
+        if outside:
+            return [f"{name} stands out by {_listed(outside)} only"], False
+        return [f"{name} not listed"], False
+    if not truth.names:
+        return [f"{name} listed as {_listed(stated.kinds)}, but follows"], False
+    wrong: list[str] = []
+    if not stated.kinds & truth.names:
+        wrong.append(f"{name}: {_listed(stated.kinds)} lacks {_listed(truth.names, ' or ')}")
+    if excess := stated.kinds - truth.allowed:
+        wrong.append(f"{name}: {_listed(excess)} excluded by the data")
+    wrong += _onset(name, truth, stated.since_s, robot)
+    return wrong, stated.kinds < truth.allowed
+
+
+def _onset(name: str, truth: JointTruth, since_s: float | None, robot: Robot) -> list[str]:
+    """An onset that is off by more than a cycle and a half, and half a second."""
+    if truth.since_s is None:
+        return []
+    slack = 1.5 * 2 * np.pi / robot.omega + 0.5
+    if abs((since_s or 0.0) - truth.since_s) <= slack:
+        return []
+    return [f"{name} since {since_s} s, not {truth.since_s:.1f} s"]
+
+
+def _listed(words: frozenset[str], by: str = ", ") -> str:
+    return by.join(sorted(words))
+
+
+def judge_all(said: Mapping[str, Statement], truth: Truth, robot: Robot) -> dict[str, Judgement]:
+    """Judge every output of a session."""
+    return {output: judge(output, one, truth, robot) for output, one in said.items()}

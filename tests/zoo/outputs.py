@@ -1,0 +1,160 @@
+"""What undulog says of a bag, output by output: the only module here that imports it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+from analysis.analyse import measure_session
+from analysis.compare.compare import Choices, compare_sessions
+from analysis.cycles import cycle_maps
+from analysis.report import render
+from analysis.stretch import Options
+from analysis.text.answer import answer
+from capture import Session
+from capture.errors import UndulogError
+from capture.log.session_check import check_session
+from replay.content import Content
+from replay.facts import markdown
+
+from .robot import SECOND_TOPIC
+
+OUTPUTS = ("answer", "log check", "compare", "page", "rerun")
+EMPTY = Content(None, None, None, None, (), (), (), False, (), (), 0, False, ())
+
+
+@dataclass(frozen=True)
+class Named:
+    """A joint that an output names as not following.
+
+    Attributes:
+        kinds: The kinds stated.
+        since_s: Onset [s], None: from the beginning.
+    """
+
+    kinds: frozenset[str]
+    since_s: float | None
+
+
+@dataclass(frozen=True)
+class Statement:
+    """What one output says.
+
+    Attributes:
+        text: Its first statement; of ``log check`` the reasons.
+        not_following: By joint name; None where the output has no structure.
+        stands_out: Joint name to quantities; None likewise.
+        undecided: Whether it says that no joint can be named.
+        alike: Whether it claims that the joints move alike, or that two sessions are the same.
+        error: What went wrong instead, or empty.
+    """
+
+    text: str
+    not_following: Mapping[str, Named] | None = None
+    stands_out: Mapping[str, frozenset[str]] | None = None
+    undecided: bool | None = None
+    alike: bool = False
+    error: str = ""
+
+
+def statements(
+    path: Path, healthy: Path | None, *, second: bool, outputs: tuple[str, ...] = OUTPUTS
+) -> dict[str, Statement]:
+    """Run undulog on a bag.
+
+    Args:
+        path: The bag.
+        healthy: A healthy session of the same robot, for ``compare``; None goes without.
+        second: Whether the bag has a second sensor.
+        outputs: Those that are wanted.
+
+    Returns:
+        By output.
+    """
+    options = Options(reference_topic=SECOND_TOPIC if second else None)
+    found: dict[str, Statement] = {}
+    try:
+        found |= _analysed(path, options, outputs)
+    except UndulogError as error:
+        found |= {
+            name: Statement("", error=str(error))
+            for name in ("answer", "page", "rerun")
+            if name in outputs
+        }
+    if "log check" in outputs:
+        health = check_session(path)
+        found["log check"] = Statement("\n".join(health.reasons), alike=health.verdict == "good")
+    if "compare" in outputs and healthy is not None:
+        found["compare"] = _compared(healthy, path, options)
+    return found
+
+
+def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[str, Statement]:
+    found: dict[str, Statement] = {}
+    with Session.open(path) as session:
+        measured = measure_session(session, options)
+        analysis = measured.analysis
+        # One source: the object that the JSON prints as `answer`, or the text's own.
+        told: Any = getattr(analysis, "answer", None) or answer(analysis)
+        if "answer" in outputs:
+            found["answer"] = structured(told)
+        if "page" in outputs:
+            page = render(analysis, session, cycle_maps(measured))
+            found["page"] = Statement(_plain(_heading(page)))
+        if "rerun" in outputs:
+            text = markdown(session, analysis, notes=(), colors="", content=EMPTY, has_cycles=False)
+            found["rerun"] = Statement(text.split("\n\n")[0])
+    return found
+
+
+def structured(told: Any) -> Statement:
+    """The answer with its lists, where it has them.
+
+    Args:
+        told: An answer, or its JSON object.
+    """
+
+    def of(item: Any, key: str) -> Any:
+        return item.get(key) if isinstance(item, dict) else getattr(item, key, None)
+
+    verdict, listed, outside = (of(told, k) for k in ("verdict", "not_following", "stand_out"))
+    quantities: dict[str, frozenset[str]] = {}
+    for one in outside or ():
+        name = of(one, "joint")
+        quantities[name] = quantities.get(name, frozenset()) | {str(of(one, "quantity"))}
+    return Statement(
+        str(of(told, "sentence")),
+        None
+        if listed is None
+        else {
+            of(one, "joint"): Named(frozenset(map(str, of(one, "kinds"))), of(one, "since_s"))
+            for one in listed
+        },
+        None if outside is None else quantities,
+        None if listed is None else of(told, "undecided") is not None,
+        str(verdict) == "alike",
+    )
+
+
+def _compared(healthy: Path, path: Path, options: Options) -> Statement:
+    try:
+        with Session.open(healthy) as first, Session.open(path) as other:
+            found = compare_sessions(first, other, Choices(session=options))
+    except UndulogError as error:
+        return Statement("", error=str(error))
+    return Statement(found.answer, alike=found.verdict in {"same", "open"})
+
+
+def _heading(page: str) -> str:
+    found = re.search(r'<h1 id="answer"[^>]*>(.*?)</h1>', page, re.DOTALL)
+    return "" if found is None else found[1]
+
+
+def _plain(markup: str) -> str:
+    """Text without tags, soft hyphens and zero-width spaces."""
+    text = unescape(re.sub(r"<wbr[^>]*>|<[^>]*>", "", markup))
+    return re.sub("[\u00ad\u200b\u2060]", "", text)

@@ -1,0 +1,56 @@
+"""The table of faults in docs/faults.md: ``PYTHONPATH=tests python -m zoo.page`` prints it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from .faults import FAULTS, Fault, plant
+from .robot import Channels, draw
+from .truth import JointTruth
+
+COLUMNS = {
+    "positions": Channels(),
+    "and a velocity of its own": Channels(velocity="true"),
+    "and effort": Channels(effort=True),
+    "and a second sensor": Channels(second=True),
+}
+"""A velocity that is derived from the same positions adds nothing to the first column."""
+
+
+def lines() -> Iterator[str]:
+    """The table, as Markdown; a fault that is planted at several places has one line."""
+    yield "| fault | what it looks like | " + " | ".join(COLUMNS) + " |"
+    yield "|---|---|" + "---|" * len(COLUMNS)
+    shown_before: list[object] = []
+    for name, fault in FAULTS.items():
+        if name.startswith("two at once") or (fault.plant in shown_before):
+            continue
+        shown_before.append(fault.plant)
+        cells = [_cell(fault, channels) for channels in COLUMNS.values()]
+        shown = cells[:1] + [
+            "same" if cell == cells[0] and cell != "-" else cell for cell in cells[1:]
+        ]
+        looks = str(fault.plant.__doc__).rstrip(".")
+        yield " | ".join([f"| {name.split(', head')[0]}", looks, *shown]) + " |"
+
+
+def _cell(fault: Fault, channels: Channels) -> str:
+    if fault.channels is not None and channels not in fault.channels:
+        return "-"
+    robot = draw(1, small=True, channels=channels, joints=fault.joints)
+    _, truth = plant(fault, robot, 1)
+    if truth.undecided:
+        return "joints differ; which one can't be decided"
+    return _kinds(truth.joints[0]) if truth.joints else "nothing"
+
+
+def _kinds(truth: JointTruth) -> str:
+    kinds = ", ".join(f"`{kind}`" for kind in sorted(truth.allowed))
+    outside = " or ".join(sorted(truth.stands_out))
+    return "; or ".join(
+        [*([kinds] if kinds else []), *([f"stands out by {outside}"] * bool(outside))]
+    )
+
+
+if __name__ == "__main__":
+    print("\n".join(lines()))

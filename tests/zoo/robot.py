@@ -1,0 +1,337 @@
+"""A foreign robot without description: drawn by seed, its physics kept apart from its telemetry.
+
+Nothing here imports undulog: the truth comes from closed forms. Three things that a log confuses
+are kept apart: what reached the servo, where the joint is, and what each sensor reports of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import norm
+
+STIFFNESS = 8.0
+"""Effort per control error [N m/rad]."""
+
+EFFORT_NOISE = 0.01
+"""Of the healthy effort's amplitude."""
+
+SECOND_TOPIC = "/joint_states_second"
+MARGIN_GAIN = 0.02
+MARGIN_RAD = np.radians(1.0)
+"""Below these a deviation is nothing to name, however sure it is."""
+
+NAMINGS: tuple[Callable[[int, int], str], ...] = (
+    lambda i, m: f"joint{i + 1}",
+    lambda i, m: f"j_{i + 1:02d}",
+    lambda i, m: f"{'yaw' if i % 2 == 0 else 'pitch'}_{i}",
+    lambda i, m: f"snake/segment{i + 1}/servo",
+    lambda i, m: f"servo{chr(ord('a') + i // 26)}{chr(ord('a') + i % 26)}",
+)
+
+
+@dataclass(frozen=True)
+class Channels:
+    """What of the joints is logged besides their positions.
+
+    Attributes:
+        velocity: ``true`` (a sensor of its own), ``derived`` (differences of the reported
+            position) or None.
+        effort: Whether efforts are logged.
+        second: Whether a second sensor of the same positions has a topic of its own.
+    """
+
+    velocity: str | None = None
+    effort: bool = False
+    second: bool = False
+
+    def __str__(self) -> str:
+        """The names, joined."""
+        names = [f"{self.velocity} velocity"] if self.velocity else []
+        names += [name for name in ("effort", "second") if getattr(self, name)]
+        return " + ".join(["position", *names])
+
+
+CHANNELS = (
+    Channels(),
+    Channels(),
+    Channels(velocity="true"),
+    Channels(velocity="derived"),
+    Channels(effort=True),
+    Channels(velocity="derived", effort=True),
+    Channels(velocity="true", effort=True),
+    Channels(second=True),
+)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A healthy robot and what it is asked to do.
+
+    Attributes:
+        names: Joint names, shape (m,).
+        planes: 1 or 2; with 2, odd joints are in the other plane.
+        amplitude: Of the commands [rad], shape (m,).
+        phase: Of the commands [rad], shape (m,).
+        bias: Constant part of the commands [rad], shape (m,).
+        omega: Gait frequency [rad/s].
+        gain: Of the joints, shape (m,).
+        lag: Of the joints [rad], shape (m,).
+        sigma: White noise of the position sensors [rad].
+        step: Step of the position sensors [rad]; 0: none.
+        duration_s: Length of the session [s].
+        sent_s: Times of the commands [s], shape (k,).
+        t_s: Times at which each joint is sampled [s], shape (n, m).
+        per_servo: Whether each servo has messages of its own.
+        channels: What is logged.
+    """
+
+    names: tuple[str, ...]
+    planes: int
+    amplitude: np.ndarray
+    phase: np.ndarray
+    bias: np.ndarray
+    omega: float
+    gain: np.ndarray
+    lag: np.ndarray
+    sigma: float
+    step: float
+    duration_s: float
+    sent_s: np.ndarray
+    t_s: np.ndarray
+    per_servo: bool
+    channels: Channels
+
+    @property
+    def m(self) -> int:
+        """Joints."""
+        return len(self.names)
+
+    def sent(self) -> np.ndarray:
+        """Commands as the controller sends them [rad], shape (k, m)."""
+        return self.bias + self.amplitude * np.sin(self.omega * self.sent_s[:, None] + self.phase)
+
+    def wanted(self, joint: int, at: int | None = None) -> np.ndarray:
+        """Command of a joint at the sampling times of ``at`` (itself if None) [rad], shape (n,)."""
+        t = self.t_s[:, joint if at is None else at]
+        return self.bias[joint] + self.amplitude[joint] * np.sin(self.omega * t + self.phase[joint])
+
+    def moved(
+        self, joint: int, gain: float | np.ndarray = 1.0, more_lag: float = 0.0, of: int = -1
+    ) -> np.ndarray:
+        """Where a joint is [rad], shape (n,).
+
+        Args:
+            joint: The joint.
+            gain: Times its own gain.
+            more_lag: More than its own [rad].
+            of: Joint whose command it follows; -1: its own.
+        """
+        k = joint if of < 0 else of
+        angle = self.omega * self.t_s[:, joint] + self.phase[k] - self.lag[joint] - more_lag
+        return self.bias[k] + gain * self.gain[joint] * self.amplitude[k] * np.sin(angle)
+
+    def swing(self, joint: int) -> float:
+        """Amplitude of the motion of a joint [rad]."""
+        return float(self.gain[joint] * self.amplitude[joint])
+
+    def half(self, joint: int, count: float | None = None) -> tuple[float, float]:
+        """Half widths of simultaneous 95 % intervals of a joint's deviation from the others.
+
+        Bonferroni over 3 m deviations; each from what a common value, a trend and a parabola
+        through the other joints predict (as many of them as m allows).
+
+        Args:
+            joint: The joint.
+            count: Samples; None: all.
+
+        Returns:
+            Of gain (relative) and lag [rad], which are the same number, and of the offset [rad].
+        """
+        n = len(self.t_s) if count is None else count
+        noise = float(np.hypot(self.sigma, self.step / 12**0.5))
+        factor = float(norm.ppf(1 - 0.025 / (3 * self.m))) * (1 + leverage(self.m, joint)) ** 0.5
+        return factor * noise * (2 / n) ** 0.5 / self.swing(joint), factor * noise / n**0.5
+
+
+def leverage(m: int, joint: int) -> float:
+    """Variance of what the other joints predict for one, in variances of one joint.
+
+    Args:
+        m: Joints.
+        joint: The one that is left out.
+    """
+    place = np.linspace(-1.0, 1.0, m)
+    terms = 3 if m >= 7 else 2 if m >= 5 else 1
+    basis = np.stack([place**k for k in range(terms)], axis=1)
+    others = np.delete(basis, joint, axis=0)
+    return float(basis[joint] @ np.linalg.solve(others.T @ others, basis[joint]))
+
+
+def draw(
+    seed: int,
+    *,
+    small: bool = False,
+    channels: Channels | None = None,
+    joints: tuple[int, int] | None = None,
+    least_s: float = 15.0,
+) -> Robot:
+    """Draw a healthy robot.
+
+    Args:
+        seed: Of everything.
+        small: Few joints and samples, for tests that must be fast.
+        channels: What is logged; None: drawn.
+        joints: Least and most joints.
+        least_s: Least duration [s].
+    """
+    rng = np.random.default_rng([seed, 1])
+    low, high = joints or ((5, 10) if small else (4, 40))
+    m = round(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+    planes = 2 if m >= 8 and rng.random() < 0.4 else 1
+    frequency = rng.uniform(0.5, 1.5) if small else float(np.exp(rng.uniform(*np.log([0.3, 1.5]))))
+    duration = rng.uniform(least_s, least_s + 2.0) if small else rng.uniform(least_s, 30.0)
+    duration = max(duration, 6.0 / frequency)
+    per_servo = bool(m <= 12 and rng.random() < 0.3)
+    rate = rng.uniform(50.0, 70.0) if small or per_servo else rng.uniform(50.0, 200.0)
+    amplitude = rng.uniform(0.1, 0.6)
+    step = rng.choice([-1, 1]) * rng.uniform(np.radians(20), np.radians(100))
+    place = np.arange(m) / max(m - 1, 1)
+    by_plane = np.arange(m) % planes
+    other = rng.uniform(0.6, 1.0), rng.uniform(-np.pi, np.pi)
+    gain = np.full(m, rng.uniform(0.85, 1.0))
+    lag = np.full(m, np.radians(rng.uniform(3.0, 20.0)))
+    if m >= 9 and rng.random() < 0.4:  # a smooth profile: free ends, or a trend
+        ends, trend = (2 * place - 1) ** 2 - 0.5, place - 0.5
+        gain = gain * (1 + rng.uniform(-0.03, 0.03) * ends + rng.uniform(-0.03, 0.03) * trend)
+        lag = lag + np.radians(rng.uniform(-3, 3) * ends + rng.uniform(-3, 3) * trend)
+    n = round(duration * rate)
+    jitter = rng.choice([0.0, 0.05, 0.15]) / rate
+    clock = np.arange(n) / rate + np.clip(rng.normal(0.0, 1.0, n), -2, 2) * jitter
+    clock = clock - clock[0]
+    skew = rng.uniform(0.0, 0.5 / rate, m) if per_servo else np.zeros(m)
+    sent_rate = rate if rng.random() < 0.5 else rng.uniform(50.0, 100.0)
+    naming = NAMINGS[rng.integers(len(NAMINGS))]
+    drawn = CHANNELS[rng.integers(len(CHANNELS))]
+    return Robot(
+        names=tuple(naming(i, m) for i in range(m)),
+        planes=planes,
+        amplitude=amplitude * np.where(by_plane == 0, 1.0, other[0]),
+        phase=rng.uniform(-np.pi, np.pi) - np.arange(m) * step + by_plane * other[1],
+        bias=rng.choice([0.0, 1.0]) * rng.uniform(-0.1, 0.1, m),
+        omega=2 * np.pi * frequency,
+        gain=gain,
+        lag=lag,
+        sigma=float(np.exp(rng.uniform(*np.log([1e-3, 5e-3])))),
+        step=float(rng.choice([0.0, 0.0, 0.0, 2 * np.pi / 4096])),
+        duration_s=duration,
+        sent_s=np.arange(round(duration * sent_rate)) / sent_rate,
+        t_s=clock[:, None] + skew,
+        per_servo=per_servo,
+        channels=drawn if channels is None else channels,
+    )
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a fault changes of one joint; what is None stays as it is.
+
+    Attributes:
+        joint: The joint.
+        position: Where it really is [rad], shape (n,).
+        wanted: Command that reached its servo [rad], shape (n,).
+        power: Share of the effort that the motor gives, shape (n,).
+        most_effort: The effort saturates there [N m].
+        exact: Where its sensors add no noise, shape (n,).
+        reading: From the position that its sensor would report to the one that it does.
+        telemetry: Applied to each channel that its servo reports, position included.
+        lost: Samples that don't arrive, shape (n,).
+    """
+
+    joint: int
+    position: np.ndarray | None = None
+    wanted: np.ndarray | None = None
+    power: np.ndarray | None = None
+    most_effort: float = np.inf
+    exact: np.ndarray | None = None
+    reading: Callable[[np.ndarray], np.ndarray] | None = None
+    telemetry: Callable[[np.ndarray], np.ndarray] | None = None
+    lost: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Log:
+    """What is recorded of a robot; NaN where a sample was lost.
+
+    Attributes:
+        robot: The robot.
+        position: [rad], shape (n, m).
+        velocity: [rad/s], or None.
+        effort: [N m], or None.
+        second: Positions by the second sensor [rad], or None.
+    """
+
+    robot: Robot
+    position: np.ndarray
+    velocity: np.ndarray | None
+    effort: np.ndarray | None
+    second: np.ndarray | None
+
+
+def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log:
+    """Let a robot run, and log it.
+
+    Args:
+        robot: The robot.
+        changes: Faults.
+        seed: Of the sensor noise.
+
+    Returns:
+        What is logged.
+    """
+    rng = np.random.default_rng([seed, 2])
+    n, m = robot.t_s.shape
+    by_joint = {change.joint: change for change in changes}
+    position, velocity, effort, second = (np.empty((n, m)) for _ in range(4))
+    for j in range(m):
+        change = by_joint.get(j, Change(j))
+        t, swing = robot.t_s[:, j], robot.swing(j)
+        where = robot.moved(j) if change.position is None else change.position
+        wanted = robot.wanted(j) if change.wanted is None else change.wanted
+        noisy = np.ones(n) if change.exact is None else np.where(change.exact, 0.0, 1.0)
+        read = where + robot.sigma * noisy * rng.normal(size=n)
+        other = where + robot.sigma * noisy * rng.normal(size=n)
+        if robot.step > 0:
+            read, other = (np.round(one / robot.step) * robot.step for one in (read, other))
+        rate = np.gradient(where, t) + 0.01 * robot.omega * swing * noisy * rng.normal(size=n)
+        scale = STIFFNESS * robot.amplitude[j] * abs(1 - robot.gain[j] * np.exp(-1j * robot.lag[j]))
+        pull = np.clip(STIFFNESS * (wanted - where), -change.most_effort, change.most_effort)
+        if change.power is not None:
+            pull = pull * change.power
+        pull = pull + EFFORT_NOISE * scale * rng.normal(size=n)
+        if change.reading is not None:
+            read = change.reading(read)
+        if robot.channels.velocity == "derived":
+            rate = np.diff(read, prepend=read[0]) / np.diff(t, prepend=2 * t[0] - t[1])
+        channels = [read, rate, pull]
+        if change.telemetry is not None:
+            channels = [change.telemetry(one) for one in channels]
+        if change.lost is not None:
+            channels = [np.where(change.lost, np.nan, one) for one in channels]
+        position[:, j], velocity[:, j], effort[:, j] = channels
+        second[:, j] = other
+    logged = robot.channels
+    return Log(
+        robot,
+        position,
+        velocity if logged.velocity else None,
+        effort if logged.effort else None,
+        second if logged.second else None,
+    )
+
+
+def with_channels(robot: Robot, channels: Channels) -> Robot:
+    """The same robot, logged in another way."""
+    return replace(robot, channels=channels)

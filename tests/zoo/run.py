@@ -1,0 +1,184 @@
+"""The fault zoo as a table: ``make zoo``.
+
+Every fault is planted with many seeds into foreign bags; undulog's outputs are judged against the
+truth. Prints a table, one line a fault, and the seeds that fail with what was said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import zlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .bags import write_bag
+from .detection import detected
+from .faults import FAULTS, Fault, plant
+from .judging import Judgement, judge_all
+from .outputs import OUTPUTS, Statement, statements
+from .robot import Robot, draw, record
+from .truth import Truth
+
+DETECTION = "detection"
+"""The detection of joints that do not follow, by itself, on arrays: fast."""
+
+RIGHT = 0.95
+SOUND = 0.05
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault planted with one seed, and what undulog says of it."""
+
+    fault: str
+    seed: int
+    robot: Robot
+    truth: Truth
+    said: dict[str, Statement]
+    judged: dict[str, Judgement]
+
+
+def robot_for(fault: Fault, seed: int, *, small: bool = False) -> Robot:
+    """The healthy robot into which a fault is planted.
+
+    Args:
+        fault: The fault.
+        seed: Of the robot.
+        small: Few joints and samples.
+    """
+    own = seed_of(fault.name, seed)
+    rng = np.random.default_rng([own, 4])
+    channels = None if fault.channels is None else fault.channels[rng.integers(len(fault.channels))]
+    return draw(own, small=small, channels=channels, joints=fault.joints)
+
+
+def seed_of(name: str, seed: int) -> int:
+    """A seed that differs from fault to fault."""
+    return seed + zlib.crc32(name.encode())
+
+
+def run_case(
+    name: str, seed: int, *, small: bool = False, outputs: tuple[str, ...] = OUTPUTS
+) -> Case:
+    """Plant, write, run, judge.
+
+    Args:
+        name: Of the fault.
+        seed: Of robot, fault and noise.
+        small: Few joints and samples.
+        outputs: Those that are judged.
+    """
+    fault = FAULTS[name]
+    robot = robot_for(fault, seed, small=small)
+    own = seed_of(name, seed)
+    changes, truth = plant(fault, robot, own)
+    log = record(robot, changes, own)
+    if outputs == (DETECTION,):  # on arrays, so without a file
+        said = {DETECTION: detected(log)}
+        return Case(name, seed, robot, truth, said, judge_all(said, truth, robot))
+    with tempfile.TemporaryDirectory() as folder:
+        bag = write_bag(log, Path(folder) / "faulty.mcap")
+        healthy = None
+        if "compare" in outputs:
+            healthy = write_bag(record(robot, (), own + 10**6), Path(folder) / "healthy.mcap")
+        said = statements(bag, healthy, second=robot.channels.second, outputs=outputs)
+    return Case(name, seed, robot, truth, said, judge_all(said, truth, robot))
+
+
+def _work(job: tuple[str, int, bool, tuple[str, ...]]) -> Case:
+    name, seed, small, outputs = job
+    try:
+        return run_case(name, seed, small=small, outputs=outputs)
+    except Exception as error:
+        raise RuntimeError(f"{name}, seed {seed}") from error
+
+
+def run_all(
+    names: Sequence[str],
+    seeds: Sequence[int],
+    *,
+    small: bool = False,
+    outputs: tuple[str, ...] = OUTPUTS,
+    jobs: int = 1,
+) -> Iterator[Case]:
+    """Every fault with every seed, in order."""
+    work = [(name, seed, small, outputs) for name in names for seed in seeds]
+    if jobs == 1:
+        yield from map(_work, work)
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        yield from pool.map(_work, work, chunksize=4)
+
+
+def table(cases: Sequence[Case], outputs: tuple[str, ...] = OUTPUTS) -> list[str]:
+    """One line a fault: share right of each output, share that names a sound joint."""
+    names = list(dict.fromkeys(case.fault for case in cases))
+    width = max(map(len, names))
+    lines = [f"{'fault':<{width}}  " + "  ".join(f"{o:>9}" for o in outputs) + "    sound  narrow"]
+    for name in names:
+        own = [case for case in cases if case.fault == name]
+        shares = [np.mean([case.judged[o].right for case in own]) for o in outputs]
+        sound = np.mean([any(one.sound for one in case.judged.values()) for case in own])
+        narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in own])
+        fine = min(shares) >= RIGHT and sound <= SOUND
+        lines.append(
+            f"{name:<{width}}  "
+            + "  ".join(f"{share:>9.0%}" for share in shares)
+            + f"  {sound:>7.0%} {narrow:>7.0%}  {'' if fine else 'FAILS'}"
+        )
+    return lines
+
+
+def failures(cases: Sequence[Case]) -> Iterator[str]:
+    """What is wrong, case by case."""
+    for case in cases:
+        for output, one in case.judged.items():
+            if one.missing or one.sound:
+                why = [*one.missing, *(f"names {name}, which is sound" for name in one.sound)]
+                robot = case.robot
+                yield (
+                    f"{case.fault!r} seed {case.seed} ({robot.m} joints, {robot.channels}), "
+                    f"{output}: {'; '.join(why)}\n    said: {case.said[output].text[:300]!r}"
+                )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the zoo.
+
+    Returns:
+        0 if every fault meets the bar, else 1.
+    """
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=100, help="seeds a fault")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--fault", action="append", help="only faults whose name contains this")
+    parser.add_argument(
+        "--outputs", nargs="*", default=list(OUTPUTS), choices=[*OUTPUTS, DETECTION]
+    )
+    parser.add_argument("--small", action="store_true", help="few joints and samples")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--quiet", action="store_true", help="the table only")
+    chosen = parser.parse_args(arguments)
+    names = [n for n in FAULTS if not chosen.fault or any(part in n for part in chosen.fault)]
+    outputs = tuple(chosen.outputs)
+    cases: list[Case] = []
+    seeds = range(chosen.first, chosen.first + chosen.seeds)
+    for case in run_all(names, seeds, small=chosen.small, outputs=outputs, jobs=chosen.jobs):
+        cases.append(case)
+        if sys.stderr.isatty():
+            print(f"\r{len(cases)} of {len(names) * len(seeds)}", end="", file=sys.stderr)
+    if not chosen.quiet:
+        print("\n".join(failures(cases)))
+    lines = table(cases, outputs)
+    print("\n".join(lines))
+    return int(any(line.endswith("FAILS") for line in lines))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,178 @@
+"""Faults of the virtual robot, recorded over its bus, and of the twin: named by every output."""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing, contextmanager
+
+import pytest
+from zoo.judging import judge
+from zoo.outputs import OUTPUTS, statements
+from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
+
+import undulog
+from capture import load_robot
+from capture.sources.address import parse_address
+from capture.sources.events import Tally
+from sim.drive.driven import find_driven
+from sim.drive.link import find_virtual_robot
+from sim.drive.loop import CommandEncoder
+from sim.readings import Readings
+
+UNDULOG = [sys.executable, "-m", "undulog"]
+PATIENCE_S = 300
+DURATION_S = 12.0
+FREQUENCY_HZ = 0.8
+SCENARIO = f"""
+description = "A healthy robot; faults are ordered on the command line."
+robot = "snake25"
+duration_s = {DURATION_S}
+seed = 20250131
+{{more}}
+[gait]
+ramp_s = 1.0
+
+[gait.horizontal]
+amplitude = 0.3
+frequency_hz = {FREQUENCY_HZ}
+lag = {math.pi / 6!r}
+
+[noise]
+position = 0.001
+"""
+
+BROKEN = STOPPED | PAUSED
+BUS = {
+    "stuck:joint05@5": (STOPPED, 5.0),
+    "frozen:joint13@6": (frozenset({"frozen_sensor"}), 6.0),
+    "lost:joint19:0.2": (frozenset({"lost_samples"}), None),
+    "stuck:joint23": (STOPPED, None),
+    "frozen:joint03@4+3": (frozenset({"frozen_sensor", "stale_sensor"}), 4.0),
+    "stuck:joint13@5+2.5": (BROKEN, 5.0),
+}
+"""What is ordered, the kinds of which one must be stated and no other, and the onset [s]."""
+
+RUNS = [list(BUS)[:3], list(BUS)[3:]]
+
+
+class SnakeOfTheBus:
+    """What a judge has to know of a robot."""
+
+    names = load_robot("snake25").joint_names
+    omega = 2 * math.pi * FREQUENCY_HZ
+
+
+@contextmanager
+def process(*words):
+    started = subprocess.Popen([*UNDULOG, *words], text=True, stdout=subprocess.PIPE)
+    try:
+        yield started
+    finally:
+        if started.poll() is None:
+            started.kill()
+        started.communicate()
+
+
+def recorded_over_the_bus(folder, scenario, faults):
+    """Serve, record and drive in lockstep; the driver looks at nothing, so it never gives up."""
+    output, robot = folder / "run.mcap", load_robot("snake25")
+    words = [word for fault in faults for word in ("--fault", fault)]
+    words += ["--socketcand", "0", "--lockstep", "--json", "--duration", str(DURATION_S)]
+    with process("sim", "serve", str(scenario), *words) as served:
+        port = json.loads(served.stdout.readline())["port"]
+        control = folder / "run.ctl"
+        source = f"can0=can:socketcand:can0?port={port}"
+        words = ["--robot", "snake25", "-o", str(output), "--socket", str(control), "--quiet"]
+        with process("record", source, *words, "--floor", "0") as recorder:
+            wait_until_connected(control)
+            gait = find_driven(str(scenario)).make(robot, None)
+            encoder, blind = CommandEncoder(robot), Readings.nothing(robot)
+            address = parse_address(f"can:socketcand:can0?host=127.0.0.1&port={port}")
+            with closing(find_virtual_robot(address, Tally(time.time_ns))) as link:
+                for tick in range(round(DURATION_S * 100) + 1):
+                    assert link.wait_tick(PATIENCE_S)[0] == tick
+                    link.send(encoder.frames(gait.step(tick / 100, blind).command))
+            served.communicate(timeout=PATIENCE_S)
+            assert served.returncode == 0
+            recorder.send_signal(signal.SIGINT)
+            recorder.communicate(timeout=PATIENCE_S)
+    return output
+
+
+def wait_until_connected(control):
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        asked = subprocess.run(
+            [*UNDULOG, "record", "status", "--socket", str(control), "--json"],
+            check=False, capture_output=True, text=True,
+        )  # fmt: skip
+        found = json.loads(asked.stdout or "{}").get("recordings", [])
+        if found and found[0]["sources"][0]["connected"]:
+            return
+        assert time.monotonic() < deadline, asked.stderr
+        time.sleep(0.1)
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory):
+    path = tmp_path_factory.mktemp("virtual") / "served.toml"
+    path.write_text(SCENARIO.format(more=""))
+    return path
+
+
+@pytest.fixture(scope="module")
+def healthy(scenario):
+    path = scenario.with_name("healthy.mcap")
+    assert undulog.run(["sim", "run", str(scenario), "-o", str(path)]) == 0
+    return path
+
+
+def problems(path, healthy, truth):
+    """What is wrong with any output, a line each; where a neighbour differs it does so indeed."""
+    said = statements(path, healthy, second=False)
+    assert set(said) == set(OUTPUTS)
+    return [
+        f"{output}: {reason}"
+        for output, one in said.items()
+        for reason in judge(output, one, truth, SnakeOfTheBus).missing
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("faults", RUNS, ids="; ".join)
+def test_faults_on_the_bus_are_named_by_every_output(tmp_path, scenario, healthy, faults):
+    path = recorded_over_the_bus(tmp_path, scenario, faults)
+    place = SnakeOfTheBus.names.index
+    truth = Truth(
+        tuple(
+            JointTruth(
+                place(fault.split("@")[0].split(":")[1]),
+                kinds,
+                kinds,
+                since_s=since,
+                compared=kinds != {"lost_samples"},
+            )
+            for fault in faults
+            for kinds, since in [BUS[fault]]
+        )
+    )
+    assert problems(path, healthy, truth) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("torque", "truth"),
+    [
+        (1e-4, JointTruth(12, frozenset({"dead"}), STOPPED)),
+        (0.25, JointTruth(12, stands_out=frozenset({"gain", "lag"}), checked=False)),
+    ],
+    ids=["dead", "weak"],
+)
+def test_a_servo_of_the_twin_is_named_by_every_output(tmp_path, healthy, torque, truth):
+    path = tmp_path / "run.toml"
+    path.write_text(SCENARIO.format(more=f"[servo_of.joint13]\nstall_torque = {torque}\n"))
+    assert undulog.run(["sim", "run", str(path), "-o", str(tmp_path / "run.mcap")]) == 0
+    assert problems(tmp_path / "run.mcap", healthy, Truth((truth,))) == []

@@ -1,0 +1,93 @@
+"""The zoo itself: bags that others can read, faults that are what they claim to be."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from zoo.bags import write_bag
+from zoo.faults import FAULTS, plant
+from zoo.page import lines
+from zoo.robot import Channels, draw, record
+from zoo.run import robot_for, run_all, seed_of, table
+
+SEED = 20250131
+"""Of the fast test; printed with what fails."""
+
+
+@pytest.mark.parametrize("per_servo", [False, True])
+def test_bags_are_read_back_by_another_reader(tmp_path, per_servo):
+    robot = next(
+        robot
+        for seed in range(100)
+        if (robot := draw(seed, small=True, channels=Channels("true", effort=True, second=True)))
+        and robot.per_servo is per_servo
+    )
+    log = record(robot, (), 7)
+    seen = {}
+    with write_bag(log, tmp_path / "bag.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, state in reader.iter_decoded_messages():
+            stamp = state.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == message.log_time
+            for k, name in enumerate(state.name):
+                columns = seen.setdefault((channel.topic, name), ([], [], []))
+                columns[0].append(state.position[k])
+                columns[1].extend(state.velocity[k : k + 1])
+                columns[2].extend(state.effort[k : k + 1])
+    for j, name in enumerate(robot.names):
+        np.testing.assert_array_equal(seen["/joint_commands", name][0], robot.sent()[:, j])
+        states = seen["/joint_states", name]
+        for column, values in zip(states, (log.position, log.velocity, log.effort), strict=True):
+            np.testing.assert_array_equal(column, values[:, j])
+        np.testing.assert_array_equal(seen["/joint_states_second", name][0], log.second[:, j])
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_touches_no_joint_but_those_it_names(name):
+    """Same seed of noise: what differs from the healthy log is what was planted."""
+    for seed in range(3):
+        robot = robot_for(FAULTS[name], seed, small=True)
+        changes, truth = plant(FAULTS[name], robot, seed_of(name, seed))
+        healthy, faulty = (record(robot, one, 1).position for one in ((), changes))
+        differs = ~(np.isclose(healthy, faulty, rtol=0, atol=1e-12)).all(axis=0)
+        assert np.flatnonzero(differs).tolist() == sorted(one.joint for one in truth.joints)
+        for one in truth.joints:
+            assert one.names <= one.allowed
+            assert one.names or one.stands_out
+            assert one.since_s is None or 0 < one.since_s < robot.duration_s
+
+
+def test_a_healthy_robot_answers_as_drawn():
+    """Gain and lag of each joint by least squares, by the seed's own numbers."""
+    robot = draw(3, small=True)
+    log = record(robot, (), 3)
+    for j in range(robot.m):
+        angle = robot.omega * robot.t_s[:, j] + robot.phase[j]
+        model = np.stack([np.sin(angle), np.cos(angle), np.ones(angle.size)], axis=1)
+        (sine, cosine, bias), *_ = np.linalg.lstsq(model, log.position[:, j])
+        response = complex(sine, cosine) / robot.amplitude[j]
+        half, offset = robot.half(j)
+        assert abs(abs(response) / robot.gain[j] - 1) < half
+        assert abs(-np.angle(response) - robot.lag[j]) < half
+        assert abs(bias - robot.bias[j]) < offset
+
+
+def test_there_are_faults_enough():
+    assert len([name for name in FAULTS if name != "healthy"]) >= 30
+
+
+def test_the_manual_lists_the_kinds_of_every_fault():
+    page = Path(__file__).parents[2] / "docs" / "faults.md"
+    assert "\n".join(lines()) in page.read_text(), "renew it: python -m zoo.page"
+
+
+@pytest.mark.slow
+def test_every_output_is_right_about_a_fault_of_each_kind(capsys):
+    """A seed a fault: `make zoo` takes a hundred."""
+    with capsys.disabled():
+        print(f"\nfault zoo, seed {SEED}")
+    cases = list(run_all(list(FAULTS), [SEED], small=True))
+    with capsys.disabled():
+        print("\n".join(table(cases)))
