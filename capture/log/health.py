@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from ..following.fault import Fault
 from .frames import FRAME_TOPIC_PREFIXES, bus_of
 from .freeze import FROZEN_SAMPLES
 from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
@@ -247,6 +248,21 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Finding]:
     if len(measured) > 1 and len(dead) >= BAD_JOINTS * len(measured):
         found.append(Finding(2, f"{len(dead)} of {len(measured)} joints are frozen or missing"))
     return found
+
+
+def judge_fault(fault: Fault) -> Finding:
+    """Finding on a joint that does not follow its command.
+
+    Args:
+        fault: The fault, times from the session's start.
+
+    Returns:
+        The finding, with the kinds that fit.
+    """
+    when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
+    when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
+    kinds = " or ".join(fault.kinds)
+    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {kinds}")
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:

@@ -14,7 +14,6 @@ from analysis.compare.compare import Choices, compare_sessions
 from analysis.cycles import cycle_maps
 from analysis.report import render
 from analysis.stretch import Options
-from analysis.text.answer import answer
 from capture import Session
 from capture.errors import UndulogError
 from capture.log.session_check import check_session
@@ -98,8 +97,8 @@ def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[st
     with Session.open(path) as session:
         measured = measure_session(session, options)
         analysis = measured.analysis
-        # One source: the object that the JSON prints as `answer`, or the text's own.
-        told: Any = getattr(analysis, "answer", None) or answer(analysis)
+        # One source: the object that the JSON prints as `answer`.
+        told: Any = analysis.answer
         if "answer" in outputs:
             found["answer"] = structured(told)
         if "page" in outputs:
