@@ -168,13 +168,16 @@ def find_excursions(
     return Excursions(t_s, residual - centre, expected + centre, amplitude, threshold, long)
 
 
-def departures(response: Response, found: Excursions, alone: Sequence[bool]) -> list[Symptom]:
+def departures(
+    response: Response, found: Excursions, alone: Sequence[bool], *, loaded: bool
+) -> list[Symptom]:
     """Describe what a joint does in each of its departures.
 
     Args:
         response: The joint's windowed response.
         found: All its departures.
         alone: Of each, whether no other joint departs at the same time.
+        loaded: Whether its neighbours are held back by a load: then it may be, for a while.
         loaded: Whether its neighbours are held back by a load: then it may be, for a while.
 
     Returns:
