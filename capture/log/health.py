@@ -296,7 +296,10 @@ def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
 
 
 def judge_topics(
-    types: dict[str, str], joints: Sequence[str], seen: Iterable[str]
+    types: dict[str, str],
+    joints: Sequence[str],
+    seen: Iterable[str],
+    undecoded: str | None = None,
 ) -> list[Finding]:
     """Findings on what the log contract asks for and the session lacks.
 
@@ -304,11 +307,12 @@ def judge_topics(
         types: Topic with messages to type.
         joints: The robot's joints; empty without a robot.
         seen: Joints that ``/joint_states`` carries.
+        undecoded: Why the raw CAN frames brought nothing, or hardly anything; None if they did.
 
     Returns:
-        The findings.
+        The findings; where frames brought nothing, that is the one reason for what is missing.
     """
-    found: list[Finding] = []
+    found = [] if undecoded is None else [Finding(1, undecoded)]
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
     others = sorted(topic for topic, kind in types.items() if kind.endswith("/JointState"))
     for topic in ("/joint_states", "/joint_commands"):
@@ -316,6 +320,8 @@ def judge_topics(
             continue
         if others:
             sentence = f"{topic} is missing; JointStates are on {', '.join(others)}"
+        elif undecoded is not None:
+            continue
         elif framed:
             sentence = f"{topic} is missing; there are raw CAN frames"
         else:
