@@ -21,7 +21,7 @@ from .chunk import Buffer
 from .frames import identifier_text
 from .freeze import FreezeTally
 from .health import (
-    Finding,
+    judge_body,
     judge_bus,
     judge_channel,
     judge_joints,
@@ -30,6 +30,7 @@ from .health import (
     judge_topics,
     verdict_of,
 )
+from .joined import Finding, joined
 from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 from .rosmsg import MessageType
 from .source_health import SourceHealth, judge_source, measure_sources
@@ -233,14 +234,14 @@ class SessionScan:
         unseen = set(chain).difference(one.name for one in joints if one.nan < one.samples)
         why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
         findings = [*before, *judge_topics(types, chain, seen, why)]
-        for channel in channels:
-            findings += judge_channel(channel)
+        faults = [fault for channel in channels for fault in judge_channel(channel)]
         # Messages of frames come when a batch is full; the frames themselves are judged.
         framed = {bus.topic for bus in buses}
         for each in series:
             if each.topic not in framed:
-                findings += judge_series(each, start_ns, end_ns)
-        findings += judge_joints(joints, start_ns)
+                faults += judge_series(each, start_ns, end_ns)
+        findings += joined([*faults, *judge_joints(joints, start_ns)])
+        findings += judge_body(joints)
         for bus in buses:
             findings += judge_bus(bus)
         findings += judge_silences(buses, start_ns)
