@@ -26,6 +26,7 @@ from .harmonic_moments import (
     chunks,
     time_scale,
 )
+from .quantisation import draws, lattice_step, rounding_covariance, steady_noise
 from .series import Series, shared_times
 from .threads import in_threads
 
@@ -33,6 +34,9 @@ BINS_PER_SIDE = 6
 """At most six bins on either side: 24 degrees of freedom, whose t factor is 5 % above normal."""
 
 _BLOCKS = 4096
+
+RAISED = 1.3
+"""Rounding that alone makes this many times the noise found beside omega counts instead of it."""
 
 SAME_SPAN = 1.05
 """Records whose lengths differ by no more than this factor have the same bins."""
@@ -98,11 +102,14 @@ class ResidualBins:
         offset: nu_l [rad/s], in pairs +nu, -nu, shape (L,).
         spread: Trace of the covariance of (Re a, Im a) for a level of one, shape (K,): the mean
             of ``spread |value|^2`` is E|error of a|^2.
+        rounding: Covariance of (Re a, Im a) that rounding to steps adds to what the bins show,
+            shape (K, 2, 2); no two channels share it.
     """
 
     values: ComplexArray
     offset: FloatArray
     spread: FloatArray
+    rounding: FloatArray
 
     def select(self, chosen: Sequence[int] | IntArray) -> ResidualBins:
         """Some of the channels.
@@ -114,7 +121,9 @@ class ResidualBins:
             Their bins.
         """
         index = np.asarray(chosen, dtype=np.int64)
-        return ResidualBins(self.values[index], self.offset, self.spread[index])
+        return ResidualBins(
+            self.values[index], self.offset, self.spread[index], self.rounding[index]
+        )
 
 
 def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
@@ -166,13 +175,49 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
         usable = own.usable()
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
-    rounding = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
-    level = np.maximum(level, rounding)
+    exact = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
+    level = np.maximum(level, exact)
     first = fit.model.trend + 1
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
-    noise = Noise(level, dof, level[:, None, None] * block)
     spread = np.trace(block, axis1=1, axis2=2)
-    return noise, _common_bins(groups, [common for common, _ in found], shortest, spread)
+    covariance = level[:, None, None] * block
+    rounding = np.zeros_like(covariance)
+    for chosen, rounded in _rounded(series, fit, groups, level):
+        beyond = np.trace(rounded, axis1=1, axis2=2) > RAISED * spread[chosen] * level[chosen]
+        raised = chosen[beyond]
+        rounding[raised] = _positive(rounded[beyond] - covariance[raised])
+        covariance[raised] += rounding[raised]
+        level[raised] = np.trace(covariance[raised], axis1=1, axis2=2) / spread[raised]
+        dof[raised] = [2.0 * draws(series[int(k)].count) for k in raised]
+    common = [common for common, _ in found]
+    return (
+        Noise(level, dof, covariance),
+        _common_bins(groups, common, shortest, spread, rounding),
+    )
+
+
+def _positive(symmetric: FloatArray) -> FloatArray:
+    """The part of symmetric matrices that is not negative, shape (k, 2, 2)."""
+    values, vectors = np.linalg.eigh(symmetric)
+    return (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+
+
+def _rounded(
+    series: Sequence[Series], fit: HarmonicFit, groups: Sequence[list[int]], level: FloatArray
+) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Channels of each group whose rounding no noise makes white, and what it makes of them."""
+    for members in groups:
+        found: list[tuple[int, float, float]] = []
+        for k in members:
+            step = lattice_step(series[k].values)
+            noise = steady_noise(step, float(fit.rss[k] / fit.count[k]), float(level[k]))
+            if noise is not None:
+                found.append((k, step, noise))
+        if found:
+            chosen, steps, noises = zip(*found, strict=True)
+            group = [series[k] for k in chosen]
+            covariance = rounding_covariance(group, fit, chosen, np.array(steps), np.array(noises))
+            yield np.array(chosen, dtype=np.int64), covariance
 
 
 def _common_bins(
@@ -180,6 +225,7 @@ def _common_bins(
     found: Sequence[_Demodulated],
     span: float,
     spread: FloatArray,
+    rounding: FloatArray,
 ) -> ResidualBins:
     """The bins of all groups in the order of the channels; a pair that a fit took is left out."""
     left = np.min([one.kept / one.count for one in found], axis=0)
@@ -190,7 +236,7 @@ def _common_bins(
         values[members] = one.transform[:, usable] / np.sqrt(one.kept[usable])
     offset: FloatArray = np.repeat(np.arange(1.0, pairs.size + 1), 2) * (2 * np.pi / span)
     offset[1::2] *= -1
-    return ResidualBins(values, offset[usable], spread)
+    return ResidualBins(values, offset[usable], spread, rounding)
 
 
 def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
@@ -247,7 +293,7 @@ def residuals(
     """
     t_s = group[0].t_s
     scale = time_scale(t_s)
-    theta = _parameters(fit, members, scale)
+    theta = fit.parameters(members, scale)
     first = fit.model.trend + 1
     wider = replace(fit.model, harmonics=fit.model.harmonics + 1)
     for part in chunks(t_s.size):
@@ -331,11 +377,3 @@ def _waves(t_s: FloatArray, spacing: float, side: int) -> ComplexArray:
         up = up * turn
         waves[2 * k], waves[2 * k + 1] = up, up.conj()
     return waves
-
-
-def _parameters(fit: HarmonicFit, members: Sequence[int], scale: float) -> FloatArray:
-    """Coefficients of the basis rows, shape (k, p)."""
-    trend = fit.trend[members] * scale ** np.arange(fit.model.trend + 1.0)
-    parts = fit.amplitudes[members]
-    harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(len(members), -1)
-    return np.concatenate([trend, harmonic], axis=1)

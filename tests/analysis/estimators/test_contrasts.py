@@ -134,7 +134,7 @@ def test_shared_noise_cancels_or_adds():
     series = [Series("r", t, np.cos(OMEGA * t + sign) + shared) for sign in (0.0, 0.0, np.pi)]
     fit = fit_at(series, OMEGA)
     noise, bins = residual_spectrum(series, fit)
-    still = type(bins)(0 * bins.values, bins.offset, bins.spread)
+    still = type(bins)(0 * bins.values, bins.offset, bins.spread, bins.rounding)
     errors = response_errors(fit.fundamental, still, fit.fundamental, bins)
     single = contrast_variance(errors, np.eye(3))[0]
     np.testing.assert_allclose(single, noise.level * bins.spread / 2, rtol=1e-3)

@@ -1,0 +1,168 @@
+"""Error of a fitted amplitude from the steps of an encoder or of a command.
+
+Rounding to steps of q is taken for white noise of variance q^2/12 (Widrow & Kollar, Quantization
+Noise, 2008), and so it is where noise or the sampling moves each sample to another place between
+two steps. It is not where the sampling is commensurate with the gait: 0.5 Hz at 50 Hz has 100
+phases a cycle, the same in each, so a thousand cycles hold no more than 100 different errors.
+They repeat with the gait, all of them lie at its harmonics, and the residual beside the gait
+frequency shows nothing. About a mean that lies on a step or half-way between two, the second half
+of a cycle mirrors the first and only 50 are left.
+
+So the error is found by rounding again: the fitted motion, a little larger or smaller at each
+draw, at the very times of the samples, with the noise that the residual has beside the steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from capture.arrays import FloatArray
+
+from .harmonic import HarmonicFit
+from .harmonic_moments import basis, chunks, time_scale
+from .series import Series
+
+DRAWS = 48
+"""Roundings of each channel: its error is known within 10 %."""
+
+DITHERED = 0.4
+"""Noise above this share of a step makes rounding white: of what repeats, exp(-(2 pi 0.4)^2), a
+five-hundredth of its power, is left."""
+
+_LONG = 40_000
+_DRAWS_OF_LONG = 16
+
+_LOOKED_AT = 4096
+_OFF_LATTICE = 0.02
+"""Share of a step by which values may lie beside it: they were stored in single precision."""
+
+_FINEST = 1e-6
+"""A step below this share of the range is rounding of numbers, not of a quantity."""
+
+_SYMMETRIC = 0.1
+"""Share of a step within which a mean counts as on a step or half-way between two."""
+
+_RANGE = 8.0
+"""Draws differ in amplitude by up to this many steps, and at most by ``_SHARE`` of it."""
+
+_SHARE = 0.2
+
+
+def lattice_step(values: FloatArray) -> float:
+    """Step of values that were rounded.
+
+    Args:
+        values: Finite, shape (n,).
+
+    Returns:
+        The largest step of which all differences between values are multiples; 0 where there is
+        none, or where fewer than three values occur.
+    """
+    middle = max(0, (values.size - _LOOKED_AT) // 2)
+    levels = np.unique(values[middle : middle + _LOOKED_AT])
+    if levels.size < 3:
+        return 0.0
+    reach = float(levels[-1] - levels[0])
+    apart = np.diff(levels)
+    # Equal values may differ by their own rounding.
+    apart = apart[apart > _FINEST * reach]
+    if apart.size < 2:
+        return 0.0
+    step = float(apart.min())
+    # Euclid's algorithm with real numbers: what is left of a difference is a multiple, too.
+    while step > _FINEST * reach:
+        count = np.rint(apart / step)
+        left = np.abs(apart - count * step)
+        if np.all(left <= _OFF_LATTICE * step):
+            return _checked(levels, float(apart.sum() / count.sum()))
+        step = float(left[left > _OFF_LATTICE * step].min())
+    return 0.0
+
+
+def _checked(levels: FloatArray, step: float) -> float:
+    """The step if all levels are on it, however far from the first."""
+    place = (levels - levels[0]) / step
+    return step if np.all(np.abs(place - np.rint(place)) < 2 * _OFF_LATTICE) else 0.0
+
+
+def steady_noise(step: float, residual: float, level: float) -> float | None:
+    """Noise of a channel beside its rounding.
+
+    Args:
+        step: Of its lattice, 0 for none.
+        residual: Variance of its residual, which is large also where harmonics are left in it.
+        level: Its noise level beside the gait frequency; of noise that is stronger at other
+            frequencies no more than three times that is counted on.
+
+    Returns:
+        Standard deviation in the channel's unit; None where it makes rounding white, or where
+        nothing is rounded.
+    """
+    noise = max(0.0, min(residual - step**2 / 12, 3 * level))
+    return noise**0.5 if noise < (DITHERED * step) ** 2 else None
+
+
+def rounding_covariance(
+    group: Sequence[Series],
+    fit: HarmonicFit,
+    members: Sequence[int],
+    steps: FloatArray,
+    noise: FloatArray,
+) -> FloatArray:
+    """Covariance of the fundamentals of rounded channels.
+
+    Args:
+        group: k channels with shared times.
+        fit: The fit that holds them.
+        members: Their indices in the fit.
+        steps: Steps of their lattices, shape (k,).
+        noise: Standard deviations of what else moves them, shape (k,).
+
+    Returns:
+        Of (Re a, Im a), shape (k, 2, 2), from draws that are the same at each call.
+    """
+    t_s = group[0].t_s
+    scale = time_scale(t_s)
+    model = fit.model
+    first = model.trend + 1
+    theta = fit.parameters(members, scale)
+    weight = fit.inverse_gram[members[0]][first : first + 2]
+    count = draws(t_s.size)
+    random = np.random.default_rng(0)
+    size = np.maximum(np.abs(fit.fundamental[list(members)]), np.finfo(float).tiny)
+    reach = np.minimum(_RANGE * steps / size, _SHARE)
+    scaled = 1 + reach[:, None] * random.uniform(-1, 1, (len(group), count))
+    origin = np.array([one.values[0] for one in group])
+    shift = _shift(theta[:, 0], origin, steps) if model.trend == 0 else np.zeros(len(group))
+    error = np.zeros((len(group), count, 2))
+    for part in chunks(t_s.size):
+        rows = basis(t_s[part], fit.omega, model, scale)
+        pull = weight @ rows
+        still = theta[:, :first] @ rows[:first] + (shift - origin)[:, None]
+        moving = theta[:, first:] @ rows[first:]
+        for k, step in enumerate(steps):
+            place = (still[k] + scaled[k][:, None] * moving[k]) / step
+            other = noise[k] / step * random.normal(size=place.shape) if noise[k] > 0 else 0.0
+            error[k] += step * ((np.rint(place + other) - place) @ pull.T)
+    return np.einsum("kdi,kdj->kij", error, error) / count
+
+
+def draws(samples: int) -> int:
+    """How many draws :func:`rounding_covariance` makes.
+
+    Args:
+        samples: Of a channel.
+
+    Returns:
+        Fewer for a record that is long.
+    """
+    return DRAWS if samples <= _LONG else _DRAWS_OF_LONG
+
+
+def _shift(mean: FloatArray, origin: FloatArray, steps: FloatArray) -> FloatArray:
+    """What moves a mean that is close to a step, or to half-way between two, onto it."""
+    place = 2 * (mean - origin) / steps
+    off = (np.rint(place) - place) / 2
+    return np.where(np.abs(off) < _SYMMETRIC, off * steps, 0.0)
