@@ -81,11 +81,12 @@ def response_errors(
     rounding = np.zeros((response.size, 2, 2))
     for amplitude, found in ((response, response_bins), (command, command_bins)):
         known = np.abs(amplitude) > 0
-        inverse = np.divide(1.0, amplitude, out=np.full_like(amplitude, np.nan), where=known)
+        inverse = np.full(amplitude.shape, np.nan, dtype=np.complex128)
+        np.divide(1.0, amplitude, out=inverse, where=known)
         parts.append((inverse * np.sqrt(found.spread))[:, None] * found.values)
         # Multiplied by 1/a, errors of (Re a, Im a) become those of (ln|a|, arg a).
-        rows = [[inverse.real, -inverse.imag], [inverse.imag, inverse.real]]
-        turned = np.moveaxis(np.array(rows), -1, 0)
+        turned = np.stack([inverse, 1j * inverse], axis=-1)
+        turned = np.stack([turned.real, turned.imag], axis=-2)
         rounding += turned @ found.rounding @ turned.transpose(0, 2, 1)
     turn = np.zeros(response.size) + omega_variance**0.5 * np.asarray(delay_between_s)
     return ResponseErrors(parts[0] - parts[1], rounding, turn)

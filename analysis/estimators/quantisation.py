@@ -14,8 +14,6 @@ draw, at the very times of the samples, with the noise that the residual has bes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from capture.arrays import FloatArray
@@ -105,48 +103,48 @@ def steady_noise(step: float, residual: float, level: float) -> float | None:
 
 
 def rounding_covariance(
-    group: Sequence[Series],
-    fit: HarmonicFit,
-    members: Sequence[int],
-    steps: FloatArray,
-    noise: FloatArray,
+    one: Series, fit: HarmonicFit, channel: int, step: float, noise: float
 ) -> FloatArray:
-    """Covariance of the fundamentals of rounded channels.
+    """Covariance of the fundamental of a rounded channel.
+
+    Draws differ in amplitude, and half of them in phase as well. The other half keeps its phase,
+    for a wave whose quarters mirror each other at the samples has still fewer different errors.
 
     Args:
-        group: k channels with shared times.
-        fit: The fit that holds them.
-        members: Their indices in the fit.
-        steps: Steps of their lattices, shape (k,).
-        noise: Standard deviations of what else moves them, shape (k,).
+        one: The channel.
+        fit: The fit that holds it.
+        channel: Its index in the fit.
+        step: Step of its lattice.
+        noise: Standard deviation of what else moves it, from :func:`steady_noise`.
 
     Returns:
-        Of (Re a, Im a), shape (k, 2, 2), from draws that are the same at each call.
+        Of (Re a, Im a), shape (2, 2), from draws that are the same at each call.
     """
-    t_s = group[0].t_s
+    t_s, model, first = one.t_s, fit.model, fit.model.trend + 1
     scale = time_scale(t_s)
-    model = fit.model
-    first = model.trend + 1
-    theta = fit.parameters(members, scale)
-    weight = fit.inverse_gram[members[0]][first : first + 2]
-    count = draws(t_s.size)
+    theta = fit.parameters([channel], scale)[0]
+    weight = fit.inverse_gram[channel][first : first + 2]
     random = np.random.default_rng(0)
-    size = np.maximum(np.abs(fit.fundamental[list(members)]), np.finfo(float).tiny)
-    reach = np.minimum(_RANGE * steps / size, _SHARE)
-    scaled = 1 + reach[:, None] * random.uniform(-1, 1, (len(group), count))
-    origin = np.array([one.values[0] for one in group])
-    shift = _shift(theta[:, 0], origin, steps) if model.trend == 0 else np.zeros(len(group))
-    error = np.zeros((len(group), count, 2))
+    amplitude = fit.fundamental[channel]
+    reach = min(_RANGE * step / max(abs(amplitude), step), _SHARE)
+    half_sample = fit.omega * one.period_s / 2
+    varied = np.ones((draws(one.count), 3))
+    varied[:, 1] += reach * random.uniform(-1, 1, len(varied))
+    varied[:, 2] = half_sample * random.uniform(-1, 1, len(varied))
+    varied[::2, 2] = 0.0
+    error = np.zeros((len(varied), 2))
+    origin = _origin(theta[0], float(one.values[0]), step)
     for part in chunks(t_s.size):
         rows = basis(t_s[part], fit.omega, model, scale)
-        pull = weight @ rows
-        still = theta[:, :first] @ rows[:first] + (shift - origin)[:, None]
-        moving = theta[:, first:] @ rows[first:]
-        for k, step in enumerate(steps):
-            place = (still[k] + scaled[k][:, None] * moving[k]) / step
-            other = noise[k] / step * random.normal(size=place.shape) if noise[k] > 0 else 0.0
-            error[k] += step * ((np.rint(place + other) - place) @ pull.T)
-    return np.einsum("kdi,kdj->kij", error, error) / count
+        trend = theta[:first] @ rows[:first] - origin
+        moving = theta[first:] @ rows[first:]
+        ahead = amplitude.real * rows[first + 1] - amplitude.imag * rows[first]
+        place = varied @ (np.stack([trend, moving, ahead]) / step)
+        rounded = place
+        if noise > 0:
+            rounded = place + noise / step * random.standard_normal(place.shape, np.float32)
+        error += step * (np.rint(rounded) - place) @ (weight @ rows).T
+    return error.T @ error / len(varied)
 
 
 def draws(samples: int) -> int:
@@ -161,8 +159,8 @@ def draws(samples: int) -> int:
     return DRAWS if samples <= _LONG else _DRAWS_OF_LONG
 
 
-def _shift(mean: FloatArray, origin: FloatArray, steps: FloatArray) -> FloatArray:
-    """What moves a mean that is close to a step, or to half-way between two, onto it."""
-    place = 2 * (mean - origin) / steps
-    off = (np.rint(place) - place) / 2
-    return np.where(np.abs(off) < _SYMMETRIC, off * steps, 0.0)
+def _origin(mean: float, level: float, step: float) -> float:
+    """A level of the lattice; with it, a mean close to a step or to half-way is on it exactly."""
+    place = 2 * (mean - level) / step
+    off = (round(place) - place) / 2
+    return level - off * step if abs(off) < _SYMMETRIC else level

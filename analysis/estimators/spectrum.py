@@ -182,13 +182,12 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
     spread = np.trace(block, axis1=1, axis2=2)
     covariance = level[:, None, None] * block
     rounding = np.zeros_like(covariance)
-    for chosen, rounded in _rounded(series, fit, groups, level):
-        beyond = np.trace(rounded, axis1=1, axis2=2) > RAISED * spread[chosen] * level[chosen]
-        raised = chosen[beyond]
-        rounding[raised] = _positive(rounded[beyond] - covariance[raised])
-        covariance[raised] += rounding[raised]
-        level[raised] = np.trace(covariance[raised], axis1=1, axis2=2) / spread[raised]
-        dof[raised] = [2.0 * draws(series[int(k)].count) for k in raised]
+    for k, rounded in _rounded(series, fit, level):
+        if np.trace(rounded) > RAISED * spread[k] * level[k]:
+            rounding[k] = _positive(rounded - covariance[k])
+            covariance[k] += rounding[k]
+            level[k] = np.trace(covariance[k]) / spread[k]
+            dof[k] = 2.0 * draws(series[k].count)
     common = [common for common, _ in found]
     return (
         Noise(level, dof, covariance),
@@ -196,28 +195,30 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
     )
 
 
-def _positive(symmetric: FloatArray) -> FloatArray:
-    """The part of symmetric matrices that is not negative, shape (k, 2, 2)."""
-    values, vectors = np.linalg.eigh(symmetric)
-    return (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
-
-
 def _rounded(
-    series: Sequence[Series], fit: HarmonicFit, groups: Sequence[list[int]], level: FloatArray
-) -> Iterator[tuple[IntArray, FloatArray]]:
-    """Channels of each group whose rounding no noise makes white, and what it makes of them."""
-    for members in groups:
-        found: list[tuple[int, float, float]] = []
-        for k in members:
-            step = lattice_step(series[k].values)
-            noise = steady_noise(step, float(fit.rss[k] / fit.count[k]), float(level[k]))
-            if noise is not None:
-                found.append((k, step, noise))
-        if found:
-            chosen, steps, noises = zip(*found, strict=True)
-            group = [series[k] for k in chosen]
-            covariance = rounding_covariance(group, fit, chosen, np.array(steps), np.array(noises))
-            yield np.array(chosen, dtype=np.int64), covariance
+    series: Sequence[Series], fit: HarmonicFit, level: FloatArray
+) -> list[tuple[int, FloatArray]]:
+    """Channels whose rounding no noise makes white, and the covariance that it makes."""
+    found: list[tuple[int, float, float]] = []
+    for k, one in enumerate(series):
+        step = lattice_step(one.values)
+        noise = steady_noise(step, float(fit.rss[k] / fit.count[k]), float(level[k]))
+        if noise is not None:
+            found.append((k, step, noise))
+
+    def rounded(item: tuple[int, float, float]) -> tuple[int, FloatArray]:
+        k, step, noise = item
+        return k, rounding_covariance(series[k], fit, k, step, noise)
+
+    return in_threads(
+        rounded, found, sum(draws(n) * n for n in (series[k].count for k, *_ in found))
+    )
+
+
+def _positive(symmetric: FloatArray) -> FloatArray:
+    """The part of a symmetric matrix that is not negative, shape (2, 2)."""
+    values, vectors = np.linalg.eigh(symmetric)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def _common_bins(
