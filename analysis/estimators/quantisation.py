@@ -33,11 +33,14 @@ _LONG = 40_000
 _DRAWS_OF_LONG = 16
 
 _LOOKED_AT = 4096
-_OFF_LATTICE = 0.02
-"""Share of a step by which values may lie beside it: they were stored in single precision."""
+_FEWEST = 5
+"""Levels of a channel that was rounded; fewer may be all that was ever commanded."""
 
-_FINEST = 1e-6
-"""A step below this share of the range is rounding of numbers, not of a quantity."""
+_BLUR = 4 * float(np.finfo(np.float32).eps)
+"""Values lie beside the lattice by up to this share of the largest: stored in single precision."""
+
+_SHARPEST = 20.0
+"""A step is this many times what it is in doubt by, or it may be one by chance."""
 
 _SYMMETRIC = 0.1
 """Share of a step within which a mean counts as on a step or half-way between two."""
@@ -56,33 +59,35 @@ def lattice_step(values: FloatArray) -> float:
 
     Returns:
         The largest step of which all differences between values are multiples; 0 where there is
-        none, or where fewer than three values occur.
+        none, or where fewer than five values occur.
     """
     middle = max(0, (values.size - _LOOKED_AT) // 2)
     levels = np.unique(values[middle : middle + _LOOKED_AT])
-    if levels.size < 3:
+    if levels.size < _FEWEST:
         return 0.0
-    reach = float(levels[-1] - levels[0])
+    blur = _BLUR * float(np.abs(levels).max())
     apart = np.diff(levels)
-    # Equal values may differ by their own rounding.
-    apart = apart[apart > _FINEST * reach]
-    if apart.size < 2:
+    apart = apart[apart > blur]
+    if apart.size < _FEWEST - 1:
         return 0.0
-    step = float(apart.min())
-    # Euclid's algorithm with real numbers: what is left of a difference is a multiple, too.
-    while step > _FINEST * reach:
-        count = np.rint(apart / step)
-        left = np.abs(apart - count * step)
-        if np.all(left <= _OFF_LATTICE * step):
-            return _checked(levels, float(apart.sum() / count.sum()))
-        step = float(left[left > _OFF_LATTICE * step].min())
-    return 0.0
-
-
-def _checked(levels: FloatArray, step: float) -> float:
-    """The step if all levels are on it, however far from the first."""
-    place = (levels - levels[0]) / step
-    return step if np.all(np.abs(place - np.rint(place)) < 2 * _OFF_LATTICE) else 0.0
+    step, known = float(apart.min()), 1.0
+    # Euclid's algorithm with real numbers: what is left of a difference is a multiple, too. The
+    # step is known within the blur over the most steps that it was measured over.
+    for whole in np.unique(apart).tolist():
+        other = whole
+        while True:
+            count = round(other / step)
+            doubt = blur * (1 + count / known)
+            left = abs(other - count * step)
+            if step < _SHARPEST * doubt:
+                return 0.0
+            if left <= doubt:
+                break
+            other, step, known = step, left, blur / doubt
+        count = round(whole / step)
+        if count > known:
+            step, known = whole / count, float(count)
+    return float(apart.sum() / np.rint(apart / step).sum())
 
 
 def steady_noise(step: float, residual: float, level: float) -> float | None:
