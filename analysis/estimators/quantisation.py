@@ -36,8 +36,8 @@ _LOOKED_AT = 4096
 _FEWEST = 5
 """Levels of a channel that was rounded; fewer may be all that was ever commanded."""
 
-_BLUR = 4 * float(np.finfo(np.float32).eps)
-"""Values lie beside the lattice by up to this share of the largest: stored in single precision."""
+_PRECISIONS = (float(np.finfo(np.float32).eps), 1e-11)
+"""Relative precision that values may have been stored in, or summed up in double precision."""
 
 _SHARPEST = 20.0
 """A step is this many times what it is in doubt by, or it may be one by chance."""
@@ -63,12 +63,20 @@ def lattice_step(values: FloatArray) -> float:
     """
     middle = max(0, (values.size - _LOOKED_AT) // 2)
     levels = np.unique(values[middle : middle + _LOOKED_AT])
-    if levels.size < _FEWEST:
+    if levels.size < 2:
         return 0.0
-    blur = _BLUR * float(np.abs(levels).max())
-    apart = np.diff(levels)
+    largest = float(np.abs(levels).max())
+    for precision in _PRECISIONS:
+        step = _common_step(np.diff(levels), 4 * precision * largest)
+        if step > 0:
+            return step
+    return 0.0
+
+
+def _common_step(apart: FloatArray, blur: float) -> float:
+    """Step of which differences of values that are off by up to the blur are multiples, or 0."""
     apart = apart[apart > blur]
-    if apart.size < _FEWEST - 1:
+    if apart.size + 1 < _FEWEST:
         return 0.0
     step, known = float(apart.min()), 1.0
     # Euclid's algorithm with real numbers: what is left of a difference is a multiple, too. The
