@@ -221,7 +221,9 @@ def rounded(
     series = [Series("q", t, one) for one in (*command, *answer)]
     fit = fit_at(series, omega)
     noise, bins = residual_spectrum(series, fit)
-    alone = Noise(noise.level, noise.dof, noise.covariance - bins.rounding)
+    level = np.mean(np.abs(bins.values) ** 2, axis=1)
+    dof = np.full(level.size, 2.0 * bins.offset.size)
+    alone = Noise(level, dof, (bins.spread * level / 2)[:, None, None] * np.eye(2))
     covered = []
     for one in (alone, noise):
         parts = [

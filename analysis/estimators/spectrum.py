@@ -26,7 +26,14 @@ from .harmonic_moments import (
     chunks,
     time_scale,
 )
-from .quantisation import draws, lattice_step, rounding_covariance, steady_noise
+from .quantisation import (
+    DRAWS,
+    draws,
+    lattice_step,
+    not_negative,
+    rounding_covariance,
+    steady_noise,
+)
 from .series import Series, shared_times
 from .threads import in_threads
 
@@ -102,8 +109,8 @@ class ResidualBins:
         offset: nu_l [rad/s], in pairs +nu, -nu, shape (L,).
         spread: Trace of the covariance of (Re a, Im a) for a level of one, shape (K,): the mean
             of ``spread |value|^2`` is E|error of a|^2.
-        rounding: Covariance of (Re a, Im a) that rounding to steps adds to what the bins show,
-            shape (K, 2, 2); no two channels share it.
+        rounding: Covariance of (Re a, Im a) that rounding, to steps or of numbers, adds to what
+            the bins show, shape (K, 2, 2); it is counted as each channel's own.
     """
 
     values: ComplexArray
@@ -176,18 +183,20 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
     exact = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
-    level = np.maximum(level, exact)
+    floor = np.maximum(exact - level, 0.0)
+    level += floor
     first = fit.model.trend + 1
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
     spread = np.trace(block, axis1=1, axis2=2)
     covariance = level[:, None, None] * block
-    rounding = np.zeros_like(covariance)
+    rounding = floor[:, None, None] * block
     for k, rounded in _rounded(series, fit, level):
         if np.trace(rounded) > RAISED * spread[k] * level[k]:
-            rounding[k] = _positive(rounded - covariance[k])
-            covariance[k] += rounding[k]
+            more = not_negative(rounded - covariance[k])
+            rounding[k] += more
+            covariance[k] += more
             level[k] = np.trace(covariance[k]) / spread[k]
-            dof[k] = 2.0 * draws(series[k].count)
+            dof[k] = draws(series[k].count)
     common = [common for common, _ in found]
     return (
         Noise(level, dof, covariance),
@@ -210,15 +219,7 @@ def _rounded(
         k, step, noise = item
         return k, rounding_covariance(series[k], fit, k, step, noise)
 
-    return in_threads(
-        rounded, found, sum(draws(n) * n for n in (series[k].count for k, *_ in found))
-    )
-
-
-def _positive(symmetric: FloatArray) -> FloatArray:
-    """The part of a symmetric matrix that is not negative, shape (2, 2)."""
-    values, vectors = np.linalg.eigh(symmetric)
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return in_threads(rounded, found, sum(DRAWS * series[k].count for k, *_ in found))
 
 
 def _common_bins(

@@ -1,102 +1,25 @@
 """Contrasts between joints whose noise is shared: intervals against planted truth."""
 
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from scipy.signal import lfilter
-from scipy.special import stdtrit
 
-from analysis.estimators.contrasts import contrast_variance, lag_contrast_variance, response_errors
+from analysis.estimators.contrasts import contrast_variance, response_errors
 from analysis.estimators.harmonic import HarmonicModel, fit_at
 from analysis.estimators.series import Series
 from analysis.estimators.spectrum import residual_noise, residual_spectrum
-from analysis.response import respond
 
-JOINTS, RATE, OMEGA = 9, 100.0, 2 * np.pi * 0.97
-AMPLITUDE, GAIN, LAG = 0.5, 0.9, 0.3
-FINE = 20
-
-
-def contrasts():
-    """Each joint against the mean of the others, ends against middle, linear trend."""
-    each = np.eye(JOINTS) - (1 - np.eye(JOINTS)) / (JOINTS - 1)
-    ends = np.full(JOINTS, -1 / (JOINTS - 2))
-    ends[[0, -1]] = 0.5
-    place = np.arange(JOINTS) - (JOINTS - 1) / 2
-    return np.vstack([each, ends, place / (place @ place)])
+DOCS = Path(__file__).parents[3] / "docs"
+TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "contrast_tables.py")))
+RATE, OMEGA, JOINTS = TABLES.RATE, TABLES.OMEGA, TABLES.JOINTS
 
 
-def coloured(random, runs, count, correlation):
-    """AR(1) noise of unit variance, (runs, count)."""
-    white = random.normal(size=(runs, count + 200 * bool(correlation)))
-    if not correlation:
-        return white
-    share = (1 - correlation**2) ** 0.5
-    return lfilter([share], [1.0, -correlation], white)[:, 200:]
-
-
-def simulated(shared, correlation, *, runs, apart_s=8e-4, duration_s=10.3, every=(1, 1, 1), seed=3):
-    """Responses of identical joints, channels in the order joint, run; and their phases.
-
-    Noise on a grid 20 times as fine as the samples, so that joints that are sampled at different
-    times see the same course of it.
-    """
-    random = np.random.default_rng(seed)
-    count = round(duration_s * RATE)
-    fine = (np.arange((count + 2) * FINE) / FINE / RATE) - duration_s / 2
-    smooth = correlation ** (1 / FINE)
-    courses = [coloured(random, runs, fine.size, smooth) for _ in range(2)] if correlation else []
-    ticks = random.normal(size=(2, runs, count))
-    found = []
-    phase = 0.4 - np.arange(JOINTS) * np.pi / 3
-    for joint in range(JOINTS):
-        steps = round(apart_s * joint * RATE * FINE)
-        chosen = (np.arange(count) * FINE + steps)[:: every[joint % 3]]
-        own = fine[chosen]
-        # White noise is shared sample by sample: all joints of one tick have the same.
-        first, second = (
-            [one[:, chosen] for one in courses] if correlation else ticks[:, :, :: every[joint % 3]]
-        )
-        alone = coloured(random, runs, count, correlation)[:, :: every[joint % 3]]
-        wave = OMEGA * own + phase[joint] - LAG
-        size = GAIN * AMPLITUDE
-        if shared == "nothing":
-            values = size * np.cos(wave) + 0.01 * alone
-        elif shared == "additive":
-            values = size * np.cos(wave) + 0.01 * first + 0.003 * alone
-        else:
-            values = size * (1 + 0.02 * first) * np.cos(wave + 0.02 * second) + 0.003 * alone
-        found += [Series("r", own, one) for one in values]
-    return found, phase
-
-
-def judged(shared, correlation, *, runs=300, **more):
+def judged(*case, **more):
     """Share of 95 % intervals of the contrasts that hold zero: of gain and of lag, each (11,)."""
-    responses, phase = simulated(shared, correlation, runs=runs, **more)
-    noise = residual_spectrum(responses, fit := fit_at(responses, OMEGA))
-    t = responses[0].t_s
-    commands = [Series("c", t, AMPLITUDE * np.cos(OMEGA * t + one)) for one in phase]
-    asked = fit_at(commands, OMEGA)
-    exact, exact_bins = residual_spectrum(commands, asked)
-    weights, inside = contrasts(), []
-    for run in range(runs):
-        own = np.arange(JOINTS) * runs + run
-        found = respond(
-            asked.fundamental,
-            exact,
-            fit.fundamental[own],
-            type(exact)(noise[0].level[own], noise[0].dof[own], noise[0].covariance[own]),
-            bins=(exact_bins, noise[1].select(own)),
-        )
-        errors = found.errors
-        gain, lag = weights @ np.log(found.gain), weights @ found.lag_rad
-        of_gain, of_lag = contrast_variance(errors, weights), lag_contrast_variance(errors, weights)
-        inside.append(
-            [
-                np.abs(value) <= stdtrit(dof, 0.975) * variance**0.5
-                for value, (variance, dof) in ((gain, of_gain), (lag, of_lag))
-            ]
-        )
-    return np.mean(inside, axis=0)
+    return TABLES.judged(*case, **more)[0]
 
 
 @pytest.mark.parametrize("shared", ["nothing", "additive", "modulation"])
