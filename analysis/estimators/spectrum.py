@@ -110,7 +110,7 @@ def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
         level[members] = np.mean(power[:, usable] / kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
     level = np.maximum(level, RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0))
-    first = fit.model.trend + 1
+    first = fit.model.first
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
     return Noise(level, dof, level[:, None, None] * block)
 
@@ -170,7 +170,7 @@ def residuals(
     t_s = group[0].t_s
     scale = time_scale(t_s)
     theta = _parameters(fit, members, scale)
-    first = fit.model.trend + 1
+    first = fit.model.first
     wider = replace(fit.model, harmonics=fit.model.harmonics + 1)
     for part in chunks(t_s.size):
         rows = basis(t_s[part], fit.omega, wider, scale)
@@ -209,7 +209,7 @@ def _turned_rows(rows: FloatArray, edges: IntArray, model: HarmonicModel) -> Com
     Of a harmonic they are those of its neighbours: cos(h x) exp(-j x) is half the sum of
     exp(j (h - 1) x) and exp(-j (h + 1) x), and -sin(h x) exp(-j x) is j / 2 of their difference.
     """
-    first, h = model.trend + 1, model.harmonics
+    first, h = model.first, model.harmonics
     sums = np.add.reduceat(rows, edges, axis=1)
     parts = sums[first:].reshape(h + 1, 2, -1)
     back: ComplexArray = parts[:, 0] + 1j * parts[:, 1]  # exp(-j m x), m = 1 .. h + 1
@@ -238,6 +238,6 @@ def _waves(t_s: FloatArray, spacing: float, side: int) -> ComplexArray:
 def _parameters(fit: HarmonicFit, members: Sequence[int], scale: float) -> FloatArray:
     """Coefficients of the basis rows, shape (k, p)."""
     trend = fit.trend[members] * scale ** np.arange(fit.model.trend + 1.0)
-    parts = fit.amplitudes[members]
+    parts = np.concatenate([fit.lines[members], fit.amplitudes[members]], axis=1)
     harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(len(members), -1)
     return np.concatenate([trend, harmonic], axis=1)

@@ -8,6 +8,7 @@ everything else is "could not be shown".
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -98,20 +99,22 @@ def answer(analysis: Analysis) -> Answer:
 
 
 def find(indices: dict[str, Index], stem: str) -> dict[str, Index]:
-    """The indices of one kind that have a value, by plane.
+    """The indices of one kind that have a value, by plane and group.
 
     Args:
-        indices: Name to index; where both planes are driven, names end in the plane.
+        indices: Name to index; where both planes are driven, names end in the plane, where joints
+            of one plane have several frequencies, in the group.
         stem: Name without the plane, e.g. ``gain_cv``.
 
     Returns:
-        ``horizontal``, ``vertical`` or an empty string, to the index.
+        End of the name, e.g. ``horizontal``, ``vertical_group1`` or an empty string, to the index.
     """
-    planes = {stem: "", f"{stem}_horizontal": "horizontal", f"{stem}_vertical": "vertical"}
+    pattern = re.compile(rf"{re.escape(stem)}_?((?:horizontal|vertical)?(?:_?group\d+)?)")
+    found = {name: pattern.fullmatch(name) for name in indices}
     return {
-        planes[name]: index
-        for name, index in indices.items()
-        if name in planes and index.value is not None
+        match[1]: indices[name]
+        for name, match in found.items()
+        if match is not None and indices[name].value is not None
     }
 
 
@@ -186,15 +189,21 @@ def _size(index: Index) -> Estimate:
     return Estimate(-index.value, ci95)
 
 
-def _joints_word(analysis: Analysis, plane: str) -> str:
-    """What to call the joints that an index is about."""
+def _joints_word(analysis: Analysis, end: str) -> str:
+    """What to call the joints that an index is about, from the end of its name."""
+    plane, _, group = end.partition("group")
+    plane = plane.rstrip("_")
     planes = {plane} if plane else {j.plane for j in analysis.joints if j.gain.value is not None}
     words = {"horizontal": "yaw joints", "vertical": "pitch joints"}
-    return words.get(str(next(iter(planes))), "joints") if len(planes) == 1 else "joints"
+    word = words.get(str(next(iter(planes))), "joints") if len(planes) == 1 else "joints"
+    if not group:
+        return word
+    frequency = analysis.gait.groups[int(group)].frequency_hz
+    return f"{word} at {formats.number(frequency.value, 3)} Hz"
 
 
 def _extremes(analysis: Analysis, known: Sequence[JointResult]) -> str:
-    frequency = formats.estimate(analysis.gait.frequency_hz, " Hz", most=4)
+    frequency = formats.gait_frequency(analysis.gait)
     text = f"{len(known)} of {len(analysis.joints)} joints respond to a gait of {frequency}"
     lags = [j for j in known if j.lag_rad.value is not None]
     if lags:
