@@ -317,9 +317,9 @@ def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, 
     if tones:
         falls = "; ".join(_mixed(tone, names) for tone in tones)
         warn(
-            f"the groups' frequencies are commensurate within 1/T: {falls}. What a nonlinear body "
-            "makes there is part of these joints' gain and lag, which hold for both groups moving "
-            "as they do"
+            f"frequencies of the groups are commensurate within {RESOLUTION:g}/T: {falls}; what a "
+            "nonlinear body makes there is part of these joints' gain and lag, which hold for this "
+            "operating point of all groups together"
         )
 
 

@@ -43,6 +43,12 @@ COINCIDENT = 0.5
 MIXING_ORDER = 6
 """Highest |m| + |n| of a tone m f1 + n f2 that is looked for at a group's tone."""
 
+MODELLED_ORDER = 4
+"""Highest |m| + |n| of a mixed tone that is fitted beside a group's own."""
+
+_MOST_LINES = 24
+"""Lines beside a group's harmonics, at most; lower orders come first."""
+
 _CLEAR = 0.98
 """A command explained to less than this may have a frequency of its own: a tenth of a cycle over
 the record off leaves 3 %."""
@@ -93,11 +99,12 @@ class Groups:
 
 @dataclass(frozen=True)
 class MixedTone:
-    """A tone of two groups' rhythms together that falls on a third or on one of them.
+    """A harmonic of a group, or a tone of two groups together, that falls on a group's own tone.
 
     Attributes:
         group: Index of the group on whose frequency it falls.
-        factors: Whole factor of each group's frequency in it, by index; none of them is 0.
+        factors: Whole factor of each group's frequency in it, by index; none of them is 0, and
+            the sum is above 0.
     """
 
     group: int
@@ -168,7 +175,10 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
 def further_lines(
     omegas: Sequence[float], group: int, harmonics: int, highest: float, duration_s: float
 ) -> tuple[float, ...]:
-    """Frequencies of the other groups' harmonics, for the model of one group's channels.
+    """Frequencies of the other groups' tones, for the model of one group's channels.
+
+    They are the harmonics of the other groups and the mixed tones m omega_1 + n omega_2 with
+    |m| + |n| up to ``MODELLED_ORDER``, which would count as noise otherwise.
 
     Args:
         omegas: Angular frequencies of all groups [rad/s].
@@ -179,7 +189,7 @@ def further_lines(
 
     Returns:
         Angular frequencies [rad/s] without those that coincide with an own harmonic, with zero or
-        with each other.
+        with each other; mixed tones only where they are resolved from all of these.
     """
     near = COINCIDENT * 2 * np.pi / duration_s
     taken = [0.0, *(order * omegas[group] for order in range(1, harmonics + 1))]
@@ -190,6 +200,16 @@ def further_lines(
             apart = min(abs(line - other) for other in (*taken, *lines))
             if k != group and line <= highest and apart > near:
                 lines.append(line)
+    # Mixed tones may only be absent from the noise beside the tone, so none is worth an error bar.
+    near *= RESOLUTION / COINCIDENT
+    for factors in _combinations(len(omegas)):
+        line = abs(sum(factor * omegas[k] for k, factor in factors.items()))
+        order = sum(abs(factor) for factor in factors.values())
+        if order > MODELLED_ORDER or len(lines) >= _MOST_LINES:
+            break
+        apart = min(abs(line - other) for other in (*taken, *lines))
+        if len(factors) > 1 and line <= highest and apart > near:
+            lines.append(line)
     return tuple(lines)
 
 
@@ -222,7 +242,8 @@ def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
         for factors in _combinations(len(omegas)):
             tone = sum(factor * omegas[k] for k, factor in factors.items())
             if factors != {group: 1} and abs(abs(tone) - omega) < near:
-                found.append(MixedTone(group, factors))
+                sign = 1 if tone > 0 else -1
+                found.append(MixedTone(group, {k: sign * one for k, one in factors.items()}))
                 break
     return found
 
