@@ -27,8 +27,7 @@ from .groups import (
     Groups,
     MixedTone,
     find_groups,
-    further_lines,
-    highest_line,
+    group_model,
     mixed_tones,
 )
 from .reading import Warn
@@ -214,10 +213,8 @@ def _fit_groups(
     for _ in range(_ROUNDS):
         fits = []
         for k, group in enumerate(channels):
-            model = allowed_model(group.series, omegas[k])
-            highest = highest_line(group.series)
-            lines = further_lines(omegas, k, model.harmonics, highest, duration_s)
-            fits.append(fit_shared(group.series, omegas[k], replace(model, lines=lines)))
+            model = group_model(group.series, omegas, k, duration_s)
+            fits.append(fit_shared(group.series, omegas[k], model))
         moved = [abs(fit.omega - omega) for fit, omega in zip(fits, omegas, strict=True)]
         omegas = [fit.omega for fit in fits]
         if len(channels) == 1 or max(moved) * duration_s < LINEAR:
@@ -306,7 +303,7 @@ def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, 
             else "they are analysed as one group"
         )
         warn(
-            f"one group or two can't be decided: {', '.join((*close.kept, *close.left))} are "
+            f"one group or two can't be decided: {len(close.kept) + len(close.left)} joints are "
             f"commanded at {low} to {high} Hz, closer than {RESOLUTION:g}/T in {duration_s:.3g} s; "
             f"{nulls} (record {need_s:.3g} s or more)"
         )

@@ -19,9 +19,10 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from capture.arrays import BoolArray
+from capture.arrays import BoolArray, FloatArray
 
 from .estimators.harmonic import HarmonicFit, fit_at
+from .estimators.harmonic_moments import HarmonicModel
 from .estimators.series import Series
 from .gait import (
     DRIVEN_SHARE,
@@ -48,6 +49,9 @@ MODELLED_ORDER = 4
 
 _MOST_LINES = 24
 """Lines beside a group's harmonics, at most; lower orders come first."""
+
+_SAMPLES_PER_LINE = 8
+"""Samples that a channel needs for each of these lines."""
 
 _CLEAR = 0.98
 """A command explained to less than this may have a frequency of its own: a tenth of a cycle over
@@ -86,7 +90,8 @@ class Groups:
 
     Attributes:
         rhythms: One a group, the largest group first.
-        explained: Share of all moving channels' variance that their groups' rhythms explain.
+        explained: Share of all moving channels' variance that their groups' rhythms explain, or
+            rhythms of their own that are not resolved.
         unresolved: Groups that hold, or are beside, a frequency that is too close.
         astray: Names of channels that move, but not by a rhythm of a group.
     """
@@ -149,6 +154,7 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
         for one in active
         if (rhythm := find_rhythm([one], duration_s)) is not None
         and rhythm.explained >= MIN_EXPLAINED
+        and _fundamental_share(rhythm.fit)[0] >= _OWN_SHARE
     ]
     bin_rad_s = 2 * np.pi / duration_s
     rhythms: list[Rhythm] = []
@@ -166,10 +172,32 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     rhythms = _with_compound(rhythms, active, rest, duration_s)
     rhythms.sort(key=lambda one: (-len(one.names), -float(one.fit.total.sum()), one.omega))
     total = float(common.fit.total.sum())
-    remaining = total - sum(float((one.fit.total - one.fit.rss).sum()) for one in rhythms)
+    undecided = [one.rhythm for one in tones if one.series.name in left]
+    known = sum(float((one.fit.total - one.fit.rss).sum()) for one in (*rhythms, *undecided))
     grouped = {name for rhythm in rhythms for name in rhythm.names}
     astray = tuple(one.name for one in active if one.name not in grouped | left)
-    return Groups(tuple(rhythms), 1.0 - remaining / total, tuple(unresolved), astray)
+    return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
+
+
+def group_model(
+    series: Sequence[Series], omegas: Sequence[float], group: int, duration_s: float
+) -> HarmonicModel:
+    """The basis of a group's channels: own harmonics, and the tones of the other groups.
+
+    Args:
+        series: Channels of the group.
+        omegas: Angular frequencies of all groups [rad/s].
+        group: Index of the group.
+        duration_s: Length of the record [s].
+
+    Returns:
+        As many lines as the slowest channel's sampling rate and samples allow.
+    """
+    model = allowed_model(series, omegas[group])
+    highest = NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
+    most = min(_MOST_LINES, min(one.count for one in series) // _SAMPLES_PER_LINE)
+    lines = further_lines(omegas, group, model.harmonics, highest, duration_s)
+    return replace(model, lines=lines[:most])
 
 
 def further_lines(
@@ -205,24 +233,12 @@ def further_lines(
     for factors in _combinations(len(omegas)):
         line = abs(sum(factor * omegas[k] for k, factor in factors.items()))
         order = sum(abs(factor) for factor in factors.values())
-        if order > MODELLED_ORDER or len(lines) >= _MOST_LINES:
+        if order > MODELLED_ORDER:
             break
         apart = min(abs(line - other) for other in (*taken, *lines))
         if len(factors) > 1 and line <= highest and apart > near:
             lines.append(line)
     return tuple(lines)
-
-
-def highest_line(series: Sequence[Series]) -> float:
-    """Highest frequency that the slowest channel's sampling rate allows.
-
-    Args:
-        series: Channels.
-
-    Returns:
-        Angular frequency [rad/s].
-    """
-    return NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
 
 
 def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
@@ -266,8 +282,14 @@ def _lively(fit: HarmonicFit) -> BoolArray:
 
 def _own(fit: HarmonicFit) -> BoolArray:
     """Whether the common rhythm is each channel's own and not a subharmonic of it."""
+    return (fit.explained >= _CLEAR) & (_fundamental_share(fit) >= _OWN_SHARE)
+
+
+def _fundamental_share(fit: HarmonicFit) -> FloatArray:
+    """Share of the fundamental in the power of each channel's harmonics, shape (K,)."""
     power = np.abs(fit.amplitudes) ** 2
-    return (fit.explained >= _CLEAR) & (power[:, 0] >= _OWN_SHARE * power.sum(axis=1))
+    total = power.sum(axis=1)
+    return np.divide(power[:, 0], total, out=np.zeros_like(total), where=total > 0)
 
 
 def _clusters(tones: Sequence[_Tone], apart: float) -> list[list[_Tone]]:
@@ -320,10 +342,7 @@ def _with_compound(
     names = [set(one.names) for one in rhythms]
 
     def fitted(series: Sequence[Series], group: int) -> HarmonicFit | None:
-        model = allowed_model(series, omegas[group])
-        highest = highest_line(series)
-        lines = further_lines(omegas, group, model.harmonics, highest, duration_s)
-        model = replace(model, lines=lines)
+        model = group_model(series, omegas, group, duration_s)
         enough = all(one.count > model.size + 1 for one in series)
         return fit_at(series, omegas[group], model) if enough else None
 
