@@ -136,7 +136,9 @@ def joint_results(
         own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
         if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
             own.append("gaps")
-        gain, lag = _estimates(gait, name)
+        index = None if gait is None else gait.group_of(name)
+        group = None if gait is None or index is None else gait.groups[index]
+        gain, lag = _estimates(group, name)
         power = energies[name]
         mechanical, electrical = power.mechanical, power.electrical
         results.append(
@@ -154,6 +156,8 @@ def joint_results(
                 coverage=fraction,
                 samples=0 if part is None else part.count,
                 flags=tuple(own),
+                group=index,
+                frequency_hz=None if group is None else group.fit.frequency_hz,
             )
         )
     return tuple(results)

@@ -66,7 +66,7 @@ def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> Kick
     seen: list[tuple[int, ...]] = []
     for model in runs:
         index = tuple(k for k, run in enumerate(runs) if _same_drive(run, model))
-        if index in seen or len(model.names) < 3:
+        if index in seen or len(model.names) < 3 or len(model.frequencies_hz) > 1:
             continue
         seen.append(index)
         found = sort_kicks(np.stack([runs[k].command for k in index]))
