@@ -129,7 +129,7 @@ def _lack(lack: LackOfFit) -> Iterator[str]:
     parts: list[str] = []
     if lack.alternatives:
         best = min(lack.alternatives, key=lambda one: one.p)
-        if len(lack.alternatives) * best.p < LEVEL:
+        if sum(one.widens is best.widens for one in lack.alternatives) * best.p < LEVEL:
             parts.append(f"{best.label} would fit better ({_size(best)})")
     off = [j for j, one in lack.joints.items() if len(lack.joints) * one.p < LEVEL]
     if off:
@@ -168,18 +168,13 @@ def _checked(lack: LackOfFit) -> Iterator[str]:
     if lack.unfitted is not None:
         size = lack.unfitted.unfitted_rad
         off = f"; each half under the parameters of the other is {size:.3g} rad off"
-    open_laws = [one.label for one in lack.alternatives if one.widens and _could_be(one)]
+    open_laws = [one.label for one in lack.alternatives if one.widens and one.could_be]
     if open_laws:
         yield (
             f"Not told by this session: {' or '.join(open_laws)} would do as well; intervals have "
             "it in them."
         )
     yield f"Fits: nothing but noise is shown at {what} ({_p(lack.p)}){off}."
-
-
-def _could_be(law: Alternative) -> bool:
-    """Whether a weight of 1 is in its interval."""
-    return abs(law.size - 1.0) <= Z95 * law.error
 
 
 def _p(p: float) -> str:
