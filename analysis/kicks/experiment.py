@@ -28,6 +28,7 @@ class KickExperiment:
         lag_variance: Shape (r, m).
         dof: Shape (r, m).
         labels: File names, r.
+        frequency_hz: Of the base gait.
     """
 
     index: tuple[int, ...]
@@ -39,6 +40,7 @@ class KickExperiment:
     lag_variance: FloatArray
     dof: FloatArray
     labels: tuple[str, ...]
+    frequency_hz: float
 
     def role(self, k: int) -> str | None:
         """What a run of all runs is here: ``base``, ``kick``, ``held-out`` or None."""
@@ -108,4 +110,5 @@ def _experiment(
         lag_variance=noise[1],
         dof=noise[2],
         labels=tuple(runs[k].label for k in index),
+        frequency_hz=runs[index[found.base[0]]].frequency_hz,
     )
