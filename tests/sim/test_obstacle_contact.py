@@ -18,8 +18,10 @@ FIELD = (
 )
 
 
-def law(obstacles, material=STUFF, links=1):
-    return obstacle_law(obstacles, material, np.full(links, RADIUS), np.full(links, LENGTH))
+def law(obstacles, material=STUFF, links=1, dt=0.0):
+    sizes = np.full(links, RADIUS), np.full(links, LENGTH)
+    masses = {"mass": np.full(links, MASS), "inertia": np.full(links, INERTIA)}
+    return obstacle_law(obstacles, material, *sizes, **masses, dt=dt)
 
 
 def about_z(angle):

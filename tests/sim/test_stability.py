@@ -93,7 +93,7 @@ def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name):
 
 def test_an_obstacle_uses_the_range_as_the_end_of_the_chain_gives_way(nudged):
     # Two links with a loose gear: 1 / mass at the end, from free links and the joint between them.
-    material = ObstacleMaterial(stiffness=3e4, damping=5.0)
+    material = ObstacleMaterial(stiffness=3e4, damping=5.0, mu=0.0)
     world = dataclasses.replace(
         IN_SPACE, obstacles=(Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
     )
