@@ -129,8 +129,8 @@ def _accumulated(
     )
     if net is None or plus is None:
         return None
-    means = (clean(one.name, one.t_ns, one.values, origin_ns) for one in (net, plus))
-    return add_up(*means, *window)
+    mean, positive = (clean(name, one.t_ns, one.values, origin_ns) for one in (net, plus))
+    return add_up(mean, positive, *window)
 
 
 def joint_results(

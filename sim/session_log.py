@@ -4,10 +4,10 @@ What the sensors tell is written when it arrives at the robot's computer: ``head
 sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
 joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
 means over one control period (:mod:`sim.sensing.polling`). Their products miss what happens within
-a period, so each joint's powers are logged besides, accumulated at the physics rate. Commands, gait,
-odometry, powers and ledger are the twin's own; powers carry the middle of their period, the others
-the tick. Time is simulated: nothing of the machine's clock enters the file, and the same scenario
-gives the same bytes.
+a period, so each joint's powers are logged besides, accumulated at the physics rate. Commands,
+gait, odometry, powers and ledger are the twin's own; powers carry the middle of their period, the
+others the tick. Time is simulated: nothing of the machine's clock enters the file, and the same
+scenario gives the same bytes.
 """
 
 from __future__ import annotations
@@ -102,9 +102,7 @@ class SessionLog:
         self._voltage = writer.joint_state("/joint_voltage", names, unit="V")
         told = twin.gait.names  # recorded commands may come without their gait
         self._gait = writer.joint_state("/gait", told, unit=GAIT_UNIT) if told else None
-        self._powers = {
-            topic: writer.joint_state(topic, names, unit="W") for topic in _POWER_TERMS
-        }
+        self._powers = {topic: writer.joint_state(topic, names, unit="W") for topic in _POWER_TERMS}
         self._booked = 0, np.zeros((len(JOINT_TERMS), len(names)))
         self._energy = writer.joint_state("/energy_ledger", TERMS, unit="J")
         self._odometry = writer.odometry("/odom", frame="world", child=head)

@@ -3,9 +3,9 @@
 E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
 can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
 times motor current, signed and clipped. Where the log has the powers themselves, accumulated within
-each sampling interval (:class:`capture.log.power_topics.PowerTopic`), their means are added up. Else
-sampled factors are multiplied: what the two do within an interval is lost. Gaps are not bridged:
-no time inside them counts.
+each sampling interval (:class:`capture.log.power_topics.PowerTopic`), their means are added up;
+else sampled factors are multiplied, and what the two do within an interval is lost. Gaps are not
+bridged: no time inside them counts.
 """
 
 from __future__ import annotations
