@@ -40,14 +40,14 @@ class Figures:
         errors: Of the accumulated powers, shares of the booked energy (E_net: see ``NET_FLOOR``).
         sampled: Of products of samples alone, likewise.
         balance: What is left of the ledger's mechanical and electrical balance, shares of E_abs.
-        cycles: Whole cycles in the window; 0 without a gait, where it is the whole session.
+        flags: Joints and what their sensors are blamed for; nothing, on the twin.
     """
 
     booked: dict[str, float]
     errors: dict[str, float]
     sampled: dict[str, float]
     balance: tuple[float, float]
-    cycles: int
+    flags: tuple[tuple[str, str], ...]
 
 
 def figures(path):
@@ -65,10 +65,10 @@ def figures(path):
         whole = whole_robot(energies.values())
         return {name: (whole[name] - booked[name]) / abs(scale[name]) for name in TERMS}
 
+    artefacts = measured.analysis.artefacts
+    flags = tuple((one.joint, one.flag) for one in artefacts if one.about == "sensor")
     left = (ledger[f"{kind}_residual"] / booked["abs"] for kind in ("mechanical", "electrical"))
-    return Figures(
-        booked, errors(measured.energies), errors(products), tuple(left), measured.span.cycles
-    )
+    return Figures(booked, errors(measured.energies), errors(products), tuple(left), flags)
 
 
 def run(name, folder):
@@ -82,7 +82,8 @@ def run(name, folder):
 
 def row(name, found):
     """One row of the table."""
-    cells = [f"{found.booked[one]:.3g}" for one in TITLES]
+    booked = (found.booked[one] for one in TITLES)
+    cells = [f"{one:.3g}" if abs(one) < 1000 else f"{one:.0f}" for one in booked]
     cells += [f"{100 * max(abs(one) for one in found.errors.values()):.4f}"]
     cells += [f"{100 * found.sampled[one]:+.2f}" for one in TITLES]
     return f"| `{name}` | {' | '.join(cells)} |"
@@ -106,12 +107,14 @@ def main():
     parser.add_argument("names", nargs="*", help="scenarios; all that are shipped by default")
     parser.add_argument("--write", action="store_true", help="put the table into docs/energy.md")
     options = parser.parse_args()
-    rows, worst = [], 0.0
+    rows, worst, left, flags = [], 0.0, [0.0, 0.0], []
     with tempfile.TemporaryDirectory() as folder:
         for name in options.names or scenario_names():
             found = run(name, folder)
             rows.append(row(name, found))
             worst = max(worst, *(abs(one) for one in found.errors.values()))
+            left = [max(one, abs(own)) for one, own in zip(left, found.balance, strict=True)]
+            flags += [(name, *flag) for flag in found.flags]
             print(rows[-1], flush=True)
     if options.write:
         before, _, rest = PAGE.read_text().partition(BEGIN)
@@ -119,7 +122,9 @@ def main():
         PAGE.write_text(f"{before}{BEGIN}\n\n{table(rows)}\n\n{END}{after}")
     else:
         print(f"\n{table(rows)}")
-    print(f"largest error {100 * worst:.3f} %, bar {100 * BAR:g} %")
+    print(f"largest error {100 * worst:.4f} %, bar {100 * BAR:g} %")
+    print(f"the ledger's own balance closes within {100 * left[0]:.3f} % and {100 * left[1]:.4f} %")
+    print(f"sensors blamed: {flags or 'none'}")
 
 
 if __name__ == "__main__":
