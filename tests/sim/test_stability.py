@@ -146,3 +146,9 @@ def test_the_default_robot_on_the_default_ground(nudged, links, planar, rate_hz,
 @pytest.mark.parametrize("name", scenario_names())
 def test_shipped_scenarios_are_within_the_bound(name):
     assert not warnings(load_scenario(name))
+
+
+def test_among_obstacles_the_shipped_robot_needs_two_kilohertz():
+    slow, fast = (load_scenario("random-walk", {"physics_rate_hz": hz}) for hz in (1000, 2000))
+    assert any("too stiff for steps of 1 ms" in text for text in warnings(slow))
+    assert not warnings(fast)
