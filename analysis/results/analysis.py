@@ -16,6 +16,7 @@ from .artefact import Artefact
 
 if TYPE_CHECKING:
     from ..oscillators.result import ChainCoupling
+    from .dead_band import DeadBand
     from .energy import EnergyResult
     from .over_time import ResponseOverTime
 
@@ -123,6 +124,7 @@ class JointResult:
         samples: Response samples used.
         flags: Artefacts seen in the analysed stretch, e.g. ``saturated``;
             :attr:`Analysis.artefacts` says when.
+        dead_band: Stick or play at the reversals, or None where none can be measured.
     """
 
     name: str
@@ -138,6 +140,7 @@ class JointResult:
     coverage: float
     samples: int
     flags: tuple[str, ...] = ()
+    dead_band: DeadBand | None = None
 
 
 @dataclass(frozen=True)

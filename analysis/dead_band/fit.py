@@ -1,0 +1,306 @@
+"""Least squares of the model, and how far its parameters are determined.
+
+Whether a joint catches up at the onset (b > 0) shows in few samples, and a slow follower hides it.
+So the model without it is taken unless one with it explains clearly more; and what W could be is
+read off the profile of the misfit over b, beside the scatter from cycle to cycle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from capture.arrays import BoolArray, FloatArray, IntArray
+
+from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
+
+_SHARES = np.array([0.0, 0.15, 0.3, 0.6, 1.0, 2.0])
+"""b over w along the profile."""
+
+_WIDTHS = np.array([0.005, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7])
+"""Starting values of w, as a share of twice the amplitude."""
+
+_LAGS = (0.2, 0.8)
+"""Starting values of the follower's part of the lag that w leaves over."""
+
+_FACTORS = np.array([0.03, 1.0, 30.0])
+_ITERATIONS = 25
+_SAME = 1e-4
+_SEGMENTS = 16
+"""Parts of a cycle whose repeated residuals are taken as independent."""
+
+_INSIDE = 6.0
+"""Loss of log likelihood, times two, within which a value of the profile is possible: 3.84 is the
+95 % point of chi-squared with one degree of freedom, and the model is not exact."""
+
+_CLEAR = 4.0
+"""The same that a step at the onset needs beyond Schwarz's penalty for its two parameters."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One joint's fit.
+
+    Attributes:
+        parameters: As :data:`analysis.dead_band.model.PARAMETERS`, shape (5,).
+        gain: Of the position over the follower.
+        travel: W after top and bottom, with lower and upper end [rad], shape (2, 3).
+        step: b of both, the same [rad of the command], shape (2, 3).
+        cost: Residual sum of squares [rad^2].
+        independent: Number of independent residuals.
+        rests: Where the model rests, shape (k, n).
+        follower: z [rad], shape (k, n).
+    """
+
+    parameters: FloatArray
+    gain: float
+    travel: FloatArray
+    step: FloatArray
+    cost: float
+    independent: float
+    rests: BoolArray
+    follower: FloatArray
+
+
+def fit_dead_bands(
+    cycles: Cycles, omega: float, amplitude: FloatArray, lag: FloatArray, resolution: FloatArray
+) -> list[Fitted]:
+    """Fit the model to some joints, all in step.
+
+    Args:
+        cycles: Their motion.
+        omega: Of the gait [rad/s].
+        amplitude: Of the commands [rad], shape (j,).
+        lag: Of the fundamentals, in [0, 2 pi) [rad], shape (j,).
+        resolution: Smallest step that each sensor shows [rad], shape (j,).
+
+    Returns:
+        One fit a joint.
+    """
+    joints = np.arange(len(amplitude))
+    scales = _Scales(cycles.period_s, omega, amplitude, resolution)
+    starts = _starts(cycles.period_s, omega, amplitude, lag)
+    each = misfit(cycles.some(5), np.repeat(joints, starts.shape[1]), starts.reshape(-1, 5))
+    best = each.cost.reshape(starts.shape[:2]).argmin(axis=1)
+    first = starts[joints, best]
+    # The profile over b: d, T and w are fitted, b is a share of w.
+    rows = np.repeat(joints, _SHARES.size)
+    ties = np.zeros((rows.size, PARAMETERS, 3))
+    ties[:, [DELAY, LAG, WIDTH], [0, 1, 2]] = 1.0
+    ties[:, TOP, 2] = ties[:, BOTTOM, 2] = np.tile(_SHARES, joints.size)
+    values = np.repeat(first[:, :3], _SHARES.size, axis=0)
+    values[:, WIDTH] /= 1 + np.tile(_SHARES, joints.size)
+    values = _levenberg(cycles, rows, values, ties, scales)
+    profile = np.einsum("rpn,rn->rp", ties, values)
+    costs = misfit(cycles, rows, profile).cost.reshape(joints.size, -1)
+    profile = profile.reshape(joints.size, -1, PARAMETERS)
+    # All five, from the best of the profile that has some b.
+    own = profile[joints, 1 + costs[:, 1:].argmin(axis=1)]
+    free = np.broadcast_to(np.eye(PARAMETERS), (joints.size, PARAMETERS, PARAMETERS))
+    own = _levenberg(cycles, joints, own, free, scales)
+    left = misfit(cycles, joints, own)
+    found: list[Fitted] = []
+    for j in joints:
+        independent = _independent(left.residual[j])
+        gained = independent * np.log(costs[j, 0] / left.cost[j])
+        steps = bool(gained > 2 * np.log(independent) + _CLEAR)
+        chosen, tie = (own[j], free[j]) if steps else (profile[j, 0], ties[0])
+        one = misfit(cycles, joints[j : j + 1], chosen[np.newaxis])
+        error = _errors(cycles, int(j), chosen, tie, scales, one)
+        travel = np.stack([chosen[WIDTH] + chosen[[TOP, BOTTOM]]] * 3, axis=1)
+        step = np.stack([chosen[[TOP, BOTTOM]]] * 3, axis=1)
+        travel[:, 1:] += np.outer(error[:2], [-1, 1])
+        step[:, 1:] += np.outer(error[2:], [-1, 1])
+        if not steps:
+            least = min(float(costs[j].min()), float(left.cost[j]))
+            loss = independent * np.log(costs[j] / least)
+            top, most = _possible(profile[j], loss)
+            travel[:, 1] = np.minimum(travel[:, 1], top[0] - error[:2])
+            travel[:, 2] = np.maximum(travel[:, 2], top[1] + error[:2])
+            step[:, 2] = np.maximum(step[:, 2], most)
+        found.append(
+            Fitted(
+                parameters=chosen,
+                gain=float(one.gain[0]),
+                travel=np.maximum(travel, 0.0),
+                step=np.maximum(step, 0.0),
+                cost=float(one.cost[0]),
+                independent=independent,
+                rests=one.rests[0],
+                follower=one.follower[0],
+            )
+        )
+    return found
+
+
+class _Scales:
+    """Bounds and steps of the parameters, one row a joint."""
+
+    def __init__(
+        self, period_s: float, omega: float, amplitude: FloatArray, resolution: FloatArray
+    ) -> None:
+        one = np.ones_like(amplitude)
+        fine = np.maximum(resolution / 8, 5e-4 * amplitude)
+        coarse = np.maximum(resolution, 0.01 * amplitude)
+        self.unit = np.stack([one / omega, one / omega, *[2 * amplitude] * 3], axis=1)
+        self.nudge = np.stack([one * period_s / 20] * 2 + [fine] * 3, axis=1)
+        self.least_move = np.stack([one * period_s / 2] * 2 + [coarse] * 3, axis=1)
+        self.lower = np.array([-2 * period_s, period_s / 10, 0.0, 0.0, 0.0])
+        self.resolution = resolution
+
+
+def _starts(
+    period_s: float, omega: float, amplitude: FloatArray, lag: FloatArray
+) -> FloatArray:
+    """Sets of parameters with the right lag, shape (j, p, 5)."""
+    sets: list[FloatArray] = []
+    for share in _WIDTHS:
+        # Describing function of the play operator (Gelb and Vander Velde 1968): its lag.
+        across = 1 - 2 * share
+        inphase = 0.5 + (np.arcsin(across) + across * np.sqrt(1 - across**2)) / np.pi
+        own = np.arctan2((1 - across**2) / np.pi, inphase)
+        rest_s = np.maximum(lag - own, 0.0) / omega
+        for part in _LAGS:
+            follower_s = np.maximum(part * rest_s, period_s / 4)
+            one = np.zeros((amplitude.size, PARAMETERS))
+            one[:, DELAY], one[:, LAG] = (1 - part) * rest_s, follower_s
+            one[:, WIDTH] = 2 * share * amplitude
+            sets.append(one)
+    return np.stack(sets, axis=1)
+
+
+def _levenberg(
+    cycles: Cycles, joint: IntArray, values: FloatArray, ties: FloatArray, scales: _Scales
+) -> FloatArray:
+    """Levenberg-Marquardt steps on rows of parameters ``ties @ values`` with bounds, in step."""
+    rows, n = values.shape
+    lower = scales.lower[:n]
+    damping, idle = np.full(rows, 1e-3), np.zeros(rows, dtype=np.int64)
+    here = np.arange(rows)
+    values = np.maximum(values, lower)
+    for _ in range(_ITERATIONS):
+        left, slopes = _slopes(cycles, joint, values, ties, scales)
+        tried = np.repeat(values[:, np.newaxis], _FACTORS.size, axis=1)
+        for r in range(rows):
+            unit, slope = scales.unit[joint[r], :n], slopes[r].reshape(n, -1)
+            normal, pull = slope @ slope.T, slope @ left[r].ravel()
+            free = ~((values[r] <= lower + 1e-12) & (pull > 0))
+            part = normal[np.ix_(free, free)]
+            for m, factor in enumerate(_FACTORS):
+                step = np.zeros(n)
+                more = damping[r] * factor * np.diag(part) + 1e-12 * np.trace(part) + 1e-300
+                step[free] = -np.linalg.solve(part + np.diag(more), pull[free])
+                step *= unit
+                most = np.maximum(0.4 * np.abs(values[r]), scales.least_move[joint[r], :n])
+                step /= max(1.0, float(np.max(np.abs(step) / most)))
+                tried[r, m] = np.maximum(values[r] + step, lower)
+        full = np.einsum("rpn,rmn->rmp", ties, tried).reshape(-1, PARAMETERS)
+        costs = misfit(cycles, np.repeat(joint, _FACTORS.size), full).cost.reshape(rows, -1)
+        best = costs.argmin(axis=1)
+        better = costs[here, best] < np.square(left).sum(axis=(1, 2)) * (1 - _SAME)
+        values[better] = tried[here, best][better]
+        eased = np.clip(damping * _FACTORS[best], 1e-6, 1e4)
+        damping = np.where(better, eased, 100 * damping)
+        idle = np.where(better, 0, idle + 1)
+        if np.all(idle >= 2):
+            break
+    return values
+
+
+def _slopes(
+    cycles: Cycles, joint: IntArray, values: FloatArray, ties: FloatArray, scales: _Scales
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals, shape (r, k, n), and their derivatives a unit, shape (r, m, k, n)."""
+    rows, n = values.shape
+    nudge = scales.nudge[joint, :n]
+    sets = np.repeat(values[:, np.newaxis], n + 1, axis=1)
+    for m in range(n):
+        sets[:, m + 1, m] += nudge[:, m]
+    full = np.einsum("rpn,rmn->rmp", ties, sets).reshape(-1, PARAMETERS)
+    left = misfit(cycles, np.repeat(joint, n + 1), full).residual
+    left = left.reshape(rows, n + 1, *left.shape[1:])
+    share = nudge / scales.unit[joint, :n]
+    return left[:, 0], (left[:, 1:] - left[:, :1]) / share[:, :, np.newaxis, np.newaxis]
+
+
+def _independent(residual: FloatArray) -> float:
+    """How many independent residuals there are, from their correlation along and across cycles."""
+    own = residual - residual.mean()
+    square = float(np.mean(own**2))
+    if square == 0:
+        return float(residual.size)
+    along = max(0.0, float(np.mean(own[:, 1:] * own[:, :-1])) / square)
+    share = float(np.mean(residual.mean(axis=0) ** 2)) / square * _repeated(residual)
+    cycles, samples = residual.shape
+    return samples * (1 - along) / (1 + along) / (share + (1 - share) / cycles)
+
+
+def _repeated(residual: FloatArray) -> float:
+    """Share of the mean cycle's residual that is the same in every cycle, 0 to 1."""
+    mean = float(np.mean(residual.mean(axis=0) ** 2))
+    chance = float(residual.var(axis=0, ddof=1).mean()) / len(residual)
+    return max(0.0, 1 - chance / mean) if mean > 0 else 0.0
+
+
+def _possible(profile: FloatArray, loss: FloatArray) -> tuple[tuple[float, float], float]:
+    """Least and greatest W, and the greatest b, that the profile leaves possible."""
+    travel, step = profile[:, WIDTH] + profile[:, TOP], profile[:, TOP]
+    fine = np.linspace(0.0, _SHARES[-1], 401)
+    inside = np.interp(fine, _SHARES, loss) <= _INSIDE
+    if not inside.any():
+        inside[0] = True
+    could = np.interp(fine, _SHARES, travel)[inside]
+    return (float(could.min()), float(could.max())), float(
+        np.interp(fine, _SHARES, step)[inside].max()
+    )
+
+
+def _errors(
+    cycles: Cycles, joint: int, chosen: FloatArray, tie: FloatArray, scales: _Scales, one: Misfit
+) -> FloatArray:
+    """Half widths of W after top and bottom and of both b [rad], shape (4,).
+
+    Delete-one jackknife over the cycles; what repeats in all of them, as an encoder's steps do, over
+    segments of the mean cycle. The level of a plateau is known to an encoder's step at best.
+    """
+    n = tie.shape[1]
+    nudge, unit = scales.nudge[joint, :n], scales.unit[joint, :n]
+    at_bound = chosen[:n] <= scales.lower[:n] + 1e-12
+    free = np.flatnonzero(~at_bound)
+    sets = np.stack([chosen + tie[:, m] * nudge[m] for m in free])
+    moved = misfit(cycles, np.full(free.size, joint), sets).follower - one.follower[0]
+    gain, z = float(one.gain[0]), one.follower[0] - one.follower[0].mean()
+    columns = [gain * moved[k] * unit[m] / nudge[m] for k, m in enumerate(free)]
+    design = np.stack([*columns, z, np.full_like(z, np.sqrt(np.mean(z**2)))])
+    residual = one.residual[0]
+    count, samples = residual.shape
+    within = np.einsum("akn,bkn->kab", design, design)
+    spread = _jackknife(within, np.einsum("akn,kn->ka", design, residual))
+    mean, common = design.mean(axis=1), residual.mean(axis=0)
+    segment = np.arange(samples) * _SEGMENTS // samples
+    parts = [mean[:, segment == s] for s in range(_SEGMENTS)]
+    repeated = _repeated(residual)
+    spread += repeated * _jackknife(
+        np.stack([part @ part.T for part in parts]),
+        np.stack([part @ common[segment == s] for s, part in enumerate(parts)]),
+    )
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    inner = spread[: free.size, : free.size] * np.outer(unit[free], unit[free])
+    into = tie[:, free]
+    covariance += into @ inner @ into.T
+    covariance[WIDTH, WIDTH] += repeated * (scales.resolution[joint] / max(gain, 0.1)) ** 2 / 12
+    wanted = np.zeros((4, PARAMETERS))
+    wanted[:2, WIDTH] = 1.0
+    wanted[[0, 2], TOP] = wanted[[1, 3], BOTTOM] = 1.0
+    variance = np.einsum("ap,pq,aq->a", wanted, covariance, wanted)
+    return float(stdtrit(min(count - 1, _SEGMENTS - 5), 0.975)) * np.sqrt(variance)
+
+
+def _jackknife(normals: FloatArray, pulls: FloatArray) -> FloatArray:
+    """Covariance from leaving out one group at a time, linearised; groups first."""
+    total, groups = normals.sum(axis=0), len(normals)
+    ridge = 1e-9 * np.diag(np.diag(total))
+    change = np.linalg.solve(total - normals + ridge, pulls[:, :, np.newaxis])[:, :, 0]
+    return (groups - 1) / groups * change.T @ change
