@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray
+from capture.arrays import ComplexArray, FloatArray
 from capture.log.signals import Signal
 
 from ..estimators.series import Series, clean, shared_times
@@ -19,7 +19,7 @@ from .kind import Witness, decide
 from .model import BOTTOM, DELAY, TOP, WIDTH, Cycles, whole_cycles
 from .operator import fundamental_change, rested
 
-MOST_CYCLES = 20
+MOST_CYCLES = 12
 """Cycles that are fitted, evenly spread over the stretch: an hour costs no more than a minute."""
 
 RESOLVED = 4.0
@@ -123,7 +123,7 @@ def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexAr
     turn = np.exp(-1j * omega * cycles.t_s[:, cycles.first :])
     waves: list[complex] = []
     ratios: list[complex] = []
-    for j, measured in enumerate(cycles.measured):
+    for j, measured in enumerate(cycles.measured[:, :, cycles.first :]):
         command = cycles.commanded(j)[:, cycles.first :]
         wave = complex(2 * np.mean((command - command.mean()) * turn))
         answer = complex(2 * np.mean((measured - measured.mean()) * turn))
@@ -150,7 +150,7 @@ def _without(cycles: Cycles, joint: int, lag: float) -> tuple[float, float]:
     moves = rate(times)
     plain = np.column_stack((np.ones_like(times), command.at(times), moves))
     square = np.sign(rate(times - late_s))
-    measured = cycles.measured[joint].ravel()
+    measured = cycles.measured[joint, :, cycles.first :].ravel()
     alone = np.linalg.lstsq(plain, measured, rcond=None)[0]
     both = np.linalg.lstsq(np.column_stack((plain, square)), measured, rcond=None)[0]
     return float(np.square(measured - plain @ alone).sum()), 2 * abs(float(both[-1]))
@@ -167,17 +167,22 @@ def _rests(
     cycles: Cycles, joint: int, one: Fitted, resolution: float
 ) -> tuple[float, float] | None:
     """For how long the joint rests after top and bottom [s]; None unless it does at both."""
-    command = cycles.commanded(joint, float(one.parameters[DELAY]))[:, cycles.first :]
+    begin = cycles.first // 2  # by then the model has its state
+    command = cycles.commanded(joint, float(one.parameters[DELAY]))[:, begin:]
     middle = float(one.follower.mean())
     found: tuple[list[float], list[float]] = ([], [])
     crept: tuple[list[float], list[float]] = ([], [])
     led: tuple[list[float], list[float]] = ([], [])
     for rests, z, c, seen in zip(
-        one.rests, one.follower, command, cycles.measured[joint], strict=True
+        one.rests[:, begin:],
+        one.follower[:, begin:],
+        command,
+        cycles.measured[joint, :, begin:],
+        strict=True,
     ):
         for i, k in zip(*runs(rests), strict=True):
             if i == 0 or k == rests.size or k - i < _SHORTEST:
-                continue  # begins before the window or ends after it
+                continue  # begins before the stretch or ends after it
             side = int(z[i] < middle)
             found[side].append(float(k - i) * cycles.period_s)
             settled = slice(i + round(_SETTLING * (k - i)), k)
@@ -210,8 +215,9 @@ def _result(
     width, top, bottom = one.parameters[[WIDTH, TOP, BOTTOM]].tolist()
     followed = rested(command.values, width, top, bottom)
     change = fundamental_change(command.t_s, command.values, followed, omega)
-    inside: BoolArray = one.rests
-    kind, evidence = decide(cycles, joint, one.parameters, inside, one.follower, witness)
+    fitted = slice(cycles.first, None)
+    rests, followed_by = one.rests[:, fitted], one.follower[:, fitted]
+    kind, evidence = decide(cycles, joint, one.parameters, rests, followed_by, witness)
     sides = [
         Reversal(
             travel_rad=float(travel[0]),

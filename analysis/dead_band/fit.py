@@ -16,7 +16,7 @@ from capture.arrays import BoolArray, FloatArray, IntArray
 
 from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
 
-_SHARES = np.array([0.0, 0.15, 0.3, 0.6, 1.0, 2.0])
+_SHARES = np.array([0.0, 0.25, 0.6, 1.5])
 """b over w along the profile."""
 
 _WIDTHS = np.array([0.005, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7])
@@ -26,8 +26,8 @@ _LAGS = (0.2, 0.8)
 """Starting values of the follower's part of the lag that w leaves over."""
 
 _FACTORS = np.array([0.03, 1.0, 30.0])
-_ITERATIONS = 25
-_SAME = 1e-4
+_ITERATIONS = 15
+_SAME = 1e-3
 _SEGMENTS = 16
 """Parts of a cycle whose repeated residuals are taken as independent."""
 
@@ -50,8 +50,8 @@ class Fitted:
         step: b of both, the same [rad of the command], shape (2, 3).
         cost: Residual sum of squares [rad^2].
         independent: Number of independent residuals.
-        rests: Where the model rests, shape (k, n).
-        follower: z [rad], shape (k, n).
+        rests: Where the model rests, the warm-up included, shape (k, n).
+        follower: z [rad], the same.
     """
 
     parameters: FloatArray
@@ -270,8 +270,9 @@ def _errors(
     at_bound = chosen[:n] <= scales.lower[:n] + 1e-12
     free = np.flatnonzero(~at_bound)
     sets = np.stack([chosen + tie[:, m] * nudge[m] for m in free])
-    moved = misfit(cycles, np.full(free.size, joint), sets).follower - one.follower[0]
-    gain, z = float(one.gain[0]), one.follower[0] - one.follower[0].mean()
+    still = one.follower[0, :, cycles.first :]
+    moved = misfit(cycles, np.full(free.size, joint), sets).follower[:, :, cycles.first :] - still
+    gain, z = float(one.gain[0]), still - still.mean()
     columns = [gain * moved[k] * unit[m] / nudge[m] for k, m in enumerate(free)]
     design = np.stack([*columns, z, np.full_like(z, np.sqrt(np.mean(z**2)))])
     residual = one.residual[0]

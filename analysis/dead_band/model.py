@@ -33,6 +33,9 @@ DELAY, LAG, WIDTH, TOP, BOTTOM = range(PARAMETERS)
 _WARM_UP = 0.55
 """Part of a cycle before each window over which the model finds its state."""
 
+_MOST_SAMPLES = 240
+"""Samples of a cycle that are fitted at most, evenly spread."""
+
 _TINY = 1e-300
 
 
@@ -81,7 +84,7 @@ class Cycles:
         commands: One a joint.
         t_s: Times of k windows, each with its warm-up, shape (k, n).
         first: First sample of a window after its warm-up.
-        measured: Positions after the warm-up [rad], shape (j, k, n - first).
+        measured: Positions [rad], shape (j, k, n).
     """
 
     commands: tuple[Series, ...]
@@ -147,9 +150,10 @@ def whole_cycles(
     starts = _spread(starts[whole], most)
     if starts.size < 2:
         return None
-    index = starts[:, np.newaxis] + np.arange(first + count)
-    measured = np.stack([one.values[index[:, first:]] for one in responses])
-    return Cycles(tuple(commands), t_s[index], first, measured)
+    stride = -(-count // _MOST_SAMPLES)
+    index = starts[:, np.newaxis] + np.arange(0, first + count, stride)
+    measured = np.stack([one.values[index] for one in responses])
+    return Cycles(tuple(commands), t_s[index], -(-first // stride), measured)
 
 
 @dataclass(frozen=True)
@@ -159,8 +163,8 @@ class Misfit:
     Attributes:
         residual: Measured less modelled positions [rad], shape (r, k, n).
         gain: Of the position over z, shape (r,).
-        follower: z [rad], shape (r, k, n).
-        rests: Where z rests, shape (r, k, n).
+        follower: z [rad], its warm-up included, shape (r, k, first + n).
+        rests: Where z rests, the same.
     """
 
     residual: FloatArray
@@ -189,9 +193,8 @@ def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
         [cycles.commanded(j, d) for j, d in zip(joint, parameters[:, DELAY], strict=True)]
     )
     z, rests = follow(u, np.broadcast_to(cycles.step_s, u.shape), parameters)
-    z, rests = z[:, :, cycles.first :], rests[:, :, cycles.first :]
-    measured = cycles.measured[joint]
-    own = z - z.mean(axis=(1, 2), keepdims=True)
+    fitted, measured = z[:, :, cycles.first :], cycles.measured[joint, :, cycles.first :]
+    own = fitted - fitted.mean(axis=(1, 2), keepdims=True)
     seen = measured - measured.mean(axis=(1, 2), keepdims=True)
     square = np.square(own).sum(axis=(1, 2))
     product = (own * seen).sum(axis=(1, 2))
