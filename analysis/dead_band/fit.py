@@ -8,6 +8,7 @@ read off the profile of the misfit over b, beside the scatter from cycle to cycl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -16,7 +17,7 @@ from capture.arrays import BoolArray, FloatArray, IntArray
 
 from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
 
-_SHARES = np.array([0.0, 0.25, 0.6, 1.5])
+_SHARES = np.array([0.0, 0.15, 0.4, 1.0])
 """b over w along the profile."""
 
 _WIDTHS = np.array([0.005, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7])
@@ -35,8 +36,16 @@ _INSIDE = 6.0
 """Loss of log likelihood, times two, within which a value of the profile is possible: 3.84 is the
 95 % point of chi-squared with one degree of freedom, and the model is not exact."""
 
-_CLEAR = 4.0
-"""The same that a step at the onset needs beyond Schwarz's penalty for its two parameters."""
+_NEEDED = (6.0, 12.0)
+"""The same that a step at the onset needs to be taken, and that one of another size at either end
+needs."""
+
+_TIES = (
+    np.eye(PARAMETERS)[:, :3],
+    np.vstack((np.eye(4), np.eye(4)[3:])),
+    np.eye(PARAMETERS),
+)
+"""From what is fitted to all parameters: no step, one step, two steps."""
 
 
 @dataclass(frozen=True)
@@ -96,43 +105,72 @@ def fit_dead_bands(
     profile = np.einsum("rpn,rn->rp", ties, values)
     costs = misfit(cycles, rows, profile).cost.reshape(joints.size, -1)
     profile = profile.reshape(joints.size, -1, PARAMETERS)
-    # All five, from the best of the profile that has some b.
-    own = profile[joints, 1 + costs[:, 1:].argmin(axis=1)]
-    free = np.broadcast_to(np.eye(PARAMETERS), (joints.size, PARAMETERS, PARAMETERS))
-    own = _levenberg(cycles, joints, own, free, scales)
-    left = misfit(cycles, joints, own)
-    found: list[Fitted] = []
-    for j in joints:
-        independent = _independent(left.residual[j])
-        gained = independent * np.log(costs[j, 0] / left.cost[j])
-        steps = bool(gained > 2 * np.log(independent) + _CLEAR)
-        chosen, tie = (own[j], free[j]) if steps else (profile[j, 0], ties[0])
-        one = misfit(cycles, joints[j : j + 1], chosen[np.newaxis])
-        error = _errors(cycles, int(j), chosen, tie, scales, one)
-        travel = np.stack([chosen[WIDTH] + chosen[[TOP, BOTTOM]]] * 3, axis=1)
-        step = np.stack([chosen[[TOP, BOTTOM]]] * 3, axis=1)
-        travel[:, 1:] += np.outer(error[:2], [-1, 1])
-        step[:, 1:] += np.outer(error[2:], [-1, 1])
-        if not steps:
-            least = min(float(costs[j].min()), float(left.cost[j]))
-            loss = independent * np.log(costs[j] / least)
-            top, most = _possible(profile[j], loss)
-            travel[:, 1] = np.minimum(travel[:, 1], top[0] - error[:2])
-            travel[:, 2] = np.maximum(travel[:, 2], top[1] + error[:2])
-            step[:, 2] = np.maximum(step[:, 2], most)
-        found.append(
-            Fitted(
-                parameters=chosen,
-                gain=float(one.gain[0]),
-                travel=np.maximum(travel, 0.0),
-                step=np.maximum(step, 0.0),
-                cost=float(one.cost[0]),
-                independent=independent,
-                rests=one.rests[0],
-                follower=one.follower[0],
-            )
+    found = [
+        _Candidates(profile[j], [_Candidate(profile[j, 0], _TIES[0])], costs[j]) for j in joints
+    ]
+    # b of its own, the same at both ends; then one at each.
+    start = profile[joints, 1 + costs[:, 1:].argmin(axis=1)]
+    for tie in _TIES[1:]:
+        n = tie.shape[1]
+        own = _levenberg(
+            cycles, joints, start[:, :n], np.broadcast_to(tie, (joints.size, *tie.shape)), scales
         )
-    return found
+        start = own @ tie.T
+        for one, parameters in zip(found, start, strict=True):
+            one.fits.append(_Candidate(parameters, tie))
+    return [_chosen(cycles, j, one, scales) for j, one in enumerate(found)]
+
+
+class _Candidate(NamedTuple):
+    """Parameters, and which of them were fitted."""
+
+    parameters: FloatArray
+    tie: FloatArray
+
+
+class _Candidates(NamedTuple):
+    """What was fitted to one joint: the profile over b, and models with ever more parameters."""
+
+    profile: FloatArray
+    fits: list[_Candidate]
+    costs: FloatArray
+
+
+def _chosen(cycles: Cycles, joint: int, found: _Candidates, scales: _Scales) -> Fitted:
+    """The simplest model that none explains more than, with its intervals."""
+    index = np.array([joint])
+    lefts = [misfit(cycles, index, one.parameters[np.newaxis]) for one in found.fits]
+    independent = _independent(lefts[-1].residual[0])
+    least = min(float(found.costs.min()), *(float(left.cost[0]) for left in lefts))
+    taken = 0
+    error = _errors(cycles, joint, found.fits[0], scales, lefts[0])
+    for k, needed in zip((1, 2), _NEEDED, strict=True):
+        gained = independent * np.log(lefts[taken].cost[0] / lefts[k].cost[0])
+        if gained > needed:
+            wider = _errors(cycles, joint, found.fits[k], scales, lefts[k])
+            if np.all(found.fits[k].parameters[[TOP, BOTTOM]] >= wider[2:] * (k == 1)):
+                taken, error = k, wider
+    chosen, left = found.fits[taken].parameters, lefts[taken]
+    travel = np.stack([chosen[WIDTH] + chosen[[TOP, BOTTOM]]] * 3, axis=1)
+    step = np.stack([chosen[[TOP, BOTTOM]]] * 3, axis=1)
+    travel[:, 1:] += np.outer(error[:2], [-1, 1])
+    step[:, 1:] += np.outer(error[2:], [-1, 1])
+    if taken < len(_NEEDED):
+        loss = independent * np.log(found.costs / least)
+        low, high, most = _possible(found.profile, loss)
+        travel[:, 1] = np.minimum(travel[:, 1], low - error[:2])
+        travel[:, 2] = np.maximum(travel[:, 2], high + error[:2])
+        step[:, 2] = np.maximum(step[:, 2], most)
+    return Fitted(
+        parameters=chosen,
+        gain=float(left.gain[0]),
+        travel=np.maximum(travel, 0.0),
+        step=np.maximum(step, 0.0),
+        cost=float(left.cost[0]),
+        independent=independent,
+        rests=left.rests[0],
+        follower=left.follower[0],
+    )
 
 
 class _Scales:
@@ -147,7 +185,7 @@ class _Scales:
         self.unit = np.stack([one / omega, one / omega, *[2 * amplitude] * 3], axis=1)
         self.nudge = np.stack([one * period_s / 20] * 2 + [fine] * 3, axis=1)
         self.least_move = np.stack([one * period_s / 2] * 2 + [coarse] * 3, axis=1)
-        self.lower = np.array([-2 * period_s, period_s / 10, 0.0, 0.0, 0.0])
+        self.lower = np.array([-period_s / 2, period_s / 10, 0.0, 0.0, 0.0])
         self.resolution = resolution
 
 
@@ -244,27 +282,26 @@ def _repeated(residual: FloatArray) -> float:
     return max(0.0, 1 - chance / mean) if mean > 0 else 0.0
 
 
-def _possible(profile: FloatArray, loss: FloatArray) -> tuple[tuple[float, float], float]:
+def _possible(profile: FloatArray, loss: FloatArray) -> tuple[float, float, float]:
     """Least and greatest W, and the greatest b, that the profile leaves possible."""
-    travel, step = profile[:, WIDTH] + profile[:, TOP], profile[:, TOP]
     fine = np.linspace(0.0, _SHARES[-1], 401)
     inside = np.interp(fine, _SHARES, loss) <= _INSIDE
     if not inside.any():
-        inside[0] = True
-    could = np.interp(fine, _SHARES, travel)[inside]
-    return (float(could.min()), float(could.max())), float(
-        np.interp(fine, _SHARES, step)[inside].max()
-    )
+        inside[int(np.interp(fine, _SHARES, loss).argmin())] = True
+    travel = np.interp(fine, _SHARES, profile[:, WIDTH] + profile[:, TOP])[inside]
+    step = np.interp(fine, _SHARES, profile[:, TOP])[inside]
+    return float(travel.min()), float(travel.max()), float(step.max())
 
 
 def _errors(
-    cycles: Cycles, joint: int, chosen: FloatArray, tie: FloatArray, scales: _Scales, one: Misfit
+    cycles: Cycles, joint: int, fitted: _Candidate, scales: _Scales, one: Misfit
 ) -> FloatArray:
     """Half widths of W after top and bottom and of both b [rad], shape (4,).
 
     Delete-one jackknife over the cycles; what repeats in all of them, as an encoder's steps do, over
     segments of the mean cycle. The level of a plateau is known to an encoder's step at best.
     """
+    chosen, tie = fitted
     n = tie.shape[1]
     nudge, unit = scales.nudge[joint, :n], scales.unit[joint, :n]
     at_bound = chosen[:n] <= scales.lower[:n] + 1e-12
