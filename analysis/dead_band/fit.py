@@ -146,9 +146,10 @@ def _chosen(cycles: Cycles, joint: int, found: _Candidates, scales: _Scales) -> 
     error = _errors(cycles, joint, found.fits[0], scales, lefts[0])
     for k, needed in zip((1, 2), _NEEDED, strict=True):
         gained = independent * np.log(lefts[taken].cost[0] / lefts[k].cost[0])
-        if gained > needed:
+        # Ahead of its command no joint is: it would speed up by its inertia, which isn't a step.
+        if gained > needed and found.fits[k].parameters[DELAY] >= 0:
             wider = _errors(cycles, joint, found.fits[k], scales, lefts[k])
-            if np.all(found.fits[k].parameters[[TOP, BOTTOM]] >= wider[2:] * (k == 1)):
+            if np.any(found.fits[k].parameters[[TOP, BOTTOM]] > wider[2:]):
                 taken, error = k, wider
     chosen, left = found.fits[taken].parameters, lefts[taken]
     travel = np.stack([chosen[WIDTH] + chosen[[TOP, BOTTOM]]] * 3, axis=1)
