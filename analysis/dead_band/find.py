@@ -40,8 +40,8 @@ _CREEP = 0.1
 _SETTLING = 0.25
 """Part of each plateau that is left out at its start: the joint may still arrive."""
 
-_SHORTEST = 3
-"""Samples that a plateau has at least."""
+_SHORTEST, _LONG = 3, 8
+"""Samples that a plateau has at least, and so many that three parts of it are compared."""
 
 
 def dead_bands(
@@ -114,19 +114,23 @@ def _of_group(
         rest_s = _rests(part, k, one, float(resolution[j]))
         if rest_s is not None:
             witness = Witness.of(columns, names[j], lambda s: _series(s, origin_ns))
-            found[names[j]] = _result(part, k, one, rest_s, omega, witness)
+            kind = decide(part, k, one, witness)
+            found[names[j]] = _result(
+                one, part.commands[k], rest_s, omega, kind=kind, count=len(part.t_s)
+            )
     return found
 
 
 def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexArray]:
     """Amplitudes of the commands, and of the positions over them."""
-    turn = np.exp(-1j * omega * cycles.t_s[:, cycles.first :])
+    back = np.exp(1j * omega * cycles.t_s[:, cycles.first :])
     waves: list[complex] = []
     ratios: list[complex] = []
-    for j, measured in enumerate(cycles.measured[:, :, cycles.first :]):
+    for j in range(len(cycles.measured)):
+        measured: FloatArray = cycles.measured[j, :, cycles.first :]
         command = cycles.commanded(j)[:, cycles.first :]
-        wave = complex(2 * np.mean((command - command.mean()) * turn))
-        answer = complex(2 * np.mean((measured - measured.mean()) * turn))
+        wave = complex(2 * np.vdot(back, command - np.mean(command)) / back.size)
+        answer = complex(2 * np.vdot(back, measured - np.mean(measured)) / back.size)
         waves.append(wave)
         ratios.append(answer / wave if wave else 0j)
     return np.array(waves), np.array(ratios)
@@ -186,7 +190,7 @@ def _rests(
             side = int(z[i] < middle)
             found[side].append(float(k - i) * cycles.period_s)
             settled = slice(i + round(_SETTLING * (k - i)), k)
-            parts = np.array_split(seen[settled], 3 if k - i >= 8 else 2)  # noqa: PLR2004
+            parts = np.array_split(seen[settled], 3 if k - i >= _LONG else 2)
             means = [float(part.mean()) for part in parts]
             crept[side].append(max(means) - min(means))
             led[side].append(abs(one.gain) * float(np.ptp(c[settled])))
@@ -204,20 +208,17 @@ def _series(signal: Signal, origin_ns: int) -> Series:
 
 
 def _result(
-    cycles: Cycles,
-    joint: int,
     one: Fitted,
+    command: Series,
     rest_s: tuple[float, float],
     omega: float,
-    witness: Witness,
+    *,
+    kind: tuple[str, str],
+    count: int,
 ) -> DeadBand:
-    command = cycles.commands[joint]
     width, top, bottom = one.parameters[[WIDTH, TOP, BOTTOM]].tolist()
     followed = rested(command.values, width, top, bottom)
     change = fundamental_change(command.t_s, command.values, followed, omega)
-    fitted = slice(cycles.first, None)
-    rests, followed_by = one.rests[:, fitted], one.follower[:, fitted]
-    kind, evidence = decide(cycles, joint, one.parameters, rests, followed_by, witness)
     sides = [
         Reversal(
             travel_rad=float(travel[0]),
@@ -229,11 +230,11 @@ def _result(
         for travel, step, lasts in zip(one.travel, one.step, rest_s, strict=True)
     ]
     return DeadBand(
-        kind=kind,
-        evidence=evidence,
+        kind=kind[0],
+        evidence=kind[1],
         top=sides[0],
         bottom=sides[1],
         gain_change=abs(change),
         lag_change_rad=-float(np.angle(change)),
-        cycles=len(cycles.t_s),
+        cycles=count,
     )

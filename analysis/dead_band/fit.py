@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from capture.arrays import BoolArray, FloatArray, IntArray
 
+from ..response import t_factor
 from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
 
 _SHARES = np.array([0.0, 0.15, 0.4, 1.0])
@@ -88,7 +88,7 @@ def fit_dead_bands(
     Returns:
         One fit a joint.
     """
-    joints = np.arange(len(amplitude))
+    joints = np.arange(len(amplitude), dtype=np.int64)
     scales = _Scales(cycles.period_s, omega, amplitude, resolution)
     starts = _starts(cycles.period_s, omega, amplitude, lag)
     each = misfit(cycles.some(5), np.repeat(joints, starts.shape[1]), starts.reshape(-1, 5))
@@ -190,9 +190,7 @@ class _Scales:
         self.resolution = resolution
 
 
-def _starts(
-    period_s: float, omega: float, amplitude: FloatArray, lag: FloatArray
-) -> FloatArray:
+def _starts(period_s: float, omega: float, amplitude: FloatArray, lag: FloatArray) -> FloatArray:
     """Sets of parameters with the right lag, shape (j, p, 5)."""
     sets: list[FloatArray] = []
     for share in _WIDTHS:
@@ -217,7 +215,7 @@ def _levenberg(
     rows, n = values.shape
     lower = scales.lower[:n]
     damping, idle = np.full(rows, 1e-3), np.zeros(rows, dtype=np.int64)
-    here = np.arange(rows)
+    here = np.arange(rows, dtype=np.int64)
     values = np.maximum(values, lower)
     for _ in range(_ITERATIONS):
         left, slopes = _slopes(cycles, joint, values, ties, scales)
@@ -266,32 +264,39 @@ def _slopes(
 
 def _independent(residual: FloatArray) -> float:
     """How many independent residuals there are, from their correlation along and across cycles."""
-    own = residual - residual.mean()
-    square = float(np.mean(own**2))
+    own: FloatArray = residual - residual.mean()
+    square = _mean(own**2)
     if square == 0:
         return float(residual.size)
-    along = max(0.0, float(np.mean(own[:, 1:] * own[:, :-1])) / square)
-    share = float(np.mean(residual.mean(axis=0) ** 2)) / square * _repeated(residual)
+    products: FloatArray = own[:, 1:] * own[:, :-1]
+    along = max(0.0, _mean(products) / square)
+    share = _mean(residual.mean(axis=0) ** 2) / square * _repeated(residual)
     cycles, samples = residual.shape
     return samples * (1 - along) / (1 + along) / (share + (1 - share) / cycles)
 
 
+def _mean(values: FloatArray) -> float:
+    return float(values.sum()) / values.size
+
+
 def _repeated(residual: FloatArray) -> float:
     """Share of the mean cycle's residual that is the same in every cycle, 0 to 1."""
-    mean = float(np.mean(residual.mean(axis=0) ** 2))
-    chance = float(residual.var(axis=0, ddof=1).mean()) / len(residual)
+    mean = _mean(residual.mean(axis=0) ** 2)
+    chance = _mean(residual.var(axis=0, ddof=1)) / len(residual)
     return max(0.0, 1 - chance / mean) if mean > 0 else 0.0
 
 
 def _possible(profile: FloatArray, loss: FloatArray) -> tuple[float, float, float]:
     """Least and greatest W, and the greatest b, that the profile leaves possible."""
-    fine = np.linspace(0.0, _SHARES[-1], 401)
-    inside = np.interp(fine, _SHARES, loss) <= _INSIDE
+    fine = float(_SHARES[-1]) * np.arange(401, dtype=np.float64) / 400
+    losses: FloatArray = np.interp(fine, _SHARES, loss)
+    inside: BoolArray = losses <= _INSIDE
     if not inside.any():
-        inside[int(np.interp(fine, _SHARES, loss).argmin())] = True
-    travel = np.interp(fine, _SHARES, profile[:, WIDTH] + profile[:, TOP])[inside]
-    step = np.interp(fine, _SHARES, profile[:, TOP])[inside]
-    return float(travel.min()), float(travel.max()), float(step.max())
+        inside[int(losses.argmin())] = True
+    travels: FloatArray = np.interp(fine, _SHARES, profile[:, WIDTH] + profile[:, TOP])
+    steps: FloatArray = np.interp(fine, _SHARES, profile[:, TOP])
+    could = travels[inside]
+    return float(could.min()), float(could.max()), float(steps[inside].max())
 
 
 def _errors(
@@ -299,8 +304,8 @@ def _errors(
 ) -> FloatArray:
     """Half widths of W after top and bottom and of both b [rad], shape (4,).
 
-    Delete-one jackknife over the cycles; what repeats in all of them, as an encoder's steps do, over
-    segments of the mean cycle. The level of a plateau is known to an encoder's step at best.
+    Delete-one jackknife over the cycles; what repeats in all of them, as an encoder's steps do,
+    over segments of the mean cycle. The level of a plateau is known to an encoder's step at best.
     """
     chosen, tie = fitted
     n = tie.shape[1]
@@ -310,15 +315,16 @@ def _errors(
     sets = np.stack([chosen + tie[:, m] * nudge[m] for m in free])
     still = one.follower[0, :, cycles.first :]
     moved = misfit(cycles, np.full(free.size, joint), sets).follower[:, :, cycles.first :] - still
-    gain, z = float(one.gain[0]), still - still.mean()
+    gain = float(one.gain[0])
+    z: FloatArray = still - still.mean()
     columns = [gain * moved[k] * unit[m] / nudge[m] for k, m in enumerate(free)]
-    design = np.stack([*columns, z, np.full_like(z, np.sqrt(np.mean(z**2)))])
+    design = np.stack([*columns, z, np.full_like(z, _mean(z**2) ** 0.5)])
     residual = one.residual[0]
     count, samples = residual.shape
     within = np.einsum("akn,bkn->kab", design, design)
     spread = _jackknife(within, np.einsum("akn,kn->ka", design, residual))
     mean, common = design.mean(axis=1), residual.mean(axis=0)
-    segment = np.arange(samples) * _SEGMENTS // samples
+    segment = np.arange(samples, dtype=np.int64) * _SEGMENTS // samples
     parts = [mean[:, segment == s] for s in range(_SEGMENTS)]
     repeated = _repeated(residual)
     spread += repeated * _jackknife(
@@ -334,12 +340,15 @@ def _errors(
     wanted[:2, WIDTH] = 1.0
     wanted[[0, 2], TOP] = wanted[[1, 3], BOTTOM] = 1.0
     variance = np.einsum("ap,pq,aq->a", wanted, covariance, wanted)
-    return float(stdtrit(min(count - 1, _SEGMENTS - 5), 0.975)) * np.sqrt(variance)
+    return t_factor(min(count - 1, _SEGMENTS - PARAMETERS)) * np.sqrt(variance)
 
 
 def _jackknife(normals: FloatArray, pulls: FloatArray) -> FloatArray:
     """Covariance from leaving out one group at a time, linearised; groups first."""
-    total, groups = normals.sum(axis=0), len(normals)
+    total: FloatArray = normals.sum(axis=0)
+    groups = len(normals)
     ridge = 1e-9 * np.diag(np.diag(total))
-    change = np.linalg.solve(total - normals + ridge, pulls[:, :, np.newaxis])[:, :, 0]
+    change: FloatArray = np.linalg.solve(total - normals + ridge, pulls[:, :, np.newaxis]).astype(
+        np.float64
+    )[:, :, 0]
     return (groups - 1) / groups * change.T @ change

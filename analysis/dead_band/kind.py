@@ -13,6 +13,7 @@ from capture.log.signals import Signal
 from ..estimators.series import Series
 from ..reading import Columns
 from ..results.dead_band import EITHER, PLAY, STICK
+from .fit import Fitted
 from .model import DELAY, WIDTH, Cycles
 
 _RAMP = 0.5
@@ -23,6 +24,9 @@ _NONE = 0.2
 
 _ALONG = 0.5
 """Share of the command's travel that a second sensor goes along with, before the play."""
+
+_INNER = 0.6
+"""Part of a plateau away from arrest and onset."""
 
 _SURE = 3.0
 _FEW = 3
@@ -63,14 +67,7 @@ class Witness:
         return cls(effort, quantity, None if second is None else series(second))
 
 
-def decide(
-    cycles: Cycles,
-    joint: int,
-    parameters: FloatArray,
-    rests: BoolArray,
-    follower: FloatArray,
-    witness: Witness,
-) -> tuple[str, str]:
+def decide(cycles: Cycles, joint: int, one: Fitted, witness: Witness) -> tuple[str, str]:
     """Tell stick from play, if the data do.
 
     A motor that dry friction holds pulls ever harder, from one direction to the other, while the
@@ -79,17 +76,16 @@ def decide(
     Args:
         cycles: The motion.
         joint: Index.
-        parameters: Of the model, shape (5,).
-        rests: Where the joint rests, shape (k, n).
-        follower: z [rad], shape (k, n).
+        one: Its fit.
         witness: What else is recorded.
 
     Returns:
         The kind, and what decides it.
     """
-    times = cycles.t_s[:, cycles.first :]
-    command = cycles.commanded(joint, float(parameters[DELAY]))[:, cycles.first :]
-    across = (command - follower) / max(float(parameters[WIDTH]) / 2, 1e-12)
+    fitted = slice(cycles.first, None)
+    times, rests = cycles.t_s[:, fitted], one.rests[:, fitted]
+    command = cycles.commanded(joint, float(one.parameters[DELAY]))[:, fitted]
+    across = (command - one.follower[:, fitted]) / max(float(one.parameters[WIDTH]) / 2, 1e-12)
     if witness.second is not None:
         along = _slopes(command, witness.second.at(times.ravel()).reshape(times.shape), rests)
         if _mean_beyond(along, _ALONG):
@@ -105,7 +101,7 @@ def decide(
     rises = _sure(unsigned) and float(unsigned.mean()) > _RAMP and float(effort.min()) >= 0
     if ramps or rises:
         return STICK, f"the {witness.quantity} ramps while the joint rests"
-    inner = rests & (np.abs(across) < 0.6)  # noqa: PLR2004 - away from arrest and onset
+    inner = rests & (np.abs(across) < _INNER)
     if np.count_nonzero(inner) >= _FEW and float(np.mean(np.abs(effort[inner]))) < _NONE * moving:
         return PLAY, f"the {witness.quantity} is near zero while the joint rests"
     return EITHER, f"the {witness.quantity} neither ramps clearly nor vanishes"

@@ -58,10 +58,12 @@ def follow(
     u = np.ascontiguousarray(np.moveaxis(command, 2, 0))
     dt = np.ascontiguousarray(np.moveaxis(step_s, 2, 0))
     found, rests = np.empty_like(u), np.ones(u.shape, dtype=np.bool_)
-    z, mode, before = u[0].copy(), np.zeros(u.shape[1:]), u[0]
+    z: FloatArray = u[0].copy()
+    mode: FloatArray = np.zeros(u.shape[1:])
+    before: FloatArray = u[0]
     found[0] = z
     for k in range(1, len(u)):
-        now = u[k]
+        now: FloatArray = u[k]
         error, slope = now - z, (now - before) / dt[k]
         starts_up, starts_down = (error > up) & (mode <= 0), (error < -down) & (mode >= 0)
         mode = np.where(starts_up, 1.0, np.where(starts_down, -1.0, mode))
@@ -189,9 +191,7 @@ def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
     Returns:
         One row a set of parameters.
     """
-    u = np.stack(
-        [cycles.commanded(j, d) for j, d in zip(joint, parameters[:, DELAY], strict=True)]
-    )
+    u = np.stack([cycles.commanded(j, d) for j, d in zip(joint, parameters[:, DELAY], strict=True)])
     z, rests = follow(u, np.broadcast_to(cycles.step_s, u.shape), parameters)
     fitted, measured = z[:, :, cycles.first :], cycles.measured[joint, :, cycles.first :]
     own = fitted - fitted.mean(axis=(1, 2), keepdims=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from capture.arrays import FloatArray
@@ -29,7 +31,7 @@ def rested(command: FloatArray, width: float, top: float, bottom: float) -> Floa
     edges = np.concatenate(([0], turn, [command.size - 1]))  # first and last of each way
     state = float(command[0])
     found[0] = state
-    for i, j in zip(edges[:-1], edges[1:], strict=True):
+    for i, j in pairwise(edges.tolist()):
         part = command[i + 1 : j + 1]
         if part.size == 0:
             continue
