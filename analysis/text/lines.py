@@ -43,7 +43,7 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
 
 
 def _dead_bands(analysis: Analysis) -> Iterator[str]:
-    """A line for each joint with stick or play: how far its command travels in vain, and so what."""
+    """A line for each joint with stick or play: how far its command travels in vain."""
     for joint in analysis.joints:
         band = joint.dead_band
         if band is None:
@@ -58,8 +58,8 @@ def _dead_bands(analysis: Analysis) -> Iterator[str]:
         where = "both reversals" if len(ends) == 1 else "its upper and lower reversal"
         lag = math.degrees(band.lag_change_rad)
         yield (
-            f"Dead band: {formats.plain(joint.name)}, {band.kind} ({band.evidence}): at {where} the "
-            f"command travels {widths} before the joint moves, which then catches up by {steps}; "
+            f"Dead band: {formats.plain(joint.name)}, {band.kind} ({band.evidence}): at {where} "
+            f"the command travels {widths} before the joint moves and catches up by {steps}; "
             f"of gain and lag the dead band alone makes {band.gain_change:.3f} and {lag:.1f}°"
         )
 
