@@ -405,7 +405,7 @@ def _(robot, rng, j):
         return np.where(side * (read - at) > 0, read - side * 2 * np.pi, read)
 
     kinds = frozenset({"wrapped_sensor"})
-    return (Change(j, reading=wrapped),), Truth((JointTruth(j, kinds, kinds, checked=False),))
+    return (Change(j, reading=wrapped),), Truth((JointTruth(j, kinds, kinds),))
 
 
 def _slip(robot, rng, j):
@@ -461,7 +461,7 @@ def _(robot, rng, j):
     if not robot.channels.second:
         kinds |= PAUSED
     return (Change(j, reading=lambda read: read + noise),), Truth(
-        (JointTruth(j, frozenset({"noisy_sensor"}), kinds, checked=False),)
+        (JointTruth(j, frozenset({"noisy_sensor"}), kinds),)
     )
 
 

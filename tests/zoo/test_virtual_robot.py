@@ -14,7 +14,7 @@ from zoo.outputs import OUTPUTS, statements
 from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
 
 import undulog
-from capture import load_robot
+from capture import Session, load_robot
 from capture.sources.address import parse_address
 from capture.sources.events import Tally
 from sim.drive.driven import find_driven
@@ -146,13 +146,16 @@ def problems(path, healthy, truth):
 def test_faults_on_the_bus_are_named_by_every_output(tmp_path, scenario, healthy, faults):
     path = recorded_over_the_bus(tmp_path, scenario, faults)
     place = SnakeOfTheBus.names.index
+    with Session.open(path) as session:  # its clock starts before the robot's does
+        sampled_ns = min(int(t_ns[0]) for t_ns in session.joints("/joint_states").t_ns)
+        first_s = (sampled_ns - session.start_ns) * 1e-9
     truth = Truth(
         tuple(
             JointTruth(
                 place(fault.split("@")[0].split(":")[1]),
                 kinds,
                 kinds,
-                since_s=since,
+                since_s=None if since is None else first_s + since,
                 compared=kinds != {"lost_samples"},
             )
             for fault in faults
