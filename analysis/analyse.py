@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import shlex
 from collections.abc import Mapping
@@ -39,7 +40,9 @@ from .results.analysis import (
     Window,
 )
 from .results.artefact import flags_by_joint
-from .stretch import Options, choose_stretch
+from .segments.session import commanded_joints, compare_joints, faults_of, not_following
+from .stretch import Options, choose_stretch, recorded
+from .text.answer import Facts, compose
 from .text.artefacts import warn_flags, within
 from .windows import Stretch, whole_cycles
 
@@ -143,6 +146,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     session.forget()  # what each step has looked at need not stay in memory beside the next one's
     artefacts = find_artefacts(session, columns)
     stretch = choose_stretch(session, columns, options, warn)
+    whole = recorded(session, columns, options)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     commands = _series(columns.names, columns.command, stretch, origin_ns)
     session.forget()
@@ -156,6 +160,8 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     del commands
     session.forget()
     span = _span(stretch, origin_ns, gait)
+    faulty = not_following(faults_of(session, columns, whole), held, columns.names)
+    session.forget()
     energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)
     joints = joint_results(
@@ -177,6 +183,8 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     over_time = response_over_time(session, columns, artefacts, warn)
     body = body_motion(session, sound, gait, span, warn)
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
+    commanded = commanded_joints(columns)
+    findings = compare_joints(session.robot, gait, joints, faulty, commanded)
     analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,
@@ -198,6 +206,8 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         energy=energy,
         oscillators=session_couplings(session, options.start_s, options.stop_s),
     )
+    answer = compose(Facts(analysis.gait, joints, commanded, faulty, findings, analysis.warnings))
+    analysis = dataclasses.replace(analysis, answer=answer)
     return Measured(analysis, gait, sound, energies, span)
 
 

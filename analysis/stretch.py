@@ -110,6 +110,25 @@ def choose_stretch(session: Session, columns: Columns, options: Options, warn: W
     return _in_motion(columns, later)
 
 
+def recorded(session: Session, columns: Columns, options: Options) -> Stretch:
+    """What was recorded of commands and positions, within the user's limits.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        options: What the user chose.
+
+    Returns:
+        The window, without regard to settling or steadiness.
+
+    Raises:
+        DataError: If there are no samples at all.
+    """
+    return _recorded(session, columns).intersect(
+        _absolute(session, options.start_s), _absolute(session, options.stop_s)
+    )
+
+
 def _recorded(session: Session, columns: Columns) -> Stretch:
     """Where commands and responses overlap, or where the one that exists lies."""
     kinds = (columns.command, columns.position)

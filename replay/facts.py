@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import rerun as rr
 
 from analysis.results.analysis import Analysis
-from analysis.text.answer import answer
 from analysis.text.formats import utc
 from capture import Session
 
@@ -70,7 +69,7 @@ def markdown(
 
 def _told_first(analysis: Analysis | None, *, awaited: bool) -> str:
     if analysis is not None:
-        return answer(analysis).sentence
+        return analysis.answer.sentence
     return "Being analysed: the answer comes in a moment." if awaited else "Not analysed."
 
 

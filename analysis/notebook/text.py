@@ -17,7 +17,6 @@ from ..results.experiment import Experiment, Reversal
 from ..results.sweep import LinearCoupling
 from ..sweep.answer import sweep_answer, sweep_detail
 from ..text import formats
-from ..text.answer import answer
 from ..text.table import render
 
 MOST_ROWS = 40
@@ -42,7 +41,7 @@ def headline_of(result: object) -> str:
 
 @headline_of.register
 def _(result: Analysis) -> str:
-    return f"{Path(result.session.path).name}: {answer(result).sentence}"
+    return f"{Path(result.session.path).name}: {result.answer.sentence}"
 
 
 @headline_of.register

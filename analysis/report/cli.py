@@ -98,9 +98,7 @@ def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, An
 
 
 def _told(analysis: Analysis) -> dict[str, Any]:
-    from ..text.answer import answer
-
-    told = answer(analysis)
+    told = analysis.answer
     return {
         "session": analysis.session.id,
         "path": analysis.session.path,

@@ -20,7 +20,6 @@ from ..results.experiment import Experiment, Run
 from ..results.sweep import LinearCoupling
 from ..sweep.answer import sweep_checks
 from ..text import formats
-from ..text.answer import answer
 from .drawn import Drawing
 from .entries import Entries, entries_of
 from .matrix import matrix_picture
@@ -122,7 +121,7 @@ def experiment_view(experiment: Experiment) -> ExperimentView:
         sentence=formats.sentence(experiment.answer),
         detail=tuple(reversal_detail(reversal)) if reversal is not None else (),
         facts=tuple(_facts(experiment)),
-        answers=tuple(answer(one).sentence for one in experiment.sessions),
+        answers=tuple(one.answer.sentence for one in experiment.sessions),
         mirror=mirror,
         entries=entries,
         matrices=tuple(

@@ -10,8 +10,8 @@ from capture.palette import joint_hex
 
 from ..cycles import CycleMaps
 from ..results.analysis import Analysis, JointResult
+from ..results.answer import Answer
 from ..text import formats
-from ..text.answer import Answer, answer
 from .artefacts import ArtefactRow, artefact_rows, flagged_joints
 from .drawn import Drawing
 from .driven import is_driven
@@ -87,7 +87,7 @@ def session_view(
     traces = read_traces(session, analysis) if session is not None else ()
     body = analysis.body
     driven = tuple(joint.name for joint in joints if is_driven(joint))
-    told = answer(analysis)
+    told = analysis.answer
     others = [w for w in map(formats.sentence, analysis.warnings) if w not in told.detail]
     entries = entries_of(analysis.coupling, driven)
     return SessionView(

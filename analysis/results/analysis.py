@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ..notebook.shown import Shown
+from .answer import Answer
 from .artefact import Artefact
 
 if TYPE_CHECKING:
@@ -246,6 +247,7 @@ class Analysis(Shown):
         energy: Energies cycle by cycle, cost of transport, closure.
         oscillators: Couplings of the oscillators that drove it, one a plane; none where no
             oscillator's phase was logged.
+        answer: Which joints do not follow or stand out, and the shape of the rest, in words.
     """
 
     session: SessionFacts
@@ -260,6 +262,7 @@ class Analysis(Shown):
     oscillators: tuple[ChainCoupling, ...] = ()
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
+    answer: Answer = field(default_factory=Answer)
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -272,6 +275,7 @@ class Analysis(Shown):
         """
         gait = dataclasses.asdict(self.gait) | _flat("frequency_hz", self.gait.frequency_hz)
         return {
+            "answer": dataclasses.asdict(self.answer),
             "session": dataclasses.asdict(self.session),
             "gait": gait,
             "joints": [

@@ -1,103 +1,111 @@
-"""The answer in one sentence: do the segments move alike?
+"""The answer in words: who does not follow, who stands out, and how the rest differs.
 
-The sentence claims no more than a test or an interval carries: a small p-value or a boundary
-contrast whose interval leaves out zero says "not alike"; only an equivalence test says "alike";
-everything else is "could not be shown".
+The order is that of what a reader must act on: joints that do not follow their command, joints
+that respond differently from the others, then the shape of the rest. Each number is one whose
+simultaneous interval excludes zero; only equivalence tests of every commanded joint say "alike".
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
-from ..results.analysis import (
-    Analysis,
-    Estimate,
-    Index,
-    JointResult,
-    leaves_out_zero,
-)
+from capture.following import KINDS as FAULT_KINDS
+
+from ..results.analysis import Estimate, GaitFacts, Index, JointResult
+from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
+from ..segments.examine import Findings
 from . import formats
 
-SIGNIFICANT = 0.05
-"""Family-wise level of the sentence."""
+NAMED = 4
+"""Joints that a sentence names at most; the others are counted."""
 
-_NAMED = 6
-"""Flagged joints that the answer names at most."""
+_FLAGGED = 6
+_NEGLIGIBLE = {"gain": 5e-4, "lag": math.radians(0.05)}
+"""Shapes smaller than this are left to the tables."""
 
-
-class Verdict(StrEnum):
-    """What kind of answer a session gives."""
-
-    UNLIKE = "unlike"
-    ALIKE = "alike"
-    OPEN = "open"
-    SINGLE = "single"
-    NOTHING = "nothing"
+_KIND_WORDS = {
+    "dead": "dead",
+    "jammed": "jammed",
+    "stalled": "stalled",
+    "inverted": "inverted",
+    "intermittent": "intermittent",
+    "at_limit": "at a limit",
+    "slipped": "slipped",
+    "swapped": "swapped with another joint",
+    "frozen_sensor": "a frozen sensor",
+    "inverted_sensor": "an inverted sensor",
+    "stale_sensor": "a sensor with old values",
+    "scaled_sensor": "a sensor of wrong scale or unit",
+    "slipped_sensor": "a sensor whose zero moved",
+    "noisy_sensor": "a noisy sensor",
+    "wrapped_sensor": "a sensor that wrapped around",
+    "drifting_sensor": "a drifting sensor",
+    "clipped_sensor": "a clipped sensor",
+    "lost_samples": "lost samples",
+}
 
 
 @dataclass(frozen=True)
-class Answer:
-    """The first thing the report says.
+class Facts:
+    """What an answer is composed of.
 
     Attributes:
-        verdict: Its kind.
-        sentence: One sentence; plain text, intervals in square brackets.
-        detail: What qualifies it, one or two sentences.
+        gait: The rhythm.
+        joints: The joints' results.
+        commanded: Names of the joints whose command moves.
+        not_following: Joints that do not follow, in chain order.
+        findings: Joints that stand out, and the shape of the rest.
+        warnings: Of the analysis: they hold the reason where there is no answer.
     """
 
-    verdict: Verdict
-    sentence: str
-    detail: str
+    gait: GaitFacts
+    joints: tuple[JointResult, ...]
+    commanded: tuple[str, ...]
+    not_following: tuple[NotFollowing, ...]
+    findings: Findings
+    warnings: tuple[str, ...]
 
 
-def answer(analysis: Analysis) -> Answer:
-    """Answer from the numbers of one session.
+def compose(facts: Facts) -> Answer:
+    """Compose the answer of one session.
 
     Args:
-        analysis: Its numbers.
+        facts: What is known.
 
     Returns:
         The answer.
     """
-    known = [j for j in analysis.joints if j.gain.value is not None]
-    if analysis.gait.frequency_hz.value is None:
-        return Answer(
-            Verdict.NOTHING,
-            "No gait was found in this session, so there is no gain and no lag to compare.",
-            _why_not(analysis, "no gait"),
-        )
-    if not known:
-        return Answer(
-            Verdict.NOTHING,
-            "No joint could be compared with its command.",
-            _why_not(analysis, "gain and lag are null"),
-        )
-    if len(known) == 1:
-        joint = known[0]
-        lag = formats.estimate(formats.degrees(joint.lag_rad), "°", most=2)
-        return Answer(
-            Verdict.SINGLE,
-            f"One joint was driven: its gain is {formats.estimate(joint.gain)}, "
-            f"its lag {lag} behind the command.",
-            "There is no second joint to compare it with." + _caveat(analysis),
-        )
-    verdict = _verdict(analysis)
-    lead = {
-        Verdict.UNLIKE: "The segments do not move alike",
-        Verdict.ALIKE: f"The segments move alike, {_margins(analysis)}",
-    }.get(verdict, "No difference between the segments could be shown")
-    numbers = _numbers(analysis)
+    known = [joint for joint in facts.joints if joint.gain.value is not None]
+    first = _named(facts)
+    verdict, rest, detail = _rest(facts, known)
+    if first:
+        verdict = Verdict.UNLIKE
+        detail = _responding(facts, known) + _caveat(facts.joints)
+    findings = facts.findings
+    compared = set(findings.compared)
+    everyone = bool(facts.commanded) and set(facts.commanded) <= compared
+    alike: bool | None = None
+    if first or findings.shape or findings.undecided:
+        alike = False
+    if verdict is Verdict.ALIKE and everyone:
+        alike = True
     return Answer(
-        verdict,
-        f"{lead}: {numbers}." if numbers else f"{lead}.",
-        _extremes(analysis, known) + _caveat(analysis),
+        verdict=verdict,
+        sentence=" ".join(part for part in (first, rest) if part),
+        detail=detail,
+        not_following=facts.not_following,
+        stand_out=findings.stand_out,
+        undecided=_undecided(findings, facts) or None,
+        shape=findings.shape,
+        alike=alike,
+        compared=len(compared),
+        commanded=len(facts.commanded),
     )
 
 
-def find(indices: dict[str, Index], stem: str) -> dict[str, Index]:
+def find(indices: Mapping[str, Index], stem: str) -> dict[str, Index]:
     """The indices of one kind that have a value, by plane.
 
     Args:
@@ -115,110 +123,237 @@ def find(indices: dict[str, Index], stem: str) -> dict[str, Index]:
     }
 
 
-def _verdict(analysis: Analysis) -> Verdict:
-    indices = analysis.heterogeneity
-    equal = [find(indices, f"equivalence_{quantity}") for quantity in ("gain", "lag")]
-    if all(equal) and all(_small(index.p) for kind in equal for index in kind.values()):
-        # Different for certain they may be, but by less than the margins: that has the last word.
-        return Verdict.ALIKE
-    contrasts = [find(indices, f"boundary_contrast_{quantity}") for quantity in ("gain", "lag")]
-    if any(leaves_out_zero(index.ci95) for kind in contrasts for index in kind.values()):
-        return Verdict.UNLIKE
-    tests = [i.p for i in find(indices, "common_response").values() if i.p is not None]
-    return Verdict.UNLIKE if tests and _small(min(tests) * len(tests)) else Verdict.OPEN
+def kinds_in_words(kinds: Sequence[str]) -> str:
+    """Kinds of fault that fit, as a reader takes them.
+
+    Args:
+        kinds: Keys of :data:`capture.following.KINDS`.
+
+    Returns:
+        For example ``jammed, dead or a frozen sensor``.
+    """
+    words = [_KIND_WORDS.get(kind, FAULT_KINDS.get(kind, ("", kind))[1]) for kind in kinds]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
 
-def _small(p: float | None) -> bool:
-    return p is not None and p < SIGNIFICANT
+def fault_in_words(fault: NotFollowing) -> str:
+    """One joint that does not follow, as a clause.
+
+    Args:
+        fault: The joint.
+
+    Returns:
+        For example ``joint04 does not follow its command from 7.4 s on: jammed or dead``.
+    """
+    if fault.kinds == ("lost_samples",):
+        return f"{formats.plain(fault.joint)} {fault.evidence}"
+    when = ""
+    if fault.since_s is not None and fault.until_s is None:
+        when = f" from {fault.since_s:.1f} s on"
+    elif fault.since_s is None and fault.until_s is not None:
+        when = f" until {fault.until_s:.1f} s"
+    elif fault.since_s is not None and fault.until_s is not None:
+        share = max(1.0, 100 * fault.share)
+        when = f" for {share:.0f} % of the time from {fault.since_s:.1f} to {fault.until_s:.1f} s"
+    return (
+        f"{formats.plain(fault.joint)} does not follow its command{when}: "
+        f"{kinds_in_words(fault.kinds)}"
+    )
 
 
-def _numbers(analysis: Analysis) -> str:
-    """Contrast and spread with their intervals, plane by plane."""
-    indices = analysis.heterogeneity
-    contrasts = find(indices, "boundary_contrast_lag")
-    spreads = find(indices, "lag_sd")
-    gains = find(indices, "gain_cv")
-    told: list[str] = []
-    for plane in dict.fromkeys([*contrasts, *spreads, *gains]):
-        joints = _joints_word(analysis, plane)
-        parts: list[str] = []
-        if plane in contrasts:
-            parts.append(_contrast(contrasts[plane], joints))
-        elif plane in spreads:
-            spread = Estimate(spreads[plane].value, spreads[plane].ci95)
-            lag = formats.estimate(formats.degrees(spread), "°", most=2)
-            parts.append(f"the lag of the {joints} spreads by {lag}")
-        if plane in gains:
-            spread = formats.scaled(Estimate(gains[plane].value, gains[plane].ci95), 100.0)
-            whose = "" if parts else f" of the {joints}"
-            parts.append(_gain_spread(spread, whose))
-        told.append(" and ".join(parts))
-    return "; ".join(told)
+def _named(facts: Facts) -> str:
+    """The joints that do not follow, then those that stand out; empty for none."""
+    clauses = [fault_in_words(each) for each in facts.not_following[:NAMED]]
+    if len(facts.not_following) > NAMED:
+        names = [formats.plain(each.joint) for each in facts.not_following[NAMED:]]
+        clauses.append(f"{', '.join(names)} do not follow either")
+    by_joint: dict[str, list[StandOut]] = {}
+    for each in facts.findings.stand_out:
+        by_joint.setdefault(each.joint, []).append(each)
+    for joint, several in list(by_joint.items())[:NAMED]:
+        sizes = " and ".join(_deviation(each) for each in several)
+        clauses.append(f"{formats.plain(joint)} responds differently from the others, {sizes}")
+    if len(by_joint) > NAMED:
+        names = [formats.plain(joint) for joint in list(by_joint)[NAMED:]]
+        clauses.append(f"{', '.join(names)} respond differently, too")
+    undecided = _undecided(facts.findings, facts)
+    if undecided:
+        clauses.append(undecided)
+    return f"{formats.capital('; '.join(clauses))}." if clauses else ""
 
 
-def _gain_spread(spread: Estimate, whose: str) -> str:
-    if spread.value == 0.0 and spread.ci95 is not None:  # noise explains all of it
-        most = formats.number(spread.ci95[1], formats.decimals_for([spread], most=2))
-        return f"gain{whose} spreads by no more than noise, {most} % at most"
-    return f"gain{whose} spreads by {formats.estimate(spread, ' %', most=2)}"
+def _undecided(findings: Findings, facts: Facts) -> str:
+    if not findings.undecided:
+        return ""
+    planes = {joint.plane for joint in facts.joints if joint.gain.value is not None}
+    word = _joints_word(next(iter(findings.undecided)), planes)
+    return f"the {word} differ, but with fewer than 4 sound ones it can't be decided which one"
 
 
-def _contrast(index: Index, joints: str) -> str:
-    """Who is late: the index is ends minus middle."""
-    size = formats.estimate(formats.degrees(_size(index)), "°", most=2)
-    if (index.value or 0.0) < 0:
-        return f"the middle {joints} lag {size} more than the ends"
-    return f"the {joints} at the ends lag {size} more than the middle"
+def _deviation(each: StandOut) -> str:
+    """One deviation with its interval; the word carries the sign."""
+    sign = -1.0 if each.deviation < 0 else 1.0
+    low, high = sorted(sign * end for end in each.ci95)
+    size = Estimate(sign * each.deviation, (low, high))
+    if each.quantity == "gain":
+        text = formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+        return f"gain {text} {'less' if sign < 0 else 'more'}"
+    text = formats.estimate(formats.degrees(size), "°", most=2)
+    if each.quantity == "offset":
+        return f"its mean {text} {'below' if sign < 0 else 'above'} its command's"
+    return f"lag {text} {'less' if sign < 0 else 'more'}"
 
 
-def _margins(analysis: Analysis) -> str:
-    """The margins of the equivalence tests, from their labels."""
-    tests = [i for name, i in analysis.heterogeneity.items() if "equivalence" in name]
-    stated = [test.label.rpartition("H1: ")[2] for test in tests]
-    return " and ".join(dict.fromkeys(stated))  # both planes are held to the same
+def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str]:
+    """Verdict, sentence and detail on the joints that are not named."""
+    named = bool(facts.not_following or facts.findings.stand_out or facts.findings.undecided)
+    if facts.gait.frequency_hz.value is None:
+        lead = "No gait was found in this session, so there is no gain and no lag to compare."
+        return Verdict.NOTHING, lead, _why_not(facts, "no gait")
+    if not known:
+        lead = "No joint could be compared with its command."
+        return Verdict.NOTHING, lead, _why_not(facts, "gain and lag are null")
+    if len(known) == 1:
+        return _single(facts, known[0], named=named)
+    detail = _responding(facts, known) + _caveat(facts.joints)
+    return *_compared(facts, named=named), detail
 
 
-def _size(index: Index) -> Estimate:
-    """A contrast without its sign; the words carry it."""
-    if index.value is None or index.value >= 0:
-        return Estimate(index.value, index.ci95)
-    ci95 = None if index.ci95 is None else (-index.ci95[1], -index.ci95[0])
-    return Estimate(-index.value, ci95)
+def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, str, str]:
+    lag = formats.estimate(formats.degrees(joint.lag_rad), "°", most=2)
+    lead = f"{'One other' if named else 'One'} joint was driven: its gain is "
+    lead += f"{formats.estimate(joint.gain)}, its lag {lag} behind the command."
+    return (
+        Verdict.SINGLE,
+        lead,
+        "There is no second joint to compare it with." + _caveat(facts.joints),
+    )
 
 
-def _joints_word(analysis: Analysis, plane: str) -> str:
-    """What to call the joints that an index is about."""
-    planes = {plane} if plane else {j.plane for j in analysis.joints if j.gain.value is not None}
+def _compared(facts: Facts, *, named: bool) -> tuple[Verdict, str]:
+    """Verdict and sentence on the joints that were compared and are not named."""
+    findings = facts.findings
+    if findings.undecided:
+        return Verdict.UNLIKE, ""
+    shapes = _shapes(facts)
+    if findings.alike and (named or _everyone(facts)):
+        left = len(findings.compared) - len({each.joint for each in findings.stand_out})
+        others = f"The other {left} joints" if named else f"The segments move alike: all {left}"
+        rest = "move alike, within" if named else "joints are within"
+        return Verdict.ALIKE, f"{others} {rest} 2 % of gain and 1 degree of lag."
+    if shapes:
+        lead = "The others differ" if named else "The segments do not move alike"
+        return Verdict.UNLIKE, f"{lead}: {shapes}."
+    subject = "the others" if named else "the segments"
+    return Verdict.OPEN, f"No difference between {subject} could be shown."
+
+
+def _everyone(facts: Facts) -> bool:
+    return set(facts.commanded) <= set(facts.findings.compared)
+
+
+def _shapes(facts: Facts) -> str:
+    """The largest shape of lag and of gain of each plane."""
+    planes = {joint.plane for joint in facts.joints if joint.gain.value is not None}
+    clauses: list[str] = []
+    chains = dict.fromkeys((each.plane, each.group) for each in facts.findings.shape)
+    for plane, group in sorted(chains):
+        word = _joints_word(plane, planes)
+        for quantity in ("lag", "gain"):
+            own = [
+                each
+                for each in facts.findings.shape
+                if (each.plane, each.group, each.quantity) == (plane, group, quantity)
+                and abs(each.value) >= _NEGLIGIBLE[quantity]
+            ]
+            shaped = [each for each in own if each.kind != "each"]
+            ends = [each for each in shaped if each.kind == "ends"]
+            clauses += [_shape(each, word) for each in (ends or shaped or own)[:1]]
+    return "; ".join(clauses)
+
+
+def _shape(shape: Shape, joints: str) -> str:
+    """One shape with its simultaneous interval."""
+    sign = -1.0 if shape.value < 0 else 1.0
+    low, high = sorted(sign * end for end in shape.ci95)
+    size = Estimate(sign * shape.value, (low, high))
+    lag = shape.quantity == "lag"
+    text = (
+        formats.estimate(formats.degrees(size), "°", most=2)
+        if lag
+        else formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+    )
+    if shape.kind == "ends":
+        late = f"the middle {joints}" if sign < 0 else f"the {joints} at the ends"
+        other = "the ends" if sign < 0 else "the middle"
+        return (
+            f"{late} lag {text} more than {other}"
+            if lag
+            else (
+                f"the gain of {late} is {text} {'more' if sign > 0 else 'less'}"
+                if sign > 0
+                else f"the gain at the ends is {text} less than in the middle"
+            )
+        )
+    if shape.kind == "trend":
+        grows = "grows" if sign > 0 else "falls"
+        return f"the {shape.quantity} of the {joints} {grows} by {text} from head to tail"
+    if shape.kind == "mirror":
+        more = "more" if sign > 0 else "less"
+        verb = "lag" if lag else "have"
+        tail = f"{text} {more}" if lag else f"{text} {more} gain"
+        return f"the outer {joints} {verb} {tail} than the inner ones, alike on both sides"
+    name = formats.plain(shape.joint or "")
+    more = "more" if sign > 0 else "less"
+    return (
+        f"each of the {joints} has a {shape.quantity} of its own, most so {name} "
+        f"with {text} {more} than the others"
+    )
+
+
+def _joints_word(plane: str, planes: set[str | None]) -> str:
+    """What to call the joints of a plane."""
     words = {"horizontal": "yaw joints", "vertical": "pitch joints"}
-    return words.get(str(next(iter(planes))), "joints") if len(planes) == 1 else "joints"
+    del planes
+    return words.get(plane, "joints")
 
 
-def _extremes(analysis: Analysis, known: Sequence[JointResult]) -> str:
-    frequency = formats.estimate(analysis.gait.frequency_hz, " Hz", most=4)
-    text = f"{len(known)} of {len(analysis.joints)} joints respond to a gait of {frequency}"
-    lags = [j for j in known if j.lag_rad.value is not None]
+def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
+    """How many joints respond, to which gait, and the range of their lags."""
+    if facts.gait.frequency_hz.value is None:
+        return _why_not(facts, "no gait")
+    frequency = formats.estimate(facts.gait.frequency_hz, " Hz", most=4)
+    silent = {each.joint for each in facts.not_following}
+    responding = [joint for joint in known if joint.name not in silent]
+    text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"
+    lags = [joint for joint in responding if joint.lag_rad.value is not None]
     if lags:
-        first = min(lags, key=lambda j: j.lag_rad.value or 0.0)
-        last = max(lags, key=lambda j: j.lag_rad.value or 0.0)
+        first = min(lags, key=lambda joint: joint.lag_rad.value or 0.0)
+        last = max(lags, key=lambda joint: joint.lag_rad.value or 0.0)
         text += "; lag runs from " + " to ".join(
             f"{formats.number(math.degrees(j.lag_rad.value or 0.0), 1)}° ({formats.plain(j.name)})"
             for j in (first, last)
         )
-    return text + "."
+    evidence = [
+        f" {formats.capital(f'{formats.plain(each.joint)} {each.evidence}')}."
+        for each in facts.not_following[:NAMED]
+        if each.kinds != ("lost_samples",)
+    ]
+    return text + "." + "".join(evidence)
 
 
-def _caveat(analysis: Analysis) -> str:
-    named = [f"{formats.plain(j.name)} ({', '.join(j.flags)})" for j in analysis.joints if j.flags]
+def _caveat(joints: Sequence[JointResult]) -> str:
+    named = [f"{formats.plain(j.name)} ({', '.join(j.flags)})" for j in joints if j.flags]
     if not named:
         return ""
-    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
-    return f" Flagged, see the table of joints: {', '.join(named[:_NAMED])}{more}."
+    more = f" and {len(named) - _FLAGGED} more" if len(named) > _FLAGGED else ""
+    return f" Flagged, see the table of joints: {', '.join(named[:_FLAGGED])}{more}."
 
 
-def _why_not(analysis: Analysis, lacking: str) -> str:
+def _why_not(facts: Facts, lacking: str) -> str:
     """The warning that says what is lacking, or else speaks of a gait, or the first."""
-    if not analysis.warnings:
+    if not facts.warnings:
         return "The result gives no reason."
-    verdict = [one for one in analysis.warnings if lacking in one and "held still" not in one]
-    about = [warning for warning in analysis.warnings if "gait" in warning.lower()]
-    return formats.sentence((verdict or about or analysis.warnings)[0])
+    verdict = [one for one in facts.warnings if lacking in one and "held still" not in one]
+    about = [warning for warning in facts.warnings if "gait" in warning.lower()]
+    return formats.sentence((verdict or about or facts.warnings)[0])

@@ -272,11 +272,22 @@ def sentence(text: str) -> str:
     Returns:
         Plain text.
     """
-    known = plain(text).strip().rstrip(".")
-    first = known.partition(" ")[0]
-    if not any(c in "._/\\" or c.isdigit() for c in first):
-        known = known[:1].upper() + known[1:]
-    return known + "."
+    return capital(plain(text).strip().rstrip(".")) + "."
+
+
+def capital(text: str) -> str:
+    """Text with a capital at its beginning; a name keeps its own letters.
+
+    Args:
+        text: Plain text.
+
+    Returns:
+        The text.
+    """
+    first = text.partition(" ")[0]
+    if any(c in "._/\\" or c.isdigit() for c in first):
+        return text
+    return text[:1].upper() + text[1:]
 
 
 def _forbidden(code: int) -> bool:

@@ -19,7 +19,6 @@ from ..results.analysis import (
     JointResult,
 )
 from . import formats
-from .answer import answer
 from .lines import more_lines
 
 _SPARE: list[tuple[str, ...]] = [
@@ -103,7 +102,7 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         Several lines, the last one ended.
     """
     text, prose, wide = sheet(width, color=color)
-    name, told = Path(analysis.session.path).name, answer(analysis)
+    name, told = Path(analysis.session.path).name, analysis.answer
     prose.print(f"{name}: {told.sentence}", style="bold", markup=False)
     prose.print(told.detail, markup=False)
     tables: list[tuple[Table, list[tuple[str, ...]]]] = [(_joint_table(analysis), _SPARE)]

@@ -1,0 +1,1 @@
+"""Which segments respond differently, and in which shape the rest differs."""

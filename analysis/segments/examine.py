@@ -1,0 +1,198 @@
+"""The joints that stand out and the shape of the rest, over all planes of a session."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
+from ..response import Response
+from ..results.answer import Shape, StandOut
+from .family import LEVEL, critical_value, scatter_of
+from .profile import (
+    MIN_JOINTS,
+    Contrast,
+    Deviation,
+    Profile,
+    contrasts,
+    family_of,
+    standing_out,
+)
+
+_MARGINS = {"gain": EQUIVALENT_GAIN, "lag": EQUIVALENT_LAG_RAD}
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Joints that are compared with each other: one plane and one rhythm.
+
+    Attributes:
+        plane: ``horizontal``, ``vertical`` or ``chain``.
+        group: Index of the rhythm group.
+        commanded: Names of all commanded joints of it, head to tail.
+        names: Those of them that are compared, in the same order, m of them.
+        response: Of these, shape (m,), with errors.
+    """
+
+    plane: str
+    group: int
+    commanded: tuple[str, ...]
+    names: tuple[str, ...]
+    response: Response
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the comparison of the joints shows.
+
+    Attributes:
+        stand_out: Joints that stand out, worst first.
+        shape: Shapes of the rest whose simultaneous interval excludes zero, largest first.
+        undecided: Planes in which joints differ and which one can't be decided.
+        alike: Whether the rest of the compared joints is shown to be alike; None where it isn't.
+        compared: Names of the joints that were compared.
+    """
+
+    stand_out: tuple[StandOut, ...] = ()
+    shape: tuple[Shape, ...] = ()
+    undecided: tuple[str, ...] = ()
+    alike: bool | None = None
+    compared: tuple[str, ...] = ()
+
+
+def examine(chains: Iterable[Chain]) -> Findings:
+    """Compare the joints of each chain with each other.
+
+    Args:
+        chains: One a plane and rhythm; those of fewer than two joints are left out.
+
+    Returns:
+        The findings, all of one family-wise level.
+    """
+    some = [each for each in chains if len(each.names) > 1 and each.response.errors is not None]
+    profiles = [
+        (chain, quantity, profile_of(chain, quantity)) for chain in some for quantity in _MARGINS
+    ]
+    critical = critical_value([family_of(profile) for _, _, profile in profiles], LEVEL)
+    out: list[StandOut] = []
+    shapes: list[Shape] = []
+    undecided: dict[str, None] = {}
+    excluded: dict[int, set[int]] = {id(chain): set() for chain in some}
+    for chain, quantity, profile in profiles:
+        if len(chain.names) < MIN_JOINTS:
+            continue
+        for each in standing_out(profile, critical):
+            excluded[id(chain)].add(each.joint)
+            out.append(_stand_out(chain, quantity, each, critical))
+    for chain, quantity, profile in profiles:
+        active = np.ones(len(chain.names), dtype=np.bool_)
+        active[list(excluded[id(chain)])] = False
+        found = [
+            each for each in contrasts(profile, active) if abs(each.value) > critical * each.error
+        ]
+        if len(chain.names) < MIN_JOINTS:
+            if found:
+                undecided[chain.plane] = None
+            continue
+        shapes += [_shape(chain, quantity, each, critical) for each in found]
+    alike = bool(some) and all(_alike(chain, excluded[id(chain)]) for chain in some)
+    out.sort(key=lambda each: -abs(each.deviation) / _MARGINS[each.quantity])
+    return Findings(
+        stand_out=_ranked(out),
+        shape=tuple(sorted(shapes, key=lambda each: -abs(each.value) / _MARGINS[each.quantity])),
+        undecided=tuple(undecided),
+        alike=True if alike else None,
+        compared=tuple(name for chain in some for name in chain.names),
+    )
+
+
+def profile_of(chain: Chain, quantity: str) -> Profile:
+    """The profile of one quantity along a chain.
+
+    Args:
+        chain: The chain.
+        quantity: ``gain`` (as its logarithm) or ``lag``.
+
+    Returns:
+        The profile; lags lie within pi of their circular mean.
+
+    Raises:
+        ValueError: If the response carries no errors.
+    """
+    response = chain.response
+    if response.errors is None:
+        raise ValueError("the response carries no errors to judge contrasts by")
+    gains, lags = scatter_of(response.errors)
+    place = np.array([chain.commanded.index(name) for name in chain.names], dtype=np.float64)
+    if quantity == "gain":
+        values = np.asarray(np.log(response.gain), dtype=np.float64)
+        scatter = gains
+    else:
+        mean = np.angle(np.mean(np.exp(1j * response.lag_rad)))
+        turned = mean + np.angle(np.exp(1j * (response.lag_rad - mean)))
+        values = np.asarray(turned, dtype=np.float64)
+        scatter = lags
+    margin = math.log1p(_MARGINS["gain"]) if quantity == "gain" else _MARGINS["lag"]
+    return Profile(place, len(chain.commanded), values, scatter, margin)
+
+
+def _alike(chain: Chain, excluded: set[int]) -> bool:
+    """Whether the equivalence tests of gain and lag pass for the rest of a chain."""
+    index = [k for k in range(len(chain.names)) if k not in excluded]
+    if len(index) < 2:
+        return False
+    m = len(index)
+    rows = np.eye(m) - 1 / m
+    for quantity, margin in _MARGINS.items():
+        profile = profile_of(chain, quantity)
+        values = profile.values[index]
+        scatter = profile.scatter.select(index)
+        error = np.sqrt(scatter.variance(rows))
+        dof = float(scatter.columns.shape[1])
+        deviation = values - values.mean()
+        if quantity == "gain":
+            deviation = np.expm1(deviation)
+        if equivalence_p(deviation, error, dof, margin) >= LEVEL:
+            return False
+    return True
+
+
+def _interval(value: float, half: float, quantity: str) -> tuple[float, tuple[float, float]]:
+    if quantity == "gain":
+        return math.expm1(value), (math.expm1(value - half), math.expm1(value + half))
+    return value, (value - half, value + half)
+
+
+def _stand_out(chain: Chain, quantity: str, each: Deviation, critical: float) -> StandOut:
+    value, ci95 = _interval(each.value, critical * each.error, quantity)
+    name = chain.names[each.joint]
+    return StandOut(name, chain.plane, chain.group, 0, quantity, value, ci95)
+
+
+def _shape(chain: Chain, quantity: str, each: Contrast, critical: float) -> Shape:
+    value, ci95 = _interval(each.value, critical * each.error, quantity)
+    joint = None if each.joint is None else chain.names[each.joint]
+    return Shape(each.kind, quantity, chain.plane, chain.group, value, ci95, joint)
+
+
+def _ranked(out: Sequence[StandOut]) -> tuple[StandOut, ...]:
+    """Joints ranked by their largest deviation; both quantities of a joint have its rank."""
+    ranks: Mapping[str, int] = {
+        name: k for k, name in enumerate(dict.fromkeys(each.joint for each in out), start=1)
+    }
+    ranked = [
+        StandOut(
+            each.joint,
+            each.plane,
+            each.group,
+            ranks[each.joint],
+            each.quantity,
+            each.deviation,
+            each.ci95,
+        )
+        for each in out
+    ]
+    return tuple(sorted(ranked, key=lambda each: each.rank))

@@ -1,0 +1,169 @@
+"""A session's answer: its joints' faults, the comparison of the rest, and the words for both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from capture import Session
+from capture.following import Fault, JointMotion, joints_not_following
+from capture.following.motion import Samples
+from capture.following.session import samples_of
+from capture.log.signals import Signal
+from capture.robot import Robot
+
+from ..fitting import GaitFit
+from ..gait import DRIVEN_SHARE
+from ..reading import Columns, by_plane
+from ..results.analysis import JointResult
+from ..results.answer import NotFollowing
+from ..results.artefact import Artefact
+from ..windows import Stretch
+from .examine import Chain, Findings, examine
+
+_COMPARABLE = {"lost_samples"}
+"""A joint with these faults alone still takes part in the comparison."""
+
+_OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ("position", "wrapped"): ("wrapped_sensor",),
+    ("position", "wrong_unit"): ("scaled_sensor",),
+    ("position", "scale_mismatch"): ("scaled_sensor",),
+    ("position", "clipped"): ("at_limit", "clipped_sensor"),
+    ("effort", "stalled"): ("stalled", "jammed"),
+    ("current", "stalled"): ("stalled", "jammed"),
+}
+"""Artefacts that mean that a joint does not follow, or can't be seen to: kinds that fit."""
+
+_WHOLE = 0.95
+"""Share of the analysed time above which a fault holds throughout."""
+
+
+def commanded_joints(columns: Columns) -> tuple[str, ...]:
+    """Joints whose command moves.
+
+    Args:
+        columns: The session's columns.
+
+    Returns:
+        Names, head to tail: those whose command moves more than ``DRIVEN_SHARE`` of the largest.
+    """
+    swing = {
+        name: float(np.nanmax(signal.values) - np.nanmin(signal.values))
+        for name, signal in columns.command.items()
+        if np.isfinite(signal.values).any()
+    }
+    least = DRIVEN_SHARE * max(swing.values(), default=0.0)
+    return tuple(name for name in columns.names if swing.get(name, 0.0) > least)
+
+
+def faults_of(session: Session, columns: Columns, window: Stretch) -> tuple[Fault, ...]:
+    """Joints that do not follow their command in a window.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        window: What is looked at.
+
+    Returns:
+        The faults, times from the session's start, in chain order.
+    """
+    robot = session.robot
+    limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
+    empty = Samples(np.zeros(0), np.zeros(0))
+
+    def samples(signals: Mapping[str, Signal], name: str) -> Samples | None:
+        signal = signals.get(name)
+        if signal is None:
+            return None
+        i, j = np.searchsorted(signal.t_ns, (window.start_ns, window.stop_ns)).tolist()
+        part = Signal(signal.name, signal.unit, signal.t_ns[i:j], signal.values[i:j])
+        return samples_of(part, session.start_ns)
+
+    motions: list[JointMotion] = []
+    for name in columns.names:
+        command = samples(columns.command, name)
+        if command is None:
+            continue
+        effort = samples(columns.effort, name)
+        motions.append(
+            JointMotion(
+                name=name,
+                command=command,
+                position=samples(columns.position, name) or empty,
+                velocity=samples(columns.velocity, name),
+                effort=effort if effort is not None else samples(columns.current, name),
+                reference=samples(columns.reference, name),
+                limits=limits.get(name),
+            )
+        )
+    return joints_not_following(motions)
+
+
+def not_following(
+    faults: Iterable[Fault], artefacts: Iterable[Artefact], names: tuple[str, ...]
+) -> tuple[NotFollowing, ...]:
+    """Join faults with the artefacts that falsify a joint's position.
+
+    Args:
+        faults: Of the analysed window.
+        artefacts: Of the same.
+        names: All joints, in chain order.
+
+    Returns:
+        One entry a joint, in chain order.
+    """
+    found = {
+        each.joint: NotFollowing(
+            each.joint, each.kinds, each.since_s, each.until_s, each.share, each.evidence
+        )
+        for each in faults
+    }
+    for artefact in artefacts:
+        kinds = _OF_FLAG.get((artefact.quantity, artefact.flag))
+        if kinds is None:
+            continue
+        had = found.get(artefact.joint)
+        if had is None:
+            since = artefact.spans_s[0][0] if artefact.spans_s else None
+            until = artefact.spans_s[-1][1] if artefact.spans_s else None
+            text = f"{artefact.quantity} {artefact.flag}"
+            text += f" ({artefact.note})" if artefact.note else ""
+            share = 1.0 if since is None else 0.0
+            found[artefact.joint] = NotFollowing(artefact.joint, kinds, since, until, share, text)
+    return tuple(found[name] for name in names if name in found)
+
+
+def compare_joints(
+    robot: Robot | None,
+    gait: GaitFit | None,
+    joints: Iterable[JointResult],
+    faulty: Iterable[NotFollowing],
+    commanded: tuple[str, ...],
+) -> Findings:
+    """Compare the sound joints with each other.
+
+    Args:
+        robot: The robot, or None; then all joints are one chain.
+        gait: The fitted gait, or None.
+        joints: The joints' results.
+        faulty: Joints that do not follow.
+        commanded: Joints whose command moves.
+
+    Returns:
+        The findings; none without a gait.
+    """
+    if gait is None or gait.response is None:
+        return Findings()
+    out = {each.joint for each in faulty if set(each.kinds) - _COMPARABLE}
+    results = list(joints)
+    sound = {j.name for j in results if j.lag_rad.value is not None and j.name not in out}
+    old = {j.name for j in results if j.name in sound and "stale" in j.flags}
+    if old != sound:  # where all samples are late by a hold, that makes no difference
+        sound -= old
+    chains: list[Chain] = []
+    for plane, names in by_plane(robot, commanded).items():
+        own = [name for name in names if name in sound and name in gait.answered]
+        response = gait.response.select([gait.answered.index(name) for name in own])
+        chains.append(Chain(plane, 0, tuple(names), tuple(own), response))
+    return examine(chains)
