@@ -208,7 +208,7 @@ def draw(
         gain = gain * (1 + rng.uniform(-0.03, 0.03) * ends + rng.uniform(-0.03, 0.03) * trend)
         lag = lag + np.radians(rng.uniform(-3, 3) * ends + rng.uniform(-3, 3) * trend)
     n = round(duration * rate)
-    jitter = rng.choice([0.0, 0.05, 0.15]) / rate
+    jitter = rng.choice([0.0, 0.05, 0.1]) / rate  # no interval may look like a lost sample
     clock = np.arange(n) / rate + np.clip(rng.normal(0.0, 1.0, n), -2, 2) * jitter
     clock = clock - clock[0]
     skew = rng.uniform(0.0, 0.5 / rate, m) if per_servo else np.zeros(m)
