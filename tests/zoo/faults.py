@@ -585,29 +585,63 @@ def _(robot, rng, j):
     return (Change(j, position=position),), _responds(j, RESPONSE)
 
 
+def _grown(robot, j, rng, make):
+    """The position that an operator makes, its size grown until the response shows it.
+
+    Flat tops at the reversals change the fundamental by little: a size that is large as a share
+    of the motion may leave gain and lag within the margins.
+    """
+    half = robot.half(j)[0]
+    size = rng.uniform(0.08, 0.3)
+    while size < 1.0:
+        position = make(size * robot.swing(j))
+        ratio = _fundamental(robot, j, position) / _fundamental(robot, j, robot.moved(j))
+        if (
+            abs(abs(ratio) - 1) > max(3 * half, MARGIN_GAIN + 2 * half)
+            or abs(np.angle(ratio)) > max(3 * half, MARGIN_RAD + 2 * half)
+        ):  # fmt: skip
+            break
+        size *= 1.2
+    return position
+
+
+def _fundamental(robot, j, values):
+    """Complex amplitude at the gait frequency, by least squares."""
+    angle = robot.omega * robot.t_s[:, j]
+    model = np.stack([np.cos(angle), np.sin(angle), np.ones(angle.size)], axis=1)
+    (cosine, sine, _), *_ = np.linalg.lstsq(model, values)
+    return complex(cosine, -sine)
+
+
 @fault("backlash")
 def _(robot, rng, j):
     """Flat for a moment at both reversals, then in step again."""
-    half = max(rng.uniform(0.08, 0.3), _relative(robot, j, rng, 0.1)) * robot.swing(j)
     moved = robot.moved(j)
-    position = moved.copy()
-    for k in range(1, len(moved)):
-        position[k] = np.clip(position[k - 1], moved[k] - half, moved[k] + half)
-    return (Change(j, position=position),), _responds(j, RESPONSE)
+
+    def play(half):
+        position = moved.copy()
+        for k in range(1, len(moved)):
+            position[k] = np.clip(position[k - 1], moved[k] - half, moved[k] + half)
+        return position
+
+    return (Change(j, position=_grown(robot, j, rng, play)),), _responds(j, RESPONSE)
 
 
 @fault("sticks at both reversals")
 def _(robot, rng, j):
     """Flat for a moment at both reversals, then a jump."""
-    band = max(rng.uniform(0.1, 0.35), _relative(robot, j, rng, 0.1)) * robot.swing(j)
     moved = robot.moved(j)
-    position, moves = moved.copy(), True
-    for k in range(1, len(moved)):
-        if moves and k > 1 and (moved[k] - moved[k - 1]) * (moved[k - 1] - moved[k - 2]) < 0:
-            moves = False
-        moves = moves or abs(moved[k] - position[k - 1]) > band
-        position[k] = moved[k] if moves else position[k - 1]
-    return (Change(j, position=position),), _responds(j, RESPONSE)
+
+    def stuck(band):
+        position, moves = moved.copy(), True
+        for k in range(2, len(moved)):
+            if moves and (moved[k] - moved[k - 1]) * (moved[k - 1] - moved[k - 2]) < 0:
+                moves = False
+            moves = moves or abs(moved[k] - position[k - 1]) > band
+            position[k] = moved[k] if moves else position[k - 1]
+        return position
+
+    return (Change(j, position=_grown(robot, j, rng, stuck)),), _responds(j, RESPONSE)
 
 
 # -- several, few, none --------------------------------------------------------------------------
