@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
-from analysis.analyse import measure_session
+from analysis.analyse import analyse_session
 from analysis.compare.compare import Choices, compare_sessions
-from analysis.cycles import cycle_maps
 from analysis.report import render
 from analysis.results.answer import Answer
 from analysis.stretch import Options
@@ -95,13 +94,12 @@ def statements(
 def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[str, Statement]:
     found: dict[str, Statement] = {}
     with Session.open(path) as session:
-        measured = measure_session(session, options)
-        analysis = measured.analysis
+        analysis = analyse_session(session, options)
         if "answer" in outputs:
             found["answer"] = structured(analysis.answer)
         if "page" in outputs:
-            page = render(analysis, session, cycle_maps(measured))
-            found["page"] = Statement(_plain(_heading(page)))
+            # Without signals and maps, whose drawing takes half of the time.
+            found["page"] = Statement(_plain(_heading(render(analysis))))
         if "rerun" in outputs:
             text = markdown(session, analysis, notes=(), colors="", content=EMPTY, has_cycles=False)
             found["rerun"] = Statement(text.split("\n\n")[0])
