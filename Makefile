@@ -73,6 +73,7 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/live_lag.py
 	$(BIN)/python bench/one_hour.py
 	$(BIN)/python bench/analyse_hour.py
+	$(BIN)/python bench/analyse_hour.py --adaptive
 	$(BIN)/python bench/twin_step.py
 	$(BIN)/python bench/replay_convert.py --minutes 5
 	$(BIN)/python bench/replay_merge.py

@@ -162,10 +162,15 @@ def _gait_runs(session: Session, chosen: Stretch, settle_s: float, warn: Warn) -
         warn(f"{GAIT_TOPIC} names no plane's omega: it can't be used to find steady stretches")
         return []
     t_ns, values = logged.t_ns[0], np.stack(logged.values, axis=-1)
+    start_ns = session.start_ns
+    fastest = float(np.nanmax(np.abs(values[:, omegas]), initial=0.0)) / (2 * math.pi)
+    if fastest <= 0:
+        return []
     for ignore in ((), ("offset",)):
         found: list[Stretch] = []
-        for run in steady_runs(t_ns, logged.names, values, ignore):
-            part = settled(run, session.start_ns, settle_s)
+        least_s = (MIN_CYCLES - 1) / fastest  # each run's own frequency decides below
+        for run in steady_runs(t_ns, logged.names, values, ignore, least_s=least_s):
+            part = settled(run, start_ns, settle_s)
             part = part.intersect(chosen.start_ns, chosen.stop_ns)
             row = int(np.searchsorted(t_ns, run.start_ns))
             frequency = max(abs(float(values[row, k])) for k in omegas) / (2 * math.pi)

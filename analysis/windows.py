@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -80,7 +79,12 @@ def covered(times_ns: Sequence[IntArray]) -> Stretch | None:
 
 
 def steady_runs(
-    t_ns: IntArray, names: Sequence[str], values: FloatArray, ignore: Sequence[str] = ()
+    t_ns: IntArray,
+    names: Sequence[str],
+    values: FloatArray,
+    ignore: Sequence[str] = (),
+    *,
+    least_s: float = 0.0,
 ) -> list[Stretch]:
     """Stretches over which the logged gait parameters stay as they are.
 
@@ -89,6 +93,7 @@ def steady_runs(
         names: Names such as ``horizontal.A``, shape (k,).
         values: Shape (n, k).
         ignore: Values that may change, e.g. ``offset``.
+        least_s: Shorter runs are left out [s]; an adaptive gait has one for each sample.
 
     Returns:
         Runs in order of time; each ends with the first sample that differs, the last one an
@@ -104,10 +109,12 @@ def steady_runs(
         if np.any(step):
             size = np.abs(steady)
             changed |= step > _SAME * np.maximum(size[1:], size[:-1]) + 1e-12
-    edges = [0, *(np.flatnonzero(changed) + 1).tolist(), t_ns.size]
+    edges = np.concatenate([[0], np.flatnonzero(changed) + 1, [t_ns.size]])
     interval = int(np.median(np.diff(t_ns))) if t_ns.size > 1 else 1
-    stops = np.append(t_ns, t_ns[-1] + interval)
-    return [Stretch(int(t_ns[i]), int(stops[j])) for i, j in pairwise(edges)]
+    starts, stops = t_ns[edges[:-1]], np.append(t_ns, t_ns[-1] + interval)[edges[1:]]
+    kept_runs = stops - starts >= least_s * _NS
+    pairs = zip(starts[kept_runs].tolist(), stops[kept_runs].tolist(), strict=True)
+    return [Stretch(start, stop) for start, stop in pairs]
 
 
 def settled(run: Stretch, session_start_ns: int, settle_s: float) -> Stretch:

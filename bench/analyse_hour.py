@@ -4,10 +4,14 @@ Each command runs as a process of its own, as a user starts it: wall-clock time 
 and the peak of its resident memory, mapped file included. Processor time is printed beside, which
 other processes disturb less. The file is in the page cache; the best of several runs counts.
 
+With --adaptive amplitude and frequency of the gait vary all the time, so that each sample of the
+logged gait begins a new run. The bars are the same.
+
 Writing the hour takes longer than measuring it: with --keep the session stays where it is, and the
 next run with the same file measures it again.
 
-Run: python bench/analyse_hour.py [--minutes 60] [--runs 2] [--folder DIR | --keep FILE]
+Run: python bench/analyse_hour.py [--minutes 60] [--runs 2] [--adaptive]
+                                  [--folder DIR | --keep FILE]
 """
 
 from __future__ import annotations
@@ -67,13 +71,14 @@ def verdict(what: str, value: float, bar: float, unit: str) -> bool:
     return good
 
 
-def measure(path: Path, part: float, runs: int) -> bool:
+def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bool:
     """Run both verbs and print; whether all bars are met.
 
     Args:
         path: The session.
         part: Its length over an hour; the bars of time shrink with it.
         runs: Of each verb.
+        adaptive: Whether its gait varies all the time.
 
     Returns:
         Whether all bars are met.
@@ -81,7 +86,7 @@ def measure(path: Path, part: float, runs: int) -> bool:
     page = path.with_suffix(".html")
     analysed = [cost("analyse", str(path)) for _ in range(runs)]
     reported = [cost("report", str(path), "-o", str(page), "--force") for _ in range(runs)]
-    length = f"{part * 60:g} min"
+    length = f"{part * 60:g} min{', adaptive' if adaptive else ''}"
     good: list[bool] = []
     for verb, costs, bar in (("analyse", analysed, ANALYSE_S), ("report", reported, REPORT_S)):
         best = min(costs)
@@ -98,11 +103,11 @@ def measure(path: Path, part: float, runs: int) -> bool:
     return all(good)
 
 
-def write(path: Path, seconds: int) -> None:
+def write(path: Path, seconds: int, *, adaptive: bool = False) -> None:
     """Write the session in another process, so that its memory is not this one's."""
     code = (
         "import sys; from pathlib import Path; from hour_session import write_session; "
-        "write_session(Path(sys.argv[1]), int(sys.argv[2]), can=False)"
+        f"write_session(Path(sys.argv[1]), int(sys.argv[2]), can=False, adaptive={adaptive})"
     )
     folder = Path(__file__).parent
     subprocess.run([sys.executable, "-c", code, str(path), str(seconds)], check=True, cwd=folder)
@@ -115,6 +120,7 @@ def main() -> None:
     )
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--runs", type=int, default=2)
+    parser.add_argument("--adaptive", action="store_true", help="a gait that varies all the time")
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--folder", type=Path, help="a folder with 1 GB to spare")
     place.add_argument("--keep", type=Path, help="the session, written if it is not there")
@@ -123,8 +129,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
         if not path.exists():
-            write(path, seconds)
-        good = measure(path, seconds / HOUR_S, options.runs)
+            write(path, seconds, adaptive=options.adaptive)
+        good = measure(path, seconds / HOUR_S, options.runs, adaptive=options.adaptive)
     sys.exit(0 if good else 1)
 
 

@@ -16,6 +16,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +46,11 @@ BUS = "/can/can0"
 
 _OMEGA = 2 * np.pi * 0.5
 _LAG = np.pi / 3
+_AMPLITUDE = 0.4
+_LARGER, _LARGER_S = 0.15, 61.0
+_FASTER, _FASTER_S = 0.1, 47.0
+"""An adaptive gait's amplitude and frequency vary by these parts, in these times [s]."""
+
 _COMMAND_SLOTS = np.arange(0, 50, 2)
 _STATE_SLOTS = np.arange(1, 50, 2)
 _VOLTAGE_SLOTS = np.arange(50, 75)
@@ -115,12 +121,47 @@ def _packed(values: IntArray) -> IntArray:
     return ((values & 0xFFFF) << shifts).sum(axis=-1)
 
 
-def blocks(seconds: int, seed: int = 1) -> Iterator[Block]:
+class Wave(NamedTuple):
+    """The gait at some times.
+
+    Attributes:
+        amplitude: Of each joint [rad], shape (n,).
+        omega: Angular frequency [rad/s], shape (n,).
+        phase: Of the first joint, the integral of ``omega`` [rad], shape (n,).
+    """
+
+    amplitude: FloatArray
+    omega: FloatArray
+    phase: FloatArray
+
+
+def wave_at(t: FloatArray, *, adaptive: bool) -> Wave:
+    """Return the gait at some times.
+
+    Args:
+        t: Since the session's start [s], shape (n,).
+        adaptive: Whether amplitude and frequency vary, so that no two samples have the same.
+
+    Returns:
+        The gait.
+    """
+    if not adaptive:
+        return Wave(np.full_like(t, _AMPLITUDE), np.full_like(t, _OMEGA), _OMEGA * t)
+    slow, fast = 2 * np.pi / _LARGER_S, 2 * np.pi / _FASTER_S
+    return Wave(
+        _AMPLITUDE * (1 + _LARGER * np.sin(slow * t)),
+        _OMEGA * (1 + _FASTER * np.sin(fast * t)),
+        _OMEGA * (t + _FASTER / fast * (1 - np.cos(fast * t))),
+    )
+
+
+def blocks(seconds: int, seed: int = 1, *, adaptive: bool = False) -> Iterator[Block]:
     """Seconds of a snake on its way: a travelling wave, noise, and the parts' resolution.
 
     Args:
         seconds: How many.
         seed: Of the noise.
+        adaptive: Whether the gait varies all the time, see :func:`wave_at`.
 
     Yields:
         One block a second.
@@ -134,10 +175,12 @@ def blocks(seconds: int, seed: int = 1) -> Iterator[Block]:
         device_ns = EPOCH_NS + slots + jitter_ns
         latency_ns = 40_000 + rng.gamma(4.0, 2500.0, slots.shape)
         t = tick[:, None] * 0.01
-        phase = _OMEGA * t + k * _LAG
-        wave, slope = 0.4 * np.sin(phase), 0.4 * _OMEGA * np.cos(phase)
+        size, omega, turned = wave_at(t, adaptive=adaptive)
+        phase = turned + k * _LAG
+        wave, slope = size * np.sin(phase), size * omega * np.cos(phase)
         shape = wave.shape
-        late, late_slope = 0.38 * np.sin(phase - 0.12), 0.38 * _OMEGA * np.cos(phase - 0.12)
+        late = 0.95 * size * np.sin(phase - 0.12)
+        late_slope = 0.95 * size * omega * np.cos(phase - 0.12)
         counts = np.rint((late + rng.normal(0, 3e-4, shape)) * 4096 / (2 * np.pi))  # 12 bit
         torque = 120 * np.sin(phase - 0.3) + 25 * np.sign(slope) + rng.normal(0, 4, shape)
         current = np.abs(torque) + 30 + rng.normal(0, 5, shape)
@@ -180,14 +223,18 @@ def _ranges(rng: np.random.Generator, t: FloatArray) -> IntArray:
 class Recording:
     """Writes blocks to the topics of the log contract."""
 
-    def __init__(self, writer: SessionWriter, robot: Robot, *, can: bool) -> None:
+    def __init__(
+        self, writer: SessionWriter, robot: Robot, *, can: bool, adaptive: bool = False
+    ) -> None:
         """Open all channels.
 
         Args:
             writer: The session.
             robot: The 25-joint snake.
             can: Whether the raw frames are kept.
+            adaptive: Whether the gait varies all the time, as that of the blocks.
         """
+        self._adaptive = adaptive
         names = robot.joint_names
         joint = writer.joint_state
         self._commands = joint("/joint_commands", names, unit="rad")
@@ -273,8 +320,9 @@ class Recording:
         t = (self._seconds * TICKS + np.arange(TICKS)) * 0.01
         noise = self._random.normal
         gait = np.zeros((TICKS, 10))
-        gait[:, [0, 1, 2]] = 0.4, _OMEGA, _LAG
-        gait[:, 4] = (_OMEGA * t) % (2 * np.pi)
+        gait[:, 0], gait[:, 1], turned = wave_at(t, adaptive=self._adaptive)
+        gait[:, 2] = _LAG
+        gait[:, 4] = turned % (2 * np.pi)
         links = np.arange(26)
         heading = 0.3 * np.sin(_OMEGA * t[:, None] + links * _LAG)
         spots = np.zeros((TICKS, 26, 3))
@@ -292,7 +340,12 @@ _GAIT = ("A", "omega", "lag", "offset", "phase")
 
 
 def write_session(
-    path: Path, seconds: int, *, can: bool, progress: Callable[[int], None] | None = None
+    path: Path,
+    seconds: int,
+    *,
+    can: bool,
+    adaptive: bool = False,
+    progress: Callable[[int], None] | None = None,
 ) -> None:
     """Write a session.
 
@@ -300,14 +353,15 @@ def write_session(
         path: The file to make.
         seconds: How long it is.
         can: Whether the raw frames are kept.
-        progress: Told the seconds written so far.
+        adaptive: Whether the gait's amplitude and frequency vary all the time.
+        progress: Called with the seconds written so far.
     """
     robot = load_robot("snake25")
     with contextlib.closing(
         SessionWriter(path, session_id="one-hour", epoch_ns=EPOCH_NS, robot=robot)
     ) as writer:
-        recording = Recording(writer, robot, can=can)
-        for second, block in enumerate(blocks(seconds), start=1):
+        recording = Recording(writer, robot, can=can, adaptive=adaptive)
+        for second, block in enumerate(blocks(seconds, adaptive=adaptive), start=1):
             recording.write(block)
             if progress is not None:
                 progress(second)

@@ -1,22 +1,46 @@
 """The tables of docs/estimators.md: lag and gain by our fit and by three common ways.
 
-``.venv/bin/python docs/estimator_tables.py`` prints them as Markdown; it takes about a minute.
+``.venv/bin/python docs/estimator_tables.py`` prints them as Markdown; it takes about a minute;
+with ``--quick`` some seconds, with few draws, only to see that it runs.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 
 import numpy as np
 from scipy.signal import correlate, correlation_lags, hilbert, lfilter
 
-from analysis.estimators.harmonic import fit_shared
+from analysis.estimators.harmonic import fit_at, fit_shared
 from analysis.estimators.series import Series
-from analysis.estimators.spectrum import Noise, residual_noise
+from analysis.estimators.spectrum import Noise, residual_noise, residual_spectrum
 from analysis.response import respond, t_factor
 
 GAIN, LAG = 0.9, 0.2
 """Truth: gain, and lag [rad]."""
+
+STEP = 2 * np.pi / 4096
+"""Of an encoder with 12 bits: 0.088 degrees [rad]."""
+
+ROUNDED = {
+    "0.5 Hz at 50 Hz, any mean": {},
+    "0.5 Hz at 50 Hz, mean zero": {"mean": 0.0},
+    "0.5 Hz at 50 Hz, mean half a step": {"mean": STEP / 2},
+    "the same, 10.4 cycles": {"mean": 0.0, "cycles": 10.4},
+    "the same, command rounded as well": {"mean": 0.0, "command_too": True},
+    "the same, all waves begin at a sample": {"mean": 0.0, "command_too": True, "phase": 0.0},
+    "the same, noise of 0.2 steps": {"mean": 0.0, "sigma": 0.2 * STEP},
+    "the same, noise of 1 step": {"mean": 0.0, "sigma": STEP},
+    "the same, harmonics left unfitted": {"mean": 0.0, "fifth": 0.003},
+    "steps of 1 degree, mean zero": {"mean": 0.0, "step": np.radians(1)},
+    "amplitude of 5 to 20 steps, mean zero": {"mean": 0.0, "step": 0.04},
+    "0.5 Hz at 10 Hz, mean zero": {"mean": 0.0, "rate": 10.0},
+    "0.833 Hz at 50 Hz, mean zero": {"mean": 0.0, "frequency": 5 / 6},
+    "0.5003 Hz at 50 Hz, any mean": {"frequency": 0.5003},
+    "0.97 Hz at 50 Hz, any mean": {"frequency": 0.97},
+}
+"""Cases of rounded responses: what differs from the first."""
 
 
 def sampled(
@@ -149,11 +173,84 @@ def coverage(cycles, ar, *, draws=4000, seed=1, **more):
     return inside.mean(axis=1)
 
 
+def rounded(
+    *,
+    draws=1000,
+    seed=1,
+    frequency=0.5,
+    rate=50.0,
+    cycles=10.0,
+    step=STEP,
+    mean=None,
+    phase=None,
+    sigma=0.0,
+    fifth=0.0,
+    command_too=False,
+):
+    """Coverage and width of 95 % intervals where position is rounded to steps.
+
+    Args:
+        draws: Responses, each with its own amplitude (0.2 to 0.8 rad), phase and lag.
+        seed: Of the generator.
+        frequency: Of the gait [Hz].
+        rate: Samples a second.
+        cycles: Length of the record.
+        step: Of the encoder [rad].
+        mean: Of the responses [rad]; any if None.
+        phase: Of the commands [rad]; any if None.
+        sigma: Noise before rounding [rad].
+        fifth: Of a fourth and a fifth harmonic, which aren't fitted, as a share of the amplitude.
+        command_too: Whether the command is rounded as well; else it is exact.
+
+    Returns:
+        Shares covered, (2,): of lag and of gain; the same from the residual alone, (2,); and
+        median half width over RMS error, (2,), both times the amplitude.
+    """
+    random = np.random.default_rng(seed)
+    count = round(cycles / frequency * rate)
+    t = (np.arange(count) - count // 2) / rate
+    omega = 2 * np.pi * frequency
+    size = random.uniform(0.2, 0.8, (draws, 1))
+    turned = random.uniform(-np.pi, np.pi, (draws, 1)) if phase is None else phase
+    lag = random.uniform(0.1, 0.4, (draws, 1))
+    level = random.uniform(-0.3, 0.3, (draws, 1)) if mean is None else mean
+    wave = omega * t + turned - lag
+    more = fifth * (np.sin(5 * wave + 2) + np.cos(4 * wave))
+    answer = GAIN * size * (np.sin(wave) + more) + level
+    answer = step * np.rint((answer + sigma * random.normal(size=answer.shape)) / step)
+    command = size * np.sin(omega * t + turned)
+    command = step * np.rint(command / step) if command_too else command
+    series = [Series("q", t, one) for one in (*command, *answer)]
+    fit = fit_at(series, omega)
+    noise, bins = residual_spectrum(series, fit)
+    level = np.mean(np.abs(bins.values) ** 2, axis=1)
+    dof = np.full(level.size, 2.0 * bins.offset.size)
+    alone = Noise(level, dof, (bins.spread * level / 2)[:, None, None] * np.eye(2))
+    covered = []
+    for one in (alone, noise):
+        parts = [
+            Noise(one.level[k], one.dof[k], one.covariance[k])
+            for k in (slice(draws), slice(draws, None))
+        ]
+        found = respond(fit.fundamental[:draws], parts[0], fit.fundamental[draws:], parts[1])
+        error = np.array([found.lag_rad - lag[:, 0], np.log(found.gain / GAIN)])
+        factor = np.array([t_factor(dof) for dof in found.dof])
+        half = factor * np.sqrt([found.lag_variance, found.log_gain_variance])
+        covered.append(np.mean(np.abs(error) <= half, axis=1))
+    width = np.median(half * size[:, 0], axis=1) / np.sqrt(
+        np.mean((error * size[:, 0]) ** 2, axis=1)
+    )
+    return covered[1], covered[0], width
+
+
 def main():
     """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few draws")
+    draws = {"draws": 40} if parser.parse_args().quick else {}
     print("| estimator | lag: bias | sd | RMSE / bound | gain: RMSE / bound | 95 % covers | time |")
     print("|---|---|---|---|---|---|---|")
-    for name, (bias, sd, lag, gain, covered, took) in compared().items():
+    for name, (bias, sd, lag, gain, covered, took) in compared(**draws).items():
         held = "none given" if covered is None else f"{100 * covered:.1f} %"
         print(
             f"| {name} | {bias:.4f}° | {sd:.4f}° | {lag:.2f} | {gain:.2f} | {held} | "
@@ -162,9 +259,17 @@ def main():
     print("\n| cycles | white: lag | gain | AR(0.9): lag | gain | AR(0.9), 20 % lost: lag | gain |")
     print("|---|---|---|---|---|---|---|")
     for cycles in (7.0, 7.4, 10.0, 20.0):
-        parts = [coverage(cycles, 0.0), coverage(cycles, 0.9), coverage(cycles, 0.9, lost=0.2)]
+        kinds = ({"ar": 0.0}, {"ar": 0.9}, {"ar": 0.9, "lost": 0.2})
+        parts = [coverage(cycles, **kind, **draws) for kind in kinds]
         cells = " | ".join(f"{100 * one:.1f} %" for part in parts for one in part)
         print(f"| {cycles:g} | {cells} |")
+    columns = ("lag", "gain", "half width / RMSE: lag", "gain", "residual alone: lag", "gain")
+    print(f"\n| rounded to steps | {' | '.join(columns)} |")
+    print("|---|---|---|---|---|---|---|")
+    for name, case in ROUNDED.items():
+        covered, alone, width = rounded(**case)
+        both, few = (" | ".join(f"{100 * one:.1f} %" for one in part) for part in (covered, alone))
+        print(f"| {name} | {both} | {width[0]:.2f} | {width[1]:.2f} | {few} |")
 
 
 if __name__ == "__main__":

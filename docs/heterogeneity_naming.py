@@ -6,7 +6,7 @@ ground drawn at random. The twin's noise is on the encoders only, so the two run
 once, and the noise of 6 + 6 runs is drawn 100 times.
 
 ``.venv/bin/python docs/heterogeneity_naming.py`` prints it; it takes a quarter of an
-hour of one core.
+hour of one core. ``--quick``: one module of one chain of 13 joints, only to see that it runs.
 """
 
 from __future__ import annotations
@@ -82,14 +82,15 @@ def profile(scenario, weak, folder):
     return [one.name for one in joints], np.array(y)
 
 
-def cases(ways, weakened, folder):
-    """Every driven module but the middle one: share and rate of being found and named."""
+def cases(ways, weakened, folder, most=None):
+    """Every driven module but the middle one: share and rate of being found and named.
+
+    With ``most`` only so many of them.
+    """
     names, _ = profile(ways[0], (ways[0].robot.joints[0].name, 0.0), folder)
     middle = names[len(names) // 2] if len(names) % 2 else None
     for share in weakened:
-        for name in names:
-            if name == middle:
-                continue
+        for name in [one for one in names if one != middle][:most]:
             runs = [profile(way, (name, share), folder)[1] for way in ways]
             for scatter in SCATTER:
                 yield name, share, scatter, *rates(names, name, runs, np.radians(scatter))
@@ -108,11 +109,11 @@ def rates(names, weak, ways, scatter, *, runs=6, seed=1):
     return found / SETS, named / SETS
 
 
-def table(title, ways_of, weakened, folder):
+def table(title, ways_of, weakened, folder, most=None):
     """Print one row for each weakening and scatter: mean rates, and the worst case."""
     rows = defaultdict(list)
     for label, ways in ways_of:
-        for name, share, scatter, found, named in cases(ways, weakened, folder):
+        for name, share, scatter, found, named in cases(ways, weakened, folder, most):
             rows[share, scatter].append((named, found, f"{label} {name}".strip()))
     print(title)
     for (share, scatter), seen in sorted(rows.items(), reverse=True):
@@ -129,13 +130,17 @@ def main():
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=16, help="random chains of 13 joints")
-    draws = parser.parse_args().draws
+    parser.add_argument("--quick", action="store_true", help="one module of one random chain")
+    options = parser.parse_args()
+    draws, most = (1, 1) if options.quick else (options.draws, None)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        long = [("", tuple(load_scenario(way) for way in WAYS))]
-        table("25 joints, 12 modules", long, WEAKENED, folder)
+        if not options.quick:
+            long = [("", tuple(load_scenario(way) for way in WAYS))]
+            table("25 joints, 12 modules", long, WEAKENED, folder)
         short = ((f"draw {seed}", drawn(seed, folder)) for seed in range(1, draws + 1))
-        table("13 joints, 6 modules, random gaits, servos and ground", short, WEAKENED[:1], folder)
+        title = "13 joints, 6 modules, random gaits, servos and ground"
+        table(title, short, WEAKENED[:1], folder, most)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 """The figures of docs/heterogeneity.md: level and power of the reversal test.
 
 ``.venv/bin/python docs/heterogeneity_tables.py`` prints them; it takes about two minutes, most of
-it for eight runs of the 25-joint twin.
+it for eight runs of the 25-joint twin. With ``--quick`` few draws and one weakened servo, only to
+see that it runs.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import tempfile
 from pathlib import Path
@@ -126,19 +128,25 @@ def power(names, forward, reverse, scatter, *, runs=6, sets=500, seed=1):
 
 def main():
     """Print the tables."""
-    print("false positives at 5 %, 13 identical joints, 5000 experiments each")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few draws, one weakened servo")
+    quick = parser.parse_args().quick
+    sets = 100 if quick else 5000
+    print(f"false positives at 5 %, 13 identical joints, {sets} experiments each")
     for label, noise in (
         ("white noise", {}),
         ("AR(0.9) noise", {"ar": 0.9}),
         ("white, one joint three times as noisy", {"noisy": 2}),
     ):
-        print(f"  {label}: {100 * false_positives(13, **noise):.1f} %")
+        print(f"  {label}: {100 * false_positives(13, sets=sets, **noise):.1f} %")
     print(f"{WEAK} weakened; scatter of a run; difference found; {WEAK} named")
     with tempfile.TemporaryDirectory() as folder:
-        for weakened in (0.0, 0.05, 0.1, 0.2):
+        for weakened in (0.2,) if quick else (0.0, 0.05, 0.1, 0.2):
             (names, forward), (_, reverse) = (twin_profile(way, weakened, folder) for way in WAYS)
             for scatter in (0.05, 0.1, 0.3, 1.0):
-                found, named = power(names, forward, reverse, np.radians(scatter))
+                found, named = power(
+                    names, forward, reverse, np.radians(scatter), sets=20 if quick else 500
+                )
                 print(f"  {100 * weakened:3.0f} %  {scatter:4.2f}°  {found:6.1%}  {named:6.1%}")
 
 

@@ -3,13 +3,13 @@
 ``nice .venv/bin/python docs/oscillator_tables.py 5 9 13`` prints those of chains with so many yaw
 joints (every other joint is a yaw joint, as in snake25), ``13:1.5`` those with servos of 1.5 N m
 instead of 0.25 N m. Each chain takes 2 m + 6 runs of 20 s or more on the compiled twin: half a
-minute to one and a half.
+minute to one and a half. ``--quick`` takes 3 yaw joints, only to see that it runs.
 """
 
 from __future__ import annotations
 
+import argparse
 import runpy
-import sys
 import tempfile
 from pathlib import Path
 
@@ -18,12 +18,13 @@ import numpy as np
 from analysis.oscillators.comparator import homogeneous
 from analysis.oscillators.laplacian import spectrum
 
-shared = runpy.run_path(str(Path(__file__).parents[1] / "tests" / "analysis" / "closed_loop.py"))
+TESTS = Path(__file__).parents[1] / "tests" / "analysis" / "oscillators"
+shared = runpy.run_path(str(TESTS / "closed_loop.py"))
 
 HELD_OUT = (0.05, 0.1, 0.15)
 
 
-def told(m, stall):
+def print_chain(m, stall):
     """Print the figures of one chain."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -63,9 +64,13 @@ def coupling_lines(coupling):
 
 def main():
     """Print the figures of every chain that is asked for."""
-    for word in sys.argv[1:] or ("5",):
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("chains", nargs="*", help="yaw joints, or joints:stall torque [N m]")
+    parser.add_argument("--quick", action="store_true", help="a chain of 3 yaw joints")
+    options = parser.parse_args()
+    for word in options.chains or ("3" if options.quick else "5",):
         m, _, stall = word.partition(":")
-        told(int(m), float(stall or 0.25))
+        print_chain(int(m), float(stall or 0.25))
 
 
 if __name__ == "__main__":

@@ -2,11 +2,14 @@
 
 ``python docs/paper_figures.py out/paper docs/images``: runs each scenario that is not in the first
 folder yet, and writes one SVG a figure into the second. All that is drawn is read from the
-sessions, as anyone would read them.
+sessions, as anyone would read them. With ``--quick`` the runs are short and the figures
+meaningless, only to see that it runs.
 """
 
 from __future__ import annotations
 
+import argparse
+import dataclasses
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -36,6 +39,8 @@ STONE = "#c9cdd3"
 MODES = {"walk": "#e9ecef", "avoid": "#ffd8a8", "turn": "#b2f2bb", "shrink": "#d0bfff"}
 OTHER_MODE = "#ffc9c9"
 LAGS = ("pi2", "pi3")
+QUICK_S, QUICK_GAIT_S = 2.0, 8.0
+"""Durations of quick runs; those whose gait is analysed need three cycles of it."""
 ABOVE: dict[str, Any] = {
     "frameon": False,
     "fontsize": 8,
@@ -68,16 +73,17 @@ class Run:
     world: World
 
     def at(self, time_s: float) -> int:
-        """Index of the sample at a time."""
-        return int(np.searchsorted(self.t_s, time_s))
+        """Index of the sample at a time; of the last one after the end, as in a quick run."""
+        return min(int(np.searchsorted(self.t_s, time_s)), len(self.t_s) - 1)
 
 
 class Runs:
     """Runs scenarios, each once."""
 
-    def __init__(self, folder: Path) -> None:
-        """Keep sessions in a folder."""
+    def __init__(self, folder: Path, *, quick: bool = False) -> None:
+        """Keep sessions in a folder; short ones where it is to be quick."""
         self._folder = folder
+        self._quick = quick
         folder.mkdir(parents=True, exist_ok=True)
 
     def __call__(self, name: str) -> Run:
@@ -94,6 +100,9 @@ class Runs:
         path = self._folder / f"{name}.mcap"
         if not path.exists():
             scenario = load_scenario(name)
+            if self._quick:
+                duration_s = QUICK_GAIT_S if name.startswith("snake13-") else QUICK_S
+                scenario = dataclasses.replace(scenario, duration_s=duration_s, settle_s=0.0)
             print(f"running {name}, {scenario.duration_s:g} s ...", flush=True)
             record(scenario, path)
         return path
@@ -320,8 +329,15 @@ FIGURES: dict[str, Callable[[Runs], mpl.figure.Figure]] = {
 }
 
 
-def main(sessions: Path, images: Path) -> None:
+def main() -> None:
     """Draw all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sessions", type=Path, help="the folder of the sessions")
+    parser.add_argument("images", type=Path, help="the folder to write to")
+    parser.add_argument("--quick", action="store_true", help="short runs")
+    options = parser.parse_args()
     mpl.use("Agg")
     plt.rcParams |= {
         "svg.hashsalt": "undulog",
@@ -330,8 +346,9 @@ def main(sessions: Path, images: Path) -> None:
         "axes.spines.right": False,
         "figure.constrained_layout.use": True,
     }
+    images: Path = options.images
     images.mkdir(parents=True, exist_ok=True)
-    runs = Runs(sessions)
+    runs = Runs(options.sessions, quick=options.quick)
     for name, draw in FIGURES.items():
         path = images / f"{name}.svg"
         draw(runs).savefig(path, metadata={"Date": None})
@@ -339,4 +356,4 @@ def main(sessions: Path, images: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main()

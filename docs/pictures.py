@@ -2,9 +2,11 @@
 
 ``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
 screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the body's motion, and the
-report's first figure as a picture of its own that follows the reader's light or dark scheme.
+report's first figure as a picture of its own that follows the reader's light or dark scheme. With
+``--quick`` one tab and a small clip, only to see that it runs.
 """
 
+import argparse
 import io
 import re
 import sys
@@ -21,32 +23,49 @@ DEGREES = 90
 TITLE_BAR = 36
 """Height of the viewer's own title bar [pixels]; it warns of the software driver."""
 SIZE = (1440, 900 + TITLE_BAR)
-CLIP = ("--from", "12", "--to", "14", "--fps", "12", "--size", "720x406")
-"""One period of the gait, small enough for a page."""
+CLIP = ("--from", "12", "--to", "14")
+"""One period of the gait."""
+SMALL = ("--fps", "12", "--size", "720x406")
+"""Small enough for a page."""
+QUICK = ("--fps", "2", "--size", "320x180")
 TABS = {"session": "replay", "cycles": "replay-cycles", "mean-cycle": "replay-mean-cycle"}
 
 
-def replay_pictures(demo: Path, images: Path) -> None:
-    """The viewer at one instant of the session, each tab in front once."""
-    for tab, name in TABS.items():
-        with tempfile.TemporaryDirectory() as folder, HeadlessViewer(SIZE) as viewer:
-            recording = Path(folder) / "tab.rrd"
-            words = ["--result", demo / "result.json", "--tab", tab, "--save", recording]
-            if undulog.run(["view", *map(str, (demo / "session.mcap", *words))]):
-                sys.exit(f"no recording of {demo / 'session.mcap'}")
-            viewer.open(recording, SECONDS)
-            if tab == "mean-cycle":
-                viewer.seek_phase(DEGREES)
-            for complaint in viewer.complaints():
-                print(complaint)
-            picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
-        shown = picture.crop((0, TITLE_BAR, *picture.size))
-        shown.save(images / f"{name}.png", optimize=True)
+def window_picture(
+    recording: Path, target: Path, seconds: float, *, degrees: int | None = None
+) -> None:
+    """Draw the viewer's window at one instant of a recording.
+
+    Args:
+        recording: The .rrd file.
+        target: The PNG to write.
+        seconds: Place on ``session_time`` [s].
+        degrees: Place in the mean cycle, where that is in front.
+    """
+    with HeadlessViewer(SIZE) as viewer:
+        viewer.open(recording, seconds)
+        if degrees is not None:
+            viewer.seek_phase(degrees)
+        for complaint in viewer.complaints():
+            print(complaint)
+        picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
+    picture.crop((0, TITLE_BAR, *picture.size)).save(target, optimize=True)
 
 
-def clip(demo: Path, target: Path) -> None:
-    """The body's motion over one period."""
-    words = [demo / "session.mcap", "--clip", target, *CLIP, "--force"]
+def replay_picture(demo: Path, images: Path, tab: str) -> None:
+    """Draw the viewer at one instant of the session, one tab in front."""
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / "tab.rrd"
+        words = ["--result", demo / "result.json", "--tab", tab, "--save", recording]
+        if undulog.run(["view", *map(str, (demo / "session.mcap", *words))]):
+            sys.exit(f"no recording of {demo / 'session.mcap'}")
+        degrees = DEGREES if tab == "mean-cycle" else None
+        window_picture(recording, images / f"{TABS[tab]}.png", SECONDS, degrees=degrees)
+
+
+def clip(demo: Path, target: Path, *size: str) -> None:
+    """Write the body's motion over one period."""
+    words = [demo / "session.mcap", "--clip", target, *CLIP, *size, "--force"]
     if undulog.run(["view", *map(str, words)]):
         sys.exit(f"no clip of {demo / 'session.mcap'}")
 
@@ -68,15 +87,24 @@ def response_picture(page: Path, target: Path) -> None:
     target.write_text(f"{opening}>{style}{rest}\n", encoding="utf-8")
 
 
-def main(demo: Path, images: Path) -> None:
+def main() -> None:
     """Make them all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("demo", type=Path, help="what `make demo` left")
+    parser.add_argument("images", type=Path, help="the folder to write to")
+    parser.add_argument("--quick", action="store_true", help="one tab and a small clip")
+    options = parser.parse_args()
+    images: Path = options.images
     images.mkdir(parents=True, exist_ok=True)
-    replay_pictures(demo, images)
-    clip(demo, images / "clip.gif")
-    response_picture(demo / "report.html", images / "response.svg")
+    for tab in list(TABS)[-1:] if options.quick else TABS:
+        replay_picture(options.demo, images, tab)
+    clip(options.demo, images / "clip.gif", *(QUICK if options.quick else SMALL))
+    response_picture(options.demo / "report.html", images / "response.svg")
     for path in sorted(images.iterdir()):
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main()

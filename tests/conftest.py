@@ -1,5 +1,6 @@
 """What display tests share: a Chromium, or a skip that says so."""
 
+import ctypes.util
 import json
 import os
 import shutil
@@ -44,6 +45,20 @@ def chromium(display_tests_required):
         if path is not None:
             return path
     missing = f"no Chromium on the path (looked for {', '.join(NAMES)})"
+    if display_tests_required:
+        pytest.fail(f"{missing}, and {REQUIRE} is set")
+    pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")
+
+
+@pytest.fixture(scope="session")
+def vulkan(display_tests_required):
+    """Skips where there is no Vulkan driver, fails where one is required."""
+    folders = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
+    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    drivers = [file for folder in folders for file in folder.glob("*.json")]
+    if ctypes.util.find_library("vulkan") and (drivers or named):
+        return
+    missing = "no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)"
     if display_tests_required:
         pytest.fail(f"{missing}, and {REQUIRE} is set")
     pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")

@@ -32,14 +32,14 @@ class ResponseErrors:
         bins: Complex, shape (m, L), scaled so that E[e_i conj(e_j)] of the errors e of ln H of
             joints i and j is the mean over l of ``bins[i, l] * conj(bins[j, l])``. The real part
             of that is twice the covariance of their log gains and twice that of their lags.
-        own: Variance of ln|H|, and of arg H [rad^2], that is not in the bins and that no two
-            joints share, shape (m,).
+        rounding: Covariance of (ln|H|, arg H) that rounding to steps adds to what the bins show
+            and that no two joints share, shape (m, 2, 2).
         turn: Lag error that one standard error of the shared frequency makes [rad], shape (m,);
             it is the same error in all joints.
     """
 
     bins: ComplexArray
-    own: FloatArray
+    rounding: FloatArray
     turn: FloatArray
 
     def select(self, chosen: Sequence[int] | IntArray) -> ResponseErrors:
@@ -52,7 +52,7 @@ class ResponseErrors:
             Their errors.
         """
         index = np.asarray(chosen, dtype=np.int64)
-        return ResponseErrors(self.bins[index], self.own[index], self.turn[index])
+        return ResponseErrors(self.bins[index], self.rounding[index], self.turn[index])
 
 
 def response_errors(
@@ -78,15 +78,18 @@ def response_errors(
         The errors; NaN for a joint whose command or response is zero.
     """
     parts: list[ComplexArray] = []
+    rounding = np.zeros((response.size, 2, 2))
     for amplitude, found in ((response, response_bins), (command, command_bins)):
         known = np.abs(amplitude) > 0
-        scale = np.divide(
-            np.sqrt(found.spread), amplitude, out=np.full_like(amplitude, np.nan), where=known
-        )
-        parts.append(scale[:, None] * found.values)
-    count = response.size
-    turn = np.broadcast_to(omega_variance**0.5 * np.asarray(delay_between_s), (count,))
-    return ResponseErrors(parts[0] - parts[1], np.zeros(count), np.array(turn, dtype=np.float64))
+        inverse = np.full(amplitude.shape, np.nan, dtype=np.complex128)
+        np.divide(1.0, amplitude, out=inverse, where=known)
+        parts.append((inverse * np.sqrt(found.spread))[:, None] * found.values)
+        # Multiplied by 1/a, errors of (Re a, Im a) become those of (ln|a|, arg a).
+        turned = np.stack([inverse, 1j * inverse], axis=-1)
+        turned = np.stack([turned.real, turned.imag], axis=-2)
+        rounding += turned @ found.rounding @ turned.transpose(0, 2, 1)
+    turn = np.zeros(response.size) + omega_variance**0.5 * np.asarray(delay_between_s)
+    return ResponseErrors(parts[0] - parts[1], rounding, turn)
 
 
 def contrast_variance(errors: ResponseErrors, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -98,12 +101,9 @@ def contrast_variance(errors: ResponseErrors, weights: FloatArray) -> tuple[Floa
 
     Returns:
         Variance of sum_i w_i ln|H_i| and its degrees of freedom, each of shape (...). Bins have
-        two degrees of freedom each; what is not in them is known without error.
+        two degrees of freedom each; rounding is known without error.
     """
-    summed = weights @ errors.bins
-    found = np.mean(np.abs(summed) ** 2, axis=-1) / 2
-    dof = np.full(found.shape, 2.0 * errors.bins.shape[1])
-    return _with_known(found, dof, weights**2 @ errors.own)
+    return _variance(errors, weights, weights**2 @ errors.rounding[:, 0, 0])
 
 
 def lag_contrast_variance(
@@ -111,8 +111,8 @@ def lag_contrast_variance(
 ) -> tuple[FloatArray, FloatArray]:
     """Variance of weighted sums of the joints' lags.
 
-    It is that of the log gains, and what the error of the shared frequency adds where commands
-    and responses were sampled at different times.
+    But for rounding it is that of the log gains, and what the error of the shared frequency adds
+    where commands and responses were sampled at different times.
 
     Args:
         errors: Of m joints.
@@ -121,14 +121,15 @@ def lag_contrast_variance(
     Returns:
         Variance [rad^2] and its degrees of freedom, each of shape (...).
     """
-    found, dof = contrast_variance(errors, weights)
-    return _with_known(found, dof, (weights @ errors.turn) ** 2)
+    known = weights**2 @ errors.rounding[:, 1, 1] + (weights @ errors.turn) ** 2
+    return _variance(errors, weights, known)
 
 
-def _with_known(
-    found: FloatArray, dof: FloatArray, known: FloatArray
+def _variance(
+    errors: ResponseErrors, weights: FloatArray, known: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """An estimated variance plus a known one, and the degrees of freedom of the sum (Welch)."""
-    total = found + known
+    """The variance in the bins plus a known one, and the degrees of freedom of the sum (Welch)."""
+    found = np.mean(np.abs(weights @ errors.bins) ** 2, axis=-1) / 2
+    total = np.maximum(found + known, 0.0)
     share = np.divide(found, total, out=np.ones_like(found), where=total > 0)
-    return total, dof / np.maximum(share, 1e-6) ** 2
+    return total, 2.0 * errors.bins.shape[1] / np.clip(share, 1e-6, 1.0) ** 2

@@ -81,6 +81,22 @@ class HarmonicFit:
         ratio = np.divide(self.rss, self.total, out=np.ones_like(self.rss), where=moving)
         return np.clip(1 - ratio, 0.0, 1.0)
 
+    def parameters(self, channels: Sequence[int], scale: float) -> FloatArray:
+        """Coefficients of the basis rows of some channels.
+
+        Args:
+            channels: Their indices, k of them.
+            scale: Unit of the rows' scaled time [s].
+
+        Returns:
+            Trend in scaled time, then real and imaginary part of each harmonic, shape (k, p).
+        """
+        index = np.asarray(channels, dtype=np.int64)
+        trend = self.trend[index] * scale ** np.arange(self.model.trend + 1.0)
+        parts = self.amplitudes[index]
+        harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(index.size, -1)
+        return np.concatenate([trend, harmonic], axis=1)
+
     def predict(self, channel: int, t_s: FloatArray) -> FloatArray:
         """The fitted model of one channel.
 

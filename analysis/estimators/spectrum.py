@@ -26,6 +26,14 @@ from .harmonic_moments import (
     chunks,
     time_scale,
 )
+from .quantisation import (
+    DRAWS,
+    draws,
+    lattice_step,
+    not_negative,
+    rounding_covariance,
+    steady_noise,
+)
 from .series import Series, shared_times
 from .threads import in_threads
 
@@ -33,6 +41,9 @@ BINS_PER_SIDE = 6
 """At most six bins on either side: 24 degrees of freedom, whose t factor is 5 % above normal."""
 
 _BLOCKS = 4096
+
+RAISED = 1.3
+"""Rounding that alone makes this many times the noise found beside omega counts instead of it."""
 
 SAME_SPAN = 1.05
 """Records whose lengths differ by no more than this factor have the same bins."""
@@ -98,11 +109,14 @@ class ResidualBins:
         offset: nu_l [rad/s], in pairs +nu, -nu, shape (L,).
         spread: Trace of the covariance of (Re a, Im a) for a level of one, shape (K,): the mean
             of ``spread |value|^2`` is E|error of a|^2.
+        rounding: Covariance of (Re a, Im a) that rounding, to steps or of numbers, adds to what
+            the bins show, shape (K, 2, 2); it is counted as each channel's own.
     """
 
     values: ComplexArray
     offset: FloatArray
     spread: FloatArray
+    rounding: FloatArray
 
     def select(self, chosen: Sequence[int] | IntArray) -> ResidualBins:
         """Some of the channels.
@@ -114,7 +128,9 @@ class ResidualBins:
             Their bins.
         """
         index = np.asarray(chosen, dtype=np.int64)
-        return ResidualBins(self.values[index], self.offset, self.spread[index])
+        return ResidualBins(
+            self.values[index], self.offset, self.spread[index], self.rounding[index]
+        )
 
 
 def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
@@ -166,13 +182,44 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
         usable = own.usable()
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
-    rounding = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
-    level = np.maximum(level, rounding)
+    exact = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
+    floor = np.maximum(exact - level, 0.0)
+    level += floor
     first = fit.model.trend + 1
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
-    noise = Noise(level, dof, level[:, None, None] * block)
     spread = np.trace(block, axis1=1, axis2=2)
-    return noise, _common_bins(groups, [common for common, _ in found], shortest, spread)
+    covariance = level[:, None, None] * block
+    rounding = floor[:, None, None] * block
+    for k, rounded in _rounded(series, fit, level):
+        if np.trace(rounded) > RAISED * spread[k] * level[k]:
+            more = not_negative(rounded - covariance[k])
+            rounding[k] += more
+            covariance[k] += more
+            level[k] = np.trace(covariance[k]) / spread[k]
+            dof[k] = draws(series[k].count)
+    common = [common for common, _ in found]
+    return (
+        Noise(level, dof, covariance),
+        _common_bins(groups, common, shortest, spread, rounding),
+    )
+
+
+def _rounded(
+    series: Sequence[Series], fit: HarmonicFit, level: FloatArray
+) -> list[tuple[int, FloatArray]]:
+    """Channels whose rounding no noise makes white, and the covariance that it makes."""
+    found: list[tuple[int, float, float]] = []
+    for k, one in enumerate(series):
+        step = lattice_step(one.values)
+        noise = steady_noise(step, float(fit.rss[k] / fit.count[k]), float(level[k]))
+        if noise is not None:
+            found.append((k, step, noise))
+
+    def rounded(item: tuple[int, float, float]) -> tuple[int, FloatArray]:
+        k, step, noise = item
+        return k, rounding_covariance(series[k], fit, k, step, noise)
+
+    return in_threads(rounded, found, sum(DRAWS * series[k].count for k, *_ in found))
 
 
 def _common_bins(
@@ -180,6 +227,7 @@ def _common_bins(
     found: Sequence[_Demodulated],
     span: float,
     spread: FloatArray,
+    rounding: FloatArray,
 ) -> ResidualBins:
     """The bins of all groups in the order of the channels; a pair that a fit took is left out."""
     left = np.min([one.kept / one.count for one in found], axis=0)
@@ -190,7 +238,7 @@ def _common_bins(
         values[members] = one.transform[:, usable] / np.sqrt(one.kept[usable])
     offset: FloatArray = np.repeat(np.arange(1.0, pairs.size + 1), 2) * (2 * np.pi / span)
     offset[1::2] *= -1
-    return ResidualBins(values, offset[usable], spread)
+    return ResidualBins(values, offset[usable], spread, rounding)
 
 
 def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
@@ -247,7 +295,7 @@ def residuals(
     """
     t_s = group[0].t_s
     scale = time_scale(t_s)
-    theta = _parameters(fit, members, scale)
+    theta = fit.parameters(members, scale)
     first = fit.model.trend + 1
     wider = replace(fit.model, harmonics=fit.model.harmonics + 1)
     for part in chunks(t_s.size):
@@ -331,11 +379,3 @@ def _waves(t_s: FloatArray, spacing: float, side: int) -> ComplexArray:
         up = up * turn
         waves[2 * k], waves[2 * k + 1] = up, up.conj()
     return waves
-
-
-def _parameters(fit: HarmonicFit, members: Sequence[int], scale: float) -> FloatArray:
-    """Coefficients of the basis rows, shape (k, p)."""
-    trend = fit.trend[members] * scale ** np.arange(fit.model.trend + 1.0)
-    parts = fit.amplitudes[members]
-    harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(len(members), -1)
-    return np.concatenate([trend, harmonic], axis=1)

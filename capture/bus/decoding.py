@@ -23,7 +23,9 @@ from ..log.frames import (
     ID_MASK,
     REMOTE_FLAG,
     FrameArray,
+    identifier_text,
 )
+from ..log.undecoded import counts_text
 from ..robot import BusSignal, Direction, Quantity, Robot
 from ..units import SESSION_UNIT
 from .map_entry import MapEntry, bus_messages, compile_entry, frame_id
@@ -106,12 +108,12 @@ class FrameTally:
         if self.short:
             lines.append(
                 f"{self.short.total()} values missing from frames too short for them: "
-                f"{_counts(self.short)}"
+                f"{counts_text(self.short)}"
             )
         if self.undirected:
             lines.append(
                 f"{self.undirected.total()} frames not decoded, since only their direction tells "
-                f"what they are and the log has none: {_counts(self.undirected)}"
+                f"what they are and the log has none: {counts_text(self.undirected)}"
             )
         return lines
 
@@ -123,32 +125,14 @@ class FrameTally:
         if self.unknown:
             lines.append(
                 f"{self.unknown.total()} frames of identifiers that no database knows: "
-                f"{_counts(self.unknown)}"
+                f"{counts_text(self.unknown)}"
             )
         if self.silent:
             lines.append(
                 f"{self.silent.total()} frames of known identifiers with nothing that the map "
-                f"names: {_counts(self.silent)}"
+                f"names: {counts_text(self.silent)}"
             )
         return lines
-
-
-def _counts(counter: Counter[str], most: int = 8) -> str:
-    parts = [f"{name} ({count})" for name, count in counter.most_common(most)]
-    more = len(counter) - len(parts)
-    return ", ".join(parts) + (f" and {more} more" if more else "")
-
-
-def identifier_text(id_flags: int) -> str:
-    """An identifier as candump writes it: three hexadecimal digits, or eight if extended.
-
-    Args:
-        id_flags: Identifier with flags.
-
-    Returns:
-        E.g. ``14B`` or ``18FEF100``.
-    """
-    return f"{id_flags & ID_MASK:0{8 if id_flags & EXTENDED_FLAG else 3}X}"
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
@@ -10,13 +10,14 @@ import numpy as np
 
 from ..arrays import IntArray
 from ..bus.decoded_topics import DecodedTopics, Message
-from ..bus.decoding import BusDecoder, FrameTally
+from ..bus.decoding import BusDecoder, DecodedSignals, FrameTally
 from ..bus.frame_log import FrameLog, LogBlock
 from ..console import progress
 from ..errors import ImportFormatError
 from ..interruption import StopRequest
 from ..log.channels import FrameChannel
 from ..log.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
+from ..log.undecoded import undecoded
 from ..log.writer import SessionWriter
 from ..robot import Robot
 from .can_logs import log_suffix, open_frame_log
@@ -106,6 +107,7 @@ class _Import:
         self._other_buses: dict[str, int] = {}
         self._latest_ns: dict[str, int] = {}
         self._backward = 0
+        self._unseen = set(robot.joint_names)
 
     def add(self, block: LogBlock) -> None:
         messages: list[Message] = []
@@ -122,6 +124,7 @@ class _Import:
             elif self._decoder is not None and self._topics is not None:
                 samples, tally = self._decoder.decode(frames)
                 self._tally.add(tally)
+                self._unseen -= _targets(samples) if self._unseen else set()
                 messages += self._topics.add(samples)
         self._write(messages)
         self._note_times(block.times_ns())
@@ -135,11 +138,21 @@ class _Import:
             report.problems.append(f"{self._backward} frames are stamped before the one ahead")
         if self._decoder is None:
             report.problems.append(f"nothing decoded: the robot {report.robot} has no bus map")
-        report.notes += self._tally.notes()
+        elif (why := self._undecoded()) is not None:
+            report.problems.append(why)
+        else:
+            report.notes += self._tally.notes()
         for name, count in self._other_buses.items():
             report.notes.append(f"{count} frames of bus {name} kept raw, not decoded")
         if not log.directions:
             report.notes.append("the log has no directions: all frames count as received")
+
+    def _undecoded(self) -> str | None:
+        tally = self._tally
+        frames = tally.frames - tally.errors - tally.remote
+        others = tally.unknown + tally.silent
+        all_joints = not self._unseen
+        return undecoded(self._report.robot, tally.decoded, frames, others, all_joints=all_joints)
 
     def _write(self, messages: list[Message]) -> None:
         for message in sorted(messages, key=lambda message: message.sampled_ns):
@@ -172,3 +185,12 @@ class _Import:
 
 def _writing(channel: FrameChannel, frames: FrameArray) -> Callable[[int], None]:
     return lambda log_ns: channel.write(log_ns, frames)
+
+
+def _targets(samples: Iterable[DecodedSignals]) -> set[str]:
+    """The joints and sensors that have samples."""
+    found: set[str] = set()
+    for decoded in samples:
+        members: list[int] = np.unique(decoded.member).tolist()
+        found.update(decoded.signals[member].target for member in members)
+    return found

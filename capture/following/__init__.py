@@ -9,6 +9,5 @@ from __future__ import annotations
 from .fault import KINDS, Fault
 from .find import joints_not_following
 from .motion import JointMotion
-from .session import faults_in_session
 
-__all__ = ["KINDS", "Fault", "JointMotion", "faults_in_session", "joints_not_following"]
+__all__ = ["KINDS", "Fault", "JointMotion", "joints_not_following"]

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray
 from .fault import Span
 from .kinds import Symptom
-from .motion import JointMotion, Response, predicted
+from .motion import BLOCKS, JointMotion, Response, predicted
 
 FAR = 6.0
 """Robust standard deviations of the residual that make an excursion."""
@@ -26,6 +26,12 @@ SHORT = 0.04
 
 JOIN = 0.3
 """Excursions closer than this share of a cycle are one: a residual passes through zero."""
+
+HELD_WINDOWS = 2
+"""Windows in turn in which a joint that is held stands still."""
+
+LOADED_WINDOWS = 2 * BLOCKS + 1
+"""The same where its neighbours are held back, too."""
 
 HELD = 0.25
 """A joint that moves less than this share of what it should stands still."""
@@ -48,6 +54,12 @@ DRIFT_SHARE = 0.15
 
 DRIFT_RAD = float(np.radians(1.0))
 DRIFT_EXPLAINED = 0.6
+FEWEST = 12
+"""Windows that a drift needs."""
+
+AS_USUAL = 0.97
+"""Share of the usual explained share above which a window follows as usual."""
+
 TURN = 2 * np.pi
 
 
@@ -70,6 +82,49 @@ class Excursions:
     amplitude: float
     threshold: float
     spans_s: tuple[Span, ...]
+
+
+def find_holds(
+    motion: JointMotion, response: Response, still: BoolArray, *, loaded: bool
+) -> Symptom | None:
+    """Find the times at which a joint stands still for a cycle or more.
+
+    Args:
+        motion: The joint.
+        response: Its windowed response.
+        still: Windows in which it stands still, shape (w,).
+        loaded: Whether its neighbours are held back by a load: then it may be, for a while.
+
+    Returns:
+        The symptom with its spans, from the first to the last sample at the level of each hold;
+        None if it never stands still in two windows in turn.
+    """
+    position = motion.position
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
+    spans: list[Span] = []
+    levels: list[float] = []
+    for first, stop in edges.reshape(-1, 2).tolist():
+        if stop - first < (LOADED_WINDOWS if loaded else HELD_WINDOWS):
+            continue
+        i, j = np.searchsorted(
+            position.t_s, (response.start_s[first], response.stop_s[stop - 1])
+        ).tolist()
+        # The windows at the ends of a run may hold a part of the motion.
+        quarter = (j - i) // 4
+        core = position.values[i + quarter : j - quarter]
+        level = float(np.median(core))
+        moved = response.asked[first:stop].max() * 2**0.5
+        slack = max(4 * 1.4826 * float(np.median(np.abs(core - level))), 0.1 * float(moved))
+        away = np.abs(position.values - level) > slack
+        before, after = np.flatnonzero(away[: i + quarter]), np.flatnonzero(away[j - quarter :])
+        start = int(before[-1]) + 1 if before.size else 0
+        end = j - quarter + int(after[0]) - 1 if after.size else position.t_s.size - 1
+        spans.append((float(position.t_s[start]), float(position.t_s[end])))
+        levels.append(level)
+    if not spans:
+        return None
+    text = f"position constant at {np.degrees(levels[0]):.1f} degrees"
+    return Symptom("held", tuple(dict.fromkeys(spans)), text)
 
 
 def find_excursions(
@@ -113,13 +168,17 @@ def find_excursions(
     return Excursions(t_s, residual - centre, expected + centre, amplitude, threshold, long)
 
 
-def departures(response: Response, found: Excursions, alone: Sequence[bool]) -> list[Symptom]:
+def departures(
+    response: Response, found: Excursions, alone: Sequence[bool], *, loaded: bool
+) -> list[Symptom]:
     """Describe what a joint does in each of its departures.
 
     Args:
         response: The joint's windowed response.
         found: All its departures.
         alone: Of each, whether no other joint departs at the same time.
+        loaded: Whether its neighbours are held back by a load: then it may be, for a while.
+        loaded: Whether its neighbours are held back by a load: then it may be, for a while.
 
     Returns:
         One symptom a kind of departure.
@@ -132,7 +191,16 @@ def departures(response: Response, found: Excursions, alone: Sequence[bool]) -> 
         kind, text = _described(found, span, end, response.period_s)
         if kind in ("astray", "opposite") and (span[1] < settled or not own):
             continue  # the start of the motion, or something that happened to the body
-        by_kind.setdefault(kind, []).append(span)
+        if kind in ("astray", "noisy") and _coherent(response, span):
+            continue  # it follows there, with another gain or lag
+        if kind == "held" and loaded:
+            continue
+        if kind == "stepped" and span[0] < settled < span[1]:
+            # The usual zero is that of the longer part: the step is where this part ends.
+            by_kind.setdefault(kind, []).append((span[1], end))
+            text = text.replace("off by", "was off by")
+        else:
+            by_kind.setdefault(kind, []).append(span)
         texts.setdefault(kind, text)
     if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s):
         del by_kind["astray"]
@@ -140,6 +208,15 @@ def departures(response: Response, found: Excursions, alone: Sequence[bool]) -> 
     if not found.spans_s and (drift := _drift(response, found)):
         symptoms.append(drift)
     return symptoms
+
+
+def _coherent(response: Response, span: Span) -> bool:
+    """Whether the windows around a departure follow the command as closely as usual."""
+    near = (response.start_s < span[1]) & (response.stop_s > span[0]) & response.valid
+    if not near.any():
+        return False
+    usual = float(np.median(response.explained[response.valid]))
+    return float(np.min(response.explained[near])) > AS_USUAL * usual
 
 
 def _lasting(spans: Sequence[Span], period_s: float) -> bool:
@@ -178,19 +255,34 @@ def _described(found: Excursions, span: Span, end: float, period_s: float) -> tu
 
 
 def _drift(response: Response, found: Excursions) -> Symptom | None:
-    """A zero that moves steadily over the record."""
-    valid = response.valid
-    if np.count_nonzero(valid) < 12:
+    """A zero that moves over the record: by a step, or steadily."""
+    valid = response.valid & (response.explained > 0.5)
+    if np.count_nonzero(valid) < FEWEST:
         return None
     t_s, offset = (response.start_s + response.stop_s)[valid] / 2, response.offset[valid]
-    centred = t_s - t_s.mean()
-    slope = float(centred @ (offset - offset.mean()) / (centred @ centred))
-    total = slope * float(np.ptp(t_s))
-    rest = offset - offset.mean() - slope * centred
-    power = float(np.sum((offset - offset.mean()) ** 2))
-    explained = 1 - float(rest @ rest) / power if power > 0 else 0.0
+    spread = offset - offset.mean()
+    power = float(spread @ spread)
     least = max(DRIFT_SHARE * found.amplitude, DRIFT_RAD)
-    if abs(total) < least or explained < DRIFT_EXPLAINED:
+    count = np.arange(1, offset.size)
+    before = np.cumsum(spread)[:-1] / count
+    after = -np.cumsum(spread)[:-1] / (offset.size - count)
+    by_step = count * before**2 + (offset.size - count) * after**2
+    split = int(np.argmax(by_step))
+    centred = t_s - t_s.mean()
+    slope = float(centred @ spread / (centred @ centred))
+    by_ramp = slope**2 * float(centred @ centred)
+    inside = min(split + 1, offset.size - split - 1) >= BLOCKS
+    if inside and by_step[split] > max(by_ramp, DRIFT_EXPLAINED * power):
+        size = float(after[split] - before[split])
+        if abs(size) < least:
+            return None
+        # The windows around a step hold parts of both: it lies in their middle.
+        at = float((t_s[split] + t_s[split + 1]) / 2)
+        return Symptom(
+            "stepped", ((at, float(found.t_s[-1])),), f"off by {np.degrees(size):+.1f} degrees"
+        )
+    total = slope * float(np.ptp(t_s))
+    if abs(total) < least or by_ramp < DRIFT_EXPLAINED * power:
         return None
     return Symptom("drifting", (), f"offset drifts by {np.degrees(total):+.1f} degrees")
 

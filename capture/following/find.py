@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .excursions import Excursions, departures, find_excursions
+from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span
 from .kinds import Symptom, fault_of
 from .motion import JointMotion, Response, cycle_s, windowed_response
-from .records import record_faults
+from .records import record_faults, wraps
 from .swaps import swapped_pairs
 
 DRIVEN_SHARE = 0.01
@@ -119,15 +119,26 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
         for k, (each, r) in enumerate(zip(driven, responses, strict=True))
     ]
     symptoms: dict[str, list[Symptom]] = {each.name: [] for each in motions}
+    for each in driven:
+        if (wrapped := wraps(each)) is not None:
+            symptoms[each.name].append(wrapped)
     for each in judged:
+        if symptoms[each.motion.name]:
+            continue
         symptoms[each.motion.name] += _from_windows(each, _coherence(judged, each))
+        if not symptoms[each.motion.name] and (
+            held := find_holds(
+                each.motion, each.response, each.still, loaded=abs(each.common) < LOADED
+            )
+        ):
+            symptoms[each.motion.name].append(held)
     for name, partner in swapped_pairs(judged, common).items():
         symptoms[name] = [Symptom("swapped", (), f"carries out the command of {partner}")]
     for name, found in _from_residuals(judged, symptoms).items():
         symptoms[name] += found
     for name, found in record_faults(motions).items():
         standing = {each.name for each in symptoms[name]} & {"still", "held"}
-        symptoms[name] += [each for each in found if not (standing and each.name == "stale")]
+        symptoms[name] += [] if standing else found
     by_name: Mapping[str, Judged] = {each.motion.name: each for each in judged}
     usual_effort = _usual_effort(judged)
     faults = (
@@ -264,7 +275,7 @@ def _coherence(judged: Sequence[Judged], each: Judged) -> float:
 def _from_residuals(
     judged: Sequence[Judged], symptoms: Mapping[str, Sequence[Symptom]]
 ) -> dict[str, list[Symptom]]:
-    """Times at which a joint leaves its own usual response, less those of many joints."""
+    """Times at which a joint leaves its own usual response, and no other joint does."""
     kept: list[tuple[Judged, Excursions]] = [
         (each, find_excursions(each.motion, each.response, each.follows, each.ratio, each.offset))
         for each in judged
@@ -274,7 +285,9 @@ def _from_residuals(
     result: dict[str, list[Symptom]] = {}
     for k, (each, found) in enumerate(kept):
         alone = [not _shared(span, spans, k) for span in found.spans_s]
-        result[each.motion.name] = departures(each.response, found, alone)
+        result[each.motion.name] = departures(
+            each.response, found, alone, loaded=abs(each.common) < LOADED
+        )
     return result
 
 
@@ -314,10 +327,10 @@ def _median(values: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> complex:
 
 
 def _usual_effort(judged: Sequence[Judged]) -> FloatArray:
-    """Root mean square effort of each joint that follows, shape (k,)."""
+    """Median absolute effort of each joint that follows, shape (k,)."""
     return np.array(
         [
-            float(np.sqrt(np.mean(each.motion.effort.values**2)))
+            float(np.median(np.abs(each.motion.effort.values)))
             for each in judged
             if each.motion.effort is not None and each.motion.effort.values.size and each.has_usual
         ]

@@ -40,8 +40,8 @@ LIMIT_SHARE = 0.02
 """Nearer to a limit than this share of the range is at it."""
 
 _KINDS: dict[str, tuple[str, ...]] = {
-    "still": ("dead", "jammed", "frozen_sensor"),
-    "held": ("jammed", "dead", "frozen_sensor"),
+    "still": ("dead", "jammed", "stalled", "frozen_sensor"),
+    "held": ("jammed", "dead", "stalled", "frozen_sensor"),
     "opposite": ("inverted", "inverted_sensor"),
     "incoherent": ("dead", "noisy_sensor"),
     "astray": ("intermittent",),
@@ -55,6 +55,8 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "stale": ("stale_sensor", "lost_samples"),
 }
 """Symptom to the kinds that fit where nothing else was recorded, the likeliest first."""
+
+_SENSOR = ("frozen_sensor", "stale_sensor")
 
 _PHRASES = {
     "still": "does not move with its command",
@@ -100,7 +102,7 @@ def fault_of(
         motion: The joint.
         judged: Its judged windows; None where it could not be judged.
         symptoms: What it shows, at least one.
-        usual_effort: Root mean square effort of the joints that follow, shape (k,).
+        usual_effort: Median absolute effort of the joints that follow, shape (k,).
 
     Returns:
         The fault.
@@ -114,7 +116,10 @@ def fault_of(
     if main.name in ("still", "held") and judged is not None:
         kinds, decided = _standing(motion, judged, main, usual_effort)
         if main.name == "held" and _again(main, begin, end):
-            kinds = ["intermittent", *(k for k in kinds if k != "dead")]
+            mechanical = [kind for kind in kinds if kind not in _SENSOR]
+            first = ["intermittent"] if mechanical else []
+            late = ["stale_sensor"] if "frozen_sensor" in kinds else []
+            kinds = [*first, *kinds, *late]
     elif main.name == "opposite":
         kinds, decided = _opposite(motion)
     elif main.name in ("stepped", "drifting"):
@@ -180,12 +185,15 @@ def _by_effort(
     inside = _inside(motion.effort.t_s, spans)
     here, outside = motion.effort.values[inside], motion.effort.values[~inside]
     own = main.spans_s and outside.size >= FEW_SAMPLES
-    usual = float(np.sqrt(np.mean(outside**2))) if own else _typical(usual_effort)
+    usual = float(np.median(np.abs(outside))) if own else _typical(usual_effort)
     if here.size < FEW_SAMPLES or not usual > 0:
         return kinds, ""
-    size = float(np.sqrt(np.mean(here**2)))
+    size = float(np.median(np.abs(here)))  # of a sine as large as its root mean square
     mean, spread = float(np.mean(here)), float(np.std(here))
     decided: tuple[list[str], str] = (kinds, "")
+    repeats = "frozen_sensor" in kinds
+    if repeats and np.count_nonzero(np.diff(here) == 0) > MOSTLY * here.size:
+        return [*kinds, "stale_sensor"], "its effort is constant to the bit, too"
     if size < NO_EFFORT * usual:
         decided = ["dead"], "its effort is near zero"
     elif abs(mean) > 0.5 * usual and spread < CONSTANT * abs(mean):
@@ -193,6 +201,8 @@ def _by_effort(
     elif size > PUSHING * usual:
         text = f"its effort is {size / usual:.1f} times the usual one"
         decided = ["jammed", "stalled"], text
+    elif repeats and size > 0.5 * usual:
+        decided = ["frozen_sensor"], "its effort goes on as usual"
     if at_limit and decided[1]:
         decided = ["at_limit", *decided[0]], decided[1]
     return decided

@@ -184,18 +184,24 @@ def _solved(
     ] * np.eye(2)
     gram[~valid] = np.eye(2)
     target = centred[:, :2, 2]
-    solved: FloatArray = np.linalg.solve(gram, target[:, :, None])
-    ab = solved[:, :, 0]
+    # Two unknowns in closed form (Cramer's rule).
+    (aa, ab), (_, bb) = gram[:, 0].T, gram[:, 1].T
+    determinant = aa * bb - ab**2
+    first = (bb * target[:, 0] - ab * target[:, 1]) / determinant
+    second = (aa * target[:, 1] - ab * target[:, 0]) / determinant
     power = centred[:, 2, 2]
     explained = np.divide(
-        np.sum(ab * target, axis=1), power, out=np.zeros_like(power), where=power > 0
+        first * target[:, 0] + second * target[:, 1],
+        power,
+        out=np.zeros_like(power),
+        where=power > 0,
     )
     starts = start + block * np.arange(len(moments), dtype=np.float64)
     return Response(
         start_s=starts,
         stop_s=starts + BLOCKS * block,
         valid=valid,
-        ratio=np.asarray(ab[:, 0] - 1j * ab[:, 1], dtype=np.complex128),
+        ratio=np.asarray(first - 1j * second, dtype=np.complex128),
         offset=mean[:, 2] - mean[:, 0] + shift,
         explained=np.clip(explained, 0.0, 1.0),
         spread=spread,

@@ -6,20 +6,41 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .fault import Span
 from .kinds import Symptom
 from .motion import JointMotion, Samples
 
 LOST_SHARE = 0.01
 """Share of a joint's samples that may be missing beyond what the joints have in common."""
 
-STALE_SHARE = 0.1
+STALE_SHARE = 0.15
 """Share of the fast samples that may repeat the one before, beyond what all joints do."""
+
+WRAP = 5.0
+"""A step so many times as large as the command's largest is no motion."""
+
+SAME_TURN = 0.1
+"""Steps of one counter differ by less than this, relative."""
+
+TURNS = (2 * np.pi, 4 * np.pi, np.pi, 300 * np.pi / 180, 360.0, 4096.0, 65536.0)
+"""Turns of counters: of a shaft, of half and double shafts, of a servo's range, in raw units."""
+
+MOSTLY = 0.8
+
+SILENT = 0.02
+"""A gap longer than this share of the record is a silence."""
+
+LONGEST = 8
+"""More repeats in turn than this are a joint that stands or a sensor that froze, not old values."""
 
 GAP = 1.8
 """An interval of so many median ones lacks a sample."""
 
 FAST = 0.5
-"""Fast samples: the command moves more than this share of its usual fast step."""
+"""Fast samples: the joint moves more than this share of its usual fast step."""
+
+AROUND = 4
+"""Samples on either side over which its motion is taken."""
 
 
 def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
@@ -40,7 +61,8 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     for each, missing, repeated in zip(sampled, lost, stale, strict=True):
         symptoms: list[Symptom] = []
         if missing > LOST_SHARE + 2 * usual_lost:
-            symptoms.append(Symptom("lost", (), f"{100 * missing:.2g} % of its samples missing"))
+            text = f"{100 * missing:.2g} % of its samples missing"
+            symptoms.append(Symptom("lost", _silences(each, missing), text))
         if repeated > STALE_SHARE + 2 * usual_stale:
             text = f"{100 * repeated:.2g} % of its samples repeat the one before"
             symptoms.append(Symptom("stale", (), text))
@@ -50,6 +72,37 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
         if each.position.t_s.size <= 2 < each.command.t_s.size and sampled:
             result[each.name] = [Symptom("lost", (), "no position was recorded")]
     return result
+
+
+def wraps(each: JointMotion) -> Symptom | None:
+    """Find the steps of a counter that wraps around.
+
+    Args:
+        each: The joint.
+
+    Returns:
+        The symptom, if steps of one size, both up and down or again and again, are larger than
+        the command ever moves between two samples and larger than half of its range.
+    """
+    samples = each.position
+    if samples.t_s.size < 16:
+        return None
+    step = np.diff(samples.values)
+    asked = float(np.abs(np.diff(each.command.at(samples.t_s))).max())
+    large = np.abs(step) > max(WRAP * asked, 0.5 * each.command.range)
+    sizes = np.abs(step[large])
+    if not 2 <= sizes.size <= 0.2 * step.size:
+        return None
+    turn = float(np.median(sizes))
+    near = np.abs(sizes / turn - 1) < SAME_TURN
+    known = min(abs(turn / size - 1) for size in TURNS) < SAME_TURN
+    if np.mean(near) < MOSTLY or not known:
+        return None
+    # A counter that wraps comes back: up and down steps cancel but for one.
+    balance = abs(float(np.sum(np.sign(step[large]))))
+    if balance > max(1.0, 0.2 * sizes.size):
+        return None
+    return Symptom("wrapped", (), f"{sizes.size} steps of {np.degrees(turn):.0f} degrees")
 
 
 def _lost(each: JointMotion) -> float:
@@ -66,16 +119,35 @@ def _lost(each: JointMotion) -> float:
     return absent / (samples.t_s.size + absent)
 
 
+def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:
+    """The gaps, where a few long ones hold most of what is missing; else none."""
+    t_s = each.position.t_s
+    step = np.diff(t_s)
+    length = float(t_s[-1] - t_s[0])
+    long = np.flatnonzero(step > SILENT * length)
+    if not long.size or float(step[long].sum()) < MOSTLY * missing * length:
+        return ()
+    return tuple(zip(t_s[long].tolist(), t_s[long + 1].tolist(), strict=True))
+
+
 def _repeats(each: JointMotion) -> float:
     """Share of the samples during fast motion that repeat the one before."""
     samples: Samples = each.position
-    expected = np.abs(np.diff(each.command.at(samples.t_s))) if each.command.t_s.size > 1 else None
-    step = np.abs(np.diff(samples.values))
+    values = samples.values
+    step = np.abs(np.diff(values))
     moved = step[step > 0]
-    if expected is None or moved.size < 10:
+    if moved.size < 10 or values.size < 4 * AROUND:
         return 0.0
-    least = max(2 * float(moved.min()), FAST * float(np.percentile(expected, 95)))
-    fast = expected > least
+    # Its own motion over a few samples: a joint that stands repeats its values rightly.
+    travel = np.abs(values[2 * AROUND :] - values[: -2 * AROUND]) / (2 * AROUND)
+    travel = np.pad(travel, (AROUND, AROUND - 1), mode="edge")
+    fast = travel > max(2 * float(moved.min()), FAST * float(np.percentile(travel, 95)))
     if np.count_nonzero(fast) < 20:
         return 0.0
-    return float(np.count_nonzero(fast & (step == 0)) / np.count_nonzero(fast))
+    repeated = step == 0
+    # A joint that stands repeats, too, and for longer.
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], repeated, [False])).astype(np.int8)))
+    for first, stop in edges.reshape(-1, 2).tolist():
+        if stop - first > LONGEST:
+            repeated[first:stop] = False
+    return float(np.count_nonzero(fast & repeated) / np.count_nonzero(fast))

@@ -8,6 +8,7 @@ from ..arrays import IntArray
 from .frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameArray, holds_fd
 from .measures import BusHealth
 from .tallies import NS, TimingTally
+from .undecoded import IdentifierTally
 
 
 def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
@@ -37,6 +38,9 @@ class BusTally:
 
     CAN FD frames are counted and timed. How long they are on the wire is not estimated: their data
     may have a bit rate of their own, which no session tells.
+
+    Attributes:
+        identifiers: The data frames by identifier.
     """
 
     def __init__(self, horizon_s: int | None = None) -> None:
@@ -46,6 +50,7 @@ class BusTally:
             horizon_s: Sum up seconds that are older than this against the newest [s]; None to
                 keep them all.
         """
+        self.identifiers = IdentifierTally()
         self._timing = TimingTally()
         self._errors = 0
         self._horizon_s = horizon_s
@@ -63,6 +68,7 @@ class BusTally:
         t_ns = frames["t_host_ns"].astype(np.int64)
         self._timing.add(t_ns)
         self._errors += int(((frames["id_flags"] & ERROR_FLAG) != 0).sum())
+        self.identifiers.add(frames)
         if holds_fd(frames):
             return
         fewest, most = frame_bits(frames)

@@ -222,3 +222,15 @@ def join_batches(
         joined[at[:, None] + np.arange(frames.shape[1])] = frames
         done += len(frames)
     return joined
+
+
+def identifier_text(id_flags: int) -> str:
+    """Return an identifier as candump writes it: three hexadecimal digits, or eight if extended.
+
+    Args:
+        id_flags: Identifier with flags.
+
+    Returns:
+        E.g. ``14B`` or ``18FEF100``.
+    """
+    return f"{id_flags & ID_MASK:0{8 if id_flags & EXTENDED_FLAG else 3}X}"

@@ -6,11 +6,12 @@ seconds of a live recording. Every threshold stands here by name, with why it is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 
+from ..following.fault import Fault
 from .frames import FRAME_TOPIC_PREFIXES, bus_of
 from .freeze import FROZEN_SAMPLES
+from .joined import Fault, Finding
 from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
 from .tallies import NS, PAUSE_PERIODS, PAUSE_S
 
@@ -58,19 +59,6 @@ RECORDER_TOPICS = ("/rosout", "/diagnostics", "/clock/")
 that was not read again repeats its last stamp. It has no rhythm that could be disturbed."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Something that was found.
-
-    Attributes:
-        weight: Index into :data:`VERDICTS`; 0 is worth knowing and no fault.
-        sentence: What, where, how much.
-    """
-
-    weight: int
-    sentence: str
-
-
 def judge_file(health: FileHealth) -> list[Finding]:
     """Findings on the container.
 
@@ -99,38 +87,33 @@ def judge_file(health: FileHealth) -> list[Finding]:
     return found
 
 
-def judge_channel(health: ChannelHealth) -> list[Finding]:
-    """Findings on one channel.
+def judge_channel(health: ChannelHealth) -> list[Fault]:
+    """Return what is wrong with one channel.
 
     Args:
         health: Its measures.
 
     Returns:
-        The findings.
+        The faults.
     """
-    found: list[Finding] = []
+    found: list[Fault] = []
+
+    def add(weight: int, text: str) -> None:
+        found.append(Fault(weight, health.topic, "", text))
+
     expected = health.count + (health.sequence.dropped or 0)
     if health.sequence.dropped:
         part = health.sequence.dropped / expected
-        found.append(
-            Finding(
-                2 if part >= BAD_LOSS else 1,
-                f"{health.topic}: {health.sequence.dropped} of {expected} messages were dropped "
-                f"({part:.2%}), as its sequence numbers prove",
-            )
+        add(
+            2 if part >= BAD_LOSS else 1,
+            f"{health.sequence.dropped} of {expected} messages were dropped ({part:.2%}), as its "
+            "sequence numbers prove",
         )
     if health.sequence.reordered:
-        found.append(
-            Finding(0, f"{health.topic}: {health.sequence.reordered} messages are out of sequence")
-        )
+        add(0, f"{health.sequence.reordered} messages are out of sequence")
     if health.unread:
-        part = health.unread / health.count
-        found.append(
-            Finding(
-                2 if part >= BAD_LOSS else 1,
-                f"{health.topic}: {health.unread} of {health.count} messages can't be decoded",
-            )
-        )
+        weight = 2 if health.unread >= BAD_LOSS * health.count else 1
+        add(weight, f"{health.unread} of {health.count} messages can't be decoded")
     return found
 
 
@@ -143,8 +126,8 @@ def has_rhythm(topic: str) -> bool:
     return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
 
 
-def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Finding]:
-    """Findings on the rhythm of one series.
+def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault]:
+    """Return what is wrong with the rhythm of one series.
 
     Args:
         health: Its measures.
@@ -152,101 +135,137 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Findi
         end_ns: Log time of its last message [Unix ns].
 
     Returns:
-        The findings; none for view aids and for what a recorder says of itself.
+        The faults; none for view aids and for what a recorder says of itself.
     """
-    timing, label = health.timing, health.label
+    timing = health.timing
     if timing.median_s is None or not has_rhythm(health.topic):
         return []
-    found: list[Finding] = []
+    found: list[Fault] = []
+
+    def add(weight: int, text: str) -> None:
+        found.append(Fault(weight, health.label, "", text))
+
     when = _at(timing.longest_at_ns, timing.first_ns)
     joints = health.type_name.endswith("/JointState")
     span_s = (timing.last_ns - timing.first_ns) / NS
     mostly_paused = joints and timing.paused_s >= BAD_PAUSE * span_s
     if timing.gaps:
-        long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * timing.median_s
-        weight = int(timing.missing_part > GOOD_LOSS or long)
-        scattered = timing.scattered / (timing.count + timing.scattered)
-        found.append(
-            Finding(
-                2 if scattered >= BAD_LOSS or mostly_paused else weight,
-                f"{label}: {timing.gaps} gaps, {timing.missing} samples missing "
-                f"({timing.missing_part:.2%}); the longest is {timing.longest_s:.3g} s, {when}",
-            )
-        )
+        found.append(_gaps(health, when, mostly_paused=mostly_paused))
     elif joints and timing.paused_s:
-        sentence = f"{label}: silent for {timing.paused_s:.3g} s in all; the longest pause is "
-        sentence += f"{timing.longest_s:.3g} s, {when}"
-        found.append(Finding(1 + mostly_paused, sentence))
+        text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
+        add(1 + mostly_paused, f"{text}{timing.longest_s:.3g} s, {when}")
     if timing.regular:
-        edge_s = max(PAUSE_S, PAUSE_PERIODS * timing.median_s)
-        late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
-        if late_s > edge_s:
-            found.append(Finding(1, f"{label}: starts {late_s:.3g} s after the session"))
-        if early_s > edge_s:
-            found.append(Finding(1, f"{label}: ends {early_s:.3g} s before the session"))
-        if timing.std_s is not None and timing.std_s > MAX_JITTER * timing.median_s:
-            found.append(
-                Finding(
-                    1,
-                    f"{label}: the intervals jitter by {timing.std_s / timing.median_s:.0%} of "
-                    "their median",
-                )
-            )
+        for text in _edges_and_jitter(health, start_ns, end_ns):
+            add(1, text)
     elif joints and timing.count > FROZEN_SAMPLES:
-        found.append(Finding(0, f"{label}: no steady rhythm, so single gaps can't be told"))
+        add(0, "no steady rhythm, so single gaps can't be told")
     if timing.backward:
-        found.append(Finding(1, f"{label}: {timing.backward} stamps go back in time"))
+        add(1, f"{timing.backward} stamps go back in time")
     if timing.duplicates:
         weight = int(timing.duplicates > GOOD_LOSS * timing.count)
-        found.append(Finding(weight, f"{label}: {timing.duplicates} stamps are repeated"))
+        add(weight, f"{timing.duplicates} stamps are repeated")
     if health.nan and not joints:
         weight = int(health.nan > GOOD_LOSS * health.numbers)
-        found.append(
-            Finding(weight, f"{label}: {health.nan} of {health.numbers} numbers are not a number")
-        )
+        add(weight, f"{health.nan} of {health.numbers} numbers are not a number")
     return found
 
 
-def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Finding]:
-    """Findings on the joints.
+def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
+    """The gaps of a series."""
+    timing = health.timing
+    long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * (timing.median_s or 0.0)
+    scattered = timing.scattered / (timing.count + timing.scattered)
+    lost = scattered >= BAD_LOSS or mostly_paused
+    return Fault(
+        2 if lost else int(timing.missing_part > GOOD_LOSS or long),
+        health.label,
+        "",
+        f"{timing.gaps} gaps, {timing.missing} samples missing ({timing.missing_part:.2%}); "
+        f"the longest is {timing.longest_s:.3g} s, {when}",
+        timing.gaps,
+        (timing.longest_at_ns, timing.longest_at_ns + round(timing.longest_s * NS)),
+        timing.missing_part,
+    )
+
+
+def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[str]:
+    """What is wrong with the beginning, the end and the intervals of a regular series."""
+    timing, median_s = health.timing, health.timing.median_s or 0.0
+    edge_s = max(PAUSE_S, PAUSE_PERIODS * median_s)
+    late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
+    if late_s > edge_s:
+        yield f"starts {late_s:.3g} s after the session"
+    if early_s > edge_s:
+        yield f"ends {early_s:.3g} s before the session"
+    if timing.std_s is not None and timing.std_s > MAX_JITTER * median_s:
+        yield f"the intervals jitter by {timing.std_s / median_s:.0%} of their median"
+
+
+def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
+    """Return what is wrong with the joints, each by itself.
 
     Args:
         joints: Measures of all joints of all topics.
         start_ns: Start of the session [Unix ns].
 
     Returns:
+        The faults.
+    """
+    found: list[Fault] = []
+    for joint in joints:
+
+        def add(weight: int, text: str, joint: JointHealth = joint) -> None:
+            found.append(Fault(weight, joint.topic, joint.name, text))
+
+        if joint.nan:
+            weight = int(joint.nan > GOOD_LOSS * joint.samples)
+            add(weight, f"{joint.nan} of {joint.samples} samples are not a number")
+        if _is_frozen(joint):
+            when = _at(joint.frozen_at_ns, start_ns)
+            add(1, f"frozen for {joint.frozen_s} s while its command moved, {when}")
+        if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
+            add(1, f"at the robot's limits in {joint.at_limit:.0%} of the samples")
+    return found
+
+
+def judge_body(joints: Sequence[JointHealth]) -> list[Finding]:
+    """Findings on the joints together.
+
+    Args:
+        joints: Measures of all joints of all topics.
+
+    Returns:
         The findings.
     """
-    found: list[Finding] = []
-    dead: set[str] = set()
-    for joint in joints:
-        where = f"{joint.topic}, {joint.name}"
-        if joint.nan:
-            found.append(
-                Finding(
-                    int(joint.nan > GOOD_LOSS * joint.samples),
-                    f"{where}: {joint.nan} of {joint.samples} samples are not a number",
-                )
-            )
-        frozen = (joint.frozen_s or 0) >= FROZEN_SECONDS
-        if frozen:
-            found.append(
-                Finding(
-                    1,
-                    f"{where}: frozen for {joint.frozen_s} s while its command moved, "
-                    f"{_at(joint.frozen_at_ns, start_ns)}",
-                )
-            )
-        if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
-            found.append(
-                Finding(1, f"{where}: at the robot's limits in {joint.at_limit:.0%} of the samples")
-            )
-        if joint.topic == "/joint_states" and (frozen or joint.nan > BAD_LOSS * joint.samples):
-            dead.add(joint.name)
-    measured = {joint.name for joint in joints if joint.topic == "/joint_states"}
-    if len(measured) > 1 and len(dead) >= BAD_JOINTS * len(measured):
-        found.append(Finding(2, f"{len(dead)} of {len(measured)} joints are frozen or missing"))
-    return found
+    measured = [joint for joint in joints if joint.topic == "/joint_states"]
+    names = {joint.name for joint in measured}
+    dead = {
+        joint.name
+        for joint in measured
+        if _is_frozen(joint) or joint.nan > BAD_LOSS * joint.samples
+    }
+    if len(names) > 1 and len(dead) >= BAD_JOINTS * len(names):
+        return [Finding(2, f"{len(dead)} of {len(names)} joints are frozen or missing")]
+    return []
+
+
+def _is_frozen(joint: JointHealth) -> bool:
+    return (joint.frozen_s or 0) >= FROZEN_SECONDS
+
+
+def judge_fault(fault: Fault) -> Finding:
+    """Finding on a joint that does not follow its command.
+
+    Args:
+        fault: The fault, times from the session's start.
+
+    Returns:
+        The finding, with the kinds that fit.
+    """
+    when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
+    when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
+    kinds = " or ".join(fault.kinds)
+    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {kinds}")
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:
@@ -296,7 +315,10 @@ def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
 
 
 def judge_topics(
-    types: dict[str, str], joints: Sequence[str], seen: Iterable[str]
+    types: dict[str, str],
+    joints: Sequence[str],
+    seen: Iterable[str],
+    undecoded: str | None = None,
 ) -> list[Finding]:
     """Findings on what the log contract asks for and the session lacks.
 
@@ -304,11 +326,12 @@ def judge_topics(
         types: Topic with messages to type.
         joints: The robot's joints; empty without a robot.
         seen: Joints that ``/joint_states`` carries.
+        undecoded: Why the raw CAN frames brought nothing, or hardly anything; None if they did.
 
     Returns:
-        The findings.
+        The findings; where frames brought nothing, that is the one reason for what is missing.
     """
-    found: list[Finding] = []
+    found = [] if undecoded is None else [Finding(1, undecoded)]
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
     others = sorted(topic for topic, kind in types.items() if kind.endswith("/JointState"))
     for topic in ("/joint_states", "/joint_commands"):
@@ -316,6 +339,8 @@ def judge_topics(
             continue
         if others:
             sentence = f"{topic} is missing; JointStates are on {', '.join(others)}"
+        elif undecoded is not None:
+            continue
         elif framed:
             sentence = f"{topic} is missing; there are raw CAN frames"
         else:

@@ -64,9 +64,7 @@ class RawLog:
         self.warnings = list(self.file.warnings)
         self.paths = [file.path for file in self.file.files]
         self.sha256 = _hash(self.paths)
-        filled = [block for block in self.file.blocks if block.end_ns]
-        self.start_ns = min((block.start_ns for block in filled), default=0)
-        self.end_ns = max((block.end_ns for block in filled), default=0)
+        self.start_ns, self.end_ns = self.file.limits
         self.session_id = self.file.metadata.get("undulog", {}).get("session_id") or path.stem
         self.robot = _robot_name(self.file)
 

@@ -137,12 +137,12 @@ class Session:
     @property
     def start_ns(self) -> int:
         """Log time of the first message [Unix ns]; 0 where there is none."""
-        return min((block.start_ns for block in self._filled()), default=0)
+        return self._file.limits[0]
 
     @property
     def end_ns(self) -> int:
         """Log time of the last message [Unix ns]; 0 where there is none."""
-        return max((block.end_ns for block in self._filled()), default=0)
+        return self._file.limits[1]
 
     @property
     def duration_s(self) -> float:
@@ -384,9 +384,6 @@ class Session:
     def _warn(self, sentence: str) -> None:
         if sentence not in self._warnings:
             self._warnings.append(sentence)
-
-    def _filled(self) -> list[Any]:
-        return [block for block in self._file.blocks if block.end_ns]
 
     def _groups(self, topic: str, found: Messages) -> list[Group]:
         if found.unread:

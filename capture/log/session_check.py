@@ -84,10 +84,7 @@ class _Check:
     def run(self, on_part: Callable[[float], None]) -> SessionHealth:
         """Read, then judge."""
         file = self._against_summary(self._read(on_part))
-        blocks = [block for block in self._file.blocks if block.end_ns]
-        start_ns = min((block.start_ns for block in blocks), default=0)
-        end_ns = max((block.end_ns for block in blocks), default=0)
-        found = self._scan.result(start_ns, end_ns, judge_file(file))
+        found = self._scan.result(*self._file.limits, judge_file(file))
         stored = self._file.metadata.get("undulog.health", {})
         return SessionHealth(
             **{each.name: getattr(found, each.name) for each in fields(found)},

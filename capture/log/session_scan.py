@@ -6,8 +6,10 @@ messages of a running recording, so both come to the same verdict.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +18,10 @@ from ..arrays import IntArray
 from ..robot import Robot
 from .channel_scan import ChannelScan, Limits, Series
 from .chunk import Buffer
+from .frames import identifier_text
 from .freeze import FreezeTally
 from .health import (
-    Finding,
+    judge_body,
     judge_bus,
     judge_channel,
     judge_joints,
@@ -27,10 +30,12 @@ from .health import (
     judge_topics,
     verdict_of,
 )
+from .joined import Finding, joined
 from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 from .rosmsg import MessageType
 from .source_health import SourceHealth, judge_source, measure_sources
 from .tallies import NS
+from .undecoded import named_identifiers, undecoded
 
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 
@@ -226,15 +231,17 @@ class SessionScan:
         types = {channel.topic: channel.type_name for channel in channels}
         chain = self._robot.joint_names if self._robot is not None else ()
         seen = [joint.name for joint in joints if joint.topic == STATES]
-        findings = [*before, *judge_topics(types, chain, seen)]
-        for channel in channels:
-            findings += judge_channel(channel)
+        unseen = set(chain).difference(one.name for one in joints if one.nan < one.samples)
+        why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
+        findings = [*before, *judge_topics(types, chain, seen, why)]
+        faults = [fault for channel in channels for fault in judge_channel(channel)]
         # Messages of frames come when a batch is full; the frames themselves are judged.
         framed = {bus.topic for bus in buses}
         for each in series:
             if each.topic not in framed:
-                findings += judge_series(each, start_ns, end_ns)
-        findings += judge_joints(joints, start_ns)
+                faults += judge_series(each, start_ns, end_ns)
+        findings += joined([*faults, *judge_joints(joints, start_ns)])
+        findings += judge_body(joints)
         for bus in buses:
             findings += judge_bus(bus)
         findings += judge_silences(buses, start_ns)
@@ -252,6 +259,24 @@ class SessionScan:
             buses=buses,
             sources=sources,
         )
+
+    @cached_property
+    def _named(self) -> frozenset[int]:
+        return frozenset() if self._robot is None else named_identifiers(self._robot)
+
+    def _undecoded(self, scans: list[ChannelScan], *, all_joints: bool) -> str | None:
+        """Why the frames brought nothing or hardly anything; None if they did, or without a map."""
+        tallies = [scan.bus.identifiers for scan in scans if scan.bus is not None]
+        robot = self._robot
+        if all_joints or robot is None or robot.bus is None or not tallies:
+            return None
+        counts = Counter[int]()
+        for tally in tallies:
+            counts.update(tally.counts)
+        decoded = sum(counts.pop(identifier, 0) for identifier in self._named)
+        others = {identifier_text(identifier): count for identifier, count in counts.items()}
+        frames = sum(tally.frames for tally in tallies)
+        return undecoded(robot.name, decoded, frames, others, all_joints=all_joints)
 
     def _joints(self, scans: list[tuple[int, ChannelScan]]) -> tuple[JointHealth, ...]:
         limited = set(self._robot.joint_names) if self._robot is not None else set[str]()

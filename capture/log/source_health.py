@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from ..errors import DataError
 from .cdr import layout_of
 from .diagnostics import NO_VALUES, DiagnosticStatus
-from .health import BAD_LOSS, GOOD_LOSS, Finding
+from .health import BAD_LOSS, GOOD_LOSS
+from .joined import Finding
 from .rosmsg import MessageType
 
 SOURCE_PREFIX = "source "

@@ -84,6 +84,14 @@ class LogFile:
         first, last = np.array(times, dtype=np.uint64).reshape(-1, 2).T.copy()
         return first, last
 
+    @cached_property
+    def limits(self) -> tuple[int, int]:
+        """Log times of the first and the last message [Unix ns]; 0 and 0 without messages."""
+        filled = [block for block in self.blocks if block.end_ns]
+        if not filled:
+            return 0, 0
+        return min(block.start_ns for block in filled), max(block.end_ns for block in filled)
+
     def close(self) -> None:
         """Release everything."""
         self.scratch.clear()

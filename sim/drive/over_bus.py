@@ -8,11 +8,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.bus.decoding import identifier_text
 from capture.daemon.clock import SessionClock
 from capture.errors import LogWriteError, UsageError
 from capture.interruption import StopRequest
-from capture.log.frames import FrameArray
+from capture.log.frames import FrameArray, identifier_text
 from capture.robot import Bus, Direction, Quantity, Robot
 from capture.sources.address import parse_address
 from capture.sources.contract import SourceAddress, SourceCounts

@@ -7,9 +7,8 @@ from collections import Counter
 import numpy as np
 
 from capture.arrays import IntArray
-from capture.bus.decoding import identifier_text
 from capture.bus.map_entry import bus_messages, frame_id
-from capture.log.frames import DIR_RX, ERROR_FLAG, REMOTE_FLAG, FrameArray
+from capture.log.frames import DIR_RX, ERROR_FLAG, REMOTE_FLAG, FrameArray, identifier_text
 from capture.robot import Direction, Robot
 from capture.sources.bus_watch import BUS_OFF
 

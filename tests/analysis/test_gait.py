@@ -106,6 +106,9 @@ def test_steady_runs_of_the_logged_gait():
     ]
     assert steady_runs(t_ns, names, values, ("offset",))[-1] == Stretch(600_000_000, 10**9)
     assert steady_runs(t_ns[:0], names, values[:0]) == []
+    long = [run for run in runs if run.duration_s >= 0.2]
+    assert steady_runs(t_ns, names, values, least_s=0.2) == long
+    assert len(long) == 3 < len(runs)
 
 
 def test_settling_time_counts_from_the_start_or_from_the_change():

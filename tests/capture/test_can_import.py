@@ -16,6 +16,7 @@ from capture.exchange.can_logs import RELATIVE_EPOCH_NS
 from capture.exchange.log_export import export_log
 from capture.interruption import StopRequest
 from capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from capture.log.session_check import check_session
 
 ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"
 RECORDING = ARCSNAKE / "linear_trajectory.candump.log"
@@ -172,7 +173,8 @@ def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
         writer(can.Message(timestamp=T0, is_error_frame=True, arbitration_id=0x80))
         writer(can.Message(timestamp=T0, is_fd=True, arbitration_id=2, data=bytes(64)))
     report = import_can(source, output, load_robot("arcsnake-joint"))
-    assert report.problems == ["1 error frames"]
+    assert report.problems[0] == "1 error frames"
+    assert report.problems[1].startswith("none of 2 CAN frames can be decoded")
     assert report.verdict == "degraded"
     with Session.open(output) as session:
         assert session.frames("/can/can0")["id_flags"].tolist() == [1, 0x80 | ERROR_FLAG]
@@ -396,9 +398,41 @@ def test_times_that_go_back_are_told_and_the_order_is_kept(tmp_path: Path):
         "".join(f"({t:.6f}) can0 7FF#{i:02X} R\n" for i, t in enumerate([100, 100.2, 100.1, 100.3]))
     )
     report = import_can(source, tmp_path / "a.mcap", load_robot("snake25"))
-    assert report.problems == ["1 frames are stamped before the one ahead"]
+    assert report.problems[0] == "1 frames are stamped before the one ahead"
     export_log(tmp_path / "a.mcap", tmp_path / "back.log")
     assert (tmp_path / "back.log").read_text() == source.read_text()
+
+
+def test_frames_of_another_robot_are_no_good_session(tmp_path: Path):
+    """8,400 frames of identifiers that snake25 doesn't have."""
+    source, output = tmp_path / "x.log", tmp_path / "a.mcap"
+    identifiers = [0x6A0 + i % 12 for i in range(8400)]
+    lines = (f"({100 + i * 1e-3:.3f}) can0 {k:03X}#0102 R\n" for i, k in enumerate(identifiers))
+    source.write_text("".join(lines))
+    report = import_can(source, output, load_robot("snake25"))
+    assert report.verdict == "degraded"
+    (problem,) = report.problems
+    assert problem.startswith("none of 8400 CAN frames can be decoded: the bus map of snake25 does")
+    assert "not name 6A0 (700), 6A1 (700)" in problem
+    assert "and 4 more" in problem
+    assert "with the robot that sent them (--robot" in problem
+    health = check_session(output)
+    assert (health.verdict, health.reasons, health.stored) == ("degraded", (problem,), "degraded")
+
+
+@pytest.mark.parametrize(("joints", "verdict"), [(25, "good"), (24, "degraded")])
+def test_most_frames_may_be_of_other_devices_once_every_joint_is_there(joints, verdict, tmp_path):
+    source, output = tmp_path / "x.log", tmp_path / "a.mcap"
+    identifiers = [*range(0x201, 0x201 + joints), *[0x6A0] * 300]
+    lines = (
+        f"({100 + i * 1e-3:.3f}) can0 {k:03X}#{'01' * 8} R\n" for i, k in enumerate(identifiers)
+    )
+    source.write_text("".join(lines))
+    report = import_can(source, output, load_robot("snake25"))
+    assert report.verdict == verdict
+    found = any(text.startswith("only 24 of 324 CAN frames") for text in report.problems)
+    assert found == (verdict == "degraded")
+    assert any(text.startswith("only") for text in check_session(output).reasons) == found
 
 
 def test_a_robot_without_a_bus_keeps_the_frames(tmp_path: Path):

@@ -1,13 +1,10 @@
 """A small session with known columns, recordings read back, and a headless viewer."""
 
-import ctypes.util
 import io
 import math
-import os
 import subprocess
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +23,6 @@ from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane
 
 EPOCH_NS = 1_735_689_600_000_000_000
-REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
 
 
 @pytest.fixture(scope="session")
@@ -309,20 +305,6 @@ def rerun_command():
         return done.stdout
 
     return run
-
-
-@pytest.fixture(scope="session")
-def vulkan(display_tests_required):
-    """Skips where there is no Vulkan driver, fails where one is required."""
-    folders = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
-    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
-    drivers = [file for folder in folders for file in folder.glob("*.json")]
-    if ctypes.util.find_library("vulkan") and (drivers or named):
-        return
-    missing = "no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)"
-    if display_tests_required:
-        pytest.fail(f"{missing}, and {REQUIRE} is set")
-    pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")
 
 
 @pytest.fixture(scope="module")

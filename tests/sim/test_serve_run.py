@@ -271,8 +271,8 @@ def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
         health = check_session(path)
         assert health.verdict != "good"
         reasons = "\n".join(health.reasons)
-        assert "/joint_states, joint07: " in reasons
-        assert "samples are not a number" in reasons
+        missing = [text for text in health.reasons if "samples are not a number" in text]
+        assert any("/joint_states" in text and "joint07" in text for text in missing)
         assert "/joint_states, joint03: frozen for " in reasons
         assert "error frames" in reasons
         (bus,) = health.buses

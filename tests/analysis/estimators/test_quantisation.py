@@ -1,0 +1,116 @@
+"""Rounded channels: the step that is found, and intervals against planted truth."""
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import stdtrit
+
+from analysis.estimators.contrasts import contrast_variance, lag_contrast_variance, response_errors
+from analysis.estimators.harmonic import fit_at
+from analysis.estimators.quantisation import lattice_step
+from analysis.estimators.series import Series
+from analysis.estimators.spectrum import ResidualBins, residual_spectrum
+
+DOCS = Path(__file__).parents[3] / "docs"
+TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "estimator_tables.py")))
+STEP = TABLES.STEP
+
+
+def turn(amplitude, count=500, phase=0.3):
+    return amplitude * np.sin(np.pi * np.arange(count) / 50 + phase)
+
+
+@pytest.mark.parametrize("amplitude", [0.01, 0.5, 3.0])
+def test_step_of_an_encoder(amplitude):
+    rounded = STEP * np.rint(turn(amplitude) / STEP)
+    assert lattice_step(rounded) == pytest.approx(STEP, rel=1e-9)
+    assert lattice_step(0.1234 - rounded) == pytest.approx(STEP, rel=1e-9)
+    assert lattice_step(np.degrees(rounded)) == pytest.approx(360 / 4096, rel=1e-9)
+    single = rounded.astype(np.float32).astype(np.float64)
+    assert lattice_step(single) == pytest.approx(STEP, rel=1e-6)
+    assert lattice_step(np.cumsum(np.diff(rounded))) == pytest.approx(STEP, rel=1e-9)
+
+
+def test_step_where_no_two_levels_are_neighbours():
+    assert lattice_step(np.array([0, 6, 21, 31, 46, 6, 0]) * STEP) == pytest.approx(STEP)
+
+
+@pytest.mark.parametrize("period", [4, 5, 6, 8, 12, 25, 100, 97.3])
+@pytest.mark.parametrize("phase", [0.0, 0.3])
+def test_no_step_in_values_that_were_not_rounded(period, phase):
+    values = 0.5 * np.sin(2 * np.pi * np.arange(1000) / period + phase)
+    assert lattice_step(values) == 0
+
+
+def test_no_step_in_few_levels():
+    assert lattice_step(np.ones(100)) == 0
+    assert lattice_step(np.zeros(0)) == 0
+    assert lattice_step(np.sign(turn(1.0))) == 0
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "0.5 Hz at 50 Hz, any mean",
+        "0.5 Hz at 50 Hz, mean zero",
+        "the same, command rounded as well",
+        "the same, noise of 1 step",
+    ],
+)
+def test_intervals_of_rounded_channels(name):
+    """500 draws: the standard error of the coverage is 1 %."""
+    covered, _, width = TABLES.rounded(**TABLES.ROUNDED[name], draws=500)
+    assert np.all(covered > 0.91)
+    assert np.all(width < 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TABLES.ROUNDED))
+def test_intervals_of_all_rounded_cases(name):
+    covered, _, width = TABLES.rounded(**TABLES.ROUNDED[name], seed=2)
+    assert np.all(covered > 0.91)
+    assert np.all(width < 3)
+
+
+def test_the_residual_alone_does_not_show_the_error():
+    """Else the rounding again would not be needed."""
+    assert np.all(TABLES.rounded(draws=100)[1] < 0.1)
+
+
+def test_noise_that_is_not_rounded_keeps_its_intervals():
+    random = np.random.default_rng(3)
+    t = np.arange(1000) / 50
+    series = [Series("q", t, turn(0.5, 1000) + random.normal(0, 1e-3, 1000))]
+    noise, bins = residual_spectrum(series, fit_at(series, np.pi))
+    assert not bins.rounding.any()
+    assert noise.dof[0] == 24
+
+
+def test_contrasts_of_rounded_joints():
+    """Errors that joints share by rounding are counted as independent: never too narrow."""
+    random = np.random.default_rng(4)
+    t, joints, runs = np.arange(1000) / 50, 9, 60
+    size = np.repeat(random.uniform(0.2, 0.8, runs), joints)
+    phase = np.repeat(random.uniform(-3, 3, runs), joints) - np.tile(np.arange(joints), runs)
+    truth = size * np.exp(1j * phase)
+    waves = (truth[:, None] * np.exp(1j * np.pi * t)).real
+    series = [Series("q", t, STEP * np.rint(one / STEP)) for one in waves]
+    fit = fit_at(series, np.pi)
+    _, bins = residual_spectrum(series, fit)
+    exact = ResidualBins(0 * bins.values, bins.offset, bins.spread, 0 * bins.rounding)
+    errors = response_errors(truth, exact, fit.fundamental, bins)
+    found = np.log(fit.fundamental / truth).reshape(runs, joints)
+    each = np.eye(joints) - (1 - np.eye(joints)) / (joints - 1)
+    inside = []
+    for run in range(runs):
+        own = errors.select(range(run * joints, (run + 1) * joints))
+        for variance, value in (
+            (contrast_variance(own, each), found[run].real),
+            (lag_contrast_variance(own, each), found[run].imag),
+        ):
+            half = stdtrit(variance[1], 0.975) * variance[0] ** 0.5
+            inside.append(np.mean(np.abs(each @ value) <= half))
+    assert np.mean(inside) > 0.92

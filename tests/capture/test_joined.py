@@ -1,0 +1,98 @@
+"""One loss is one reason, on however many joints and channels; two losses are two."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from capture.log.cdr import encode
+from capture.log.joined import Fault, joined, listed
+from capture.log.schemas import message_type, schema_text
+from capture.log.session_check import check_session
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+EPOCH_NS = 1_700_000_000_000_000_000
+JOINTS = tuple(f"j{k}" for k in range(1, 13))
+TOPICS = ("/joint_states", "/joint_current", "/joint_temperature")
+TICKS = 400
+
+
+def lost(path, *, of_topic=None, whole=True, servos=False):
+    """20 s at 20 Hz; in each topic a cycle is lost, or its numbers: 200, or ``of_topic``'s."""
+    kind = message_type(JOINT_STATE)
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
+        topics = (*TOPICS, "/joint_commands")
+        channels = {topic: writer.register_channel(topic, "cdr", schema) for topic in topics}
+        groups = [[name] for name in JOINTS] if servos else [list(JOINTS)]
+        for tick, topic, names in product(range(TICKS), topics, groups):
+            gone = topic in TOPICS and tick == (of_topic or {}).get(topic, 200)
+            if gone and whole:
+                continue
+            t_ns = EPOCH_NS + tick * 50_000_000
+            values = 0.4 * np.sin(0.1 * tick - np.arange(len(names)))
+            stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+            position = np.full(len(names), np.nan) if gone else values
+            fields = {"header": {"stamp": stamp}, "name": names, "position": position}
+            writer.add_message(channels[topic], t_ns, encode(kind, fields), t_ns, 0)
+        writer.finish()
+    return check_session(path)
+
+
+@pytest.mark.parametrize("servos", [False, True])
+@pytest.mark.parametrize("whole", [False, True])
+def test_one_lost_bus_cycle_is_one_reason(tmp_path, whole, servos):
+    health = lost(tmp_path / "s.mcap", whole=whole, servos=servos)
+    (reason,) = health.reasons
+    assert health.verdict == "degraded"
+    assert all(topic in reason for topic in TOPICS) or servos
+    assert ("1 samples missing (0.25%)" if whole else "1 of 400 samples") in reason
+    assert "/joint_commands" not in reason
+
+
+def test_losses_at_two_times_are_two_reasons(tmp_path):
+    health = lost(tmp_path / "s.mcap", of_topic={"/joint_current": 300})
+    apart, together = sorted(health.reasons)
+    assert apart.startswith(
+        "/joint_current: 1 gaps, 1 samples missing (0.25%); the longest is 0.1 s"
+    )
+    assert together.startswith(
+        "/joint_states and /joint_temperature, lost together: at most 1 gaps"
+    )
+
+
+def test_the_figures_are_those_of_the_worst():
+    gap = (5 * 10**9, 6 * 10**9)
+    later = (gap[0] + 10**8, gap[1] + 10**8)
+    faults = [
+        Fault(1, "/a", "", "1 of it", 1, gap, 0.01),
+        Fault(1, "/b", "", "9 of it", 1, later, 0.09),
+        Fault(0, "/c", "", "a note", 1, gap, 0.001),
+        Fault(1, "/d", "", "two gaps", 2, gap, 0.02),
+    ]
+    assert [(one.weight, one.sentence) for one in joined(faults)] == [
+        (1, "/a and /b, lost together: at most 9 of it"),
+        (0, "/c: a note"),
+        (1, "/d: two gaps"),
+    ]
+
+
+def test_joints_that_differ_have_reasons_of_their_own():
+    faults = [
+        Fault(1, topic, name, f"{3 if name == 'j2' else 1} of 400")
+        for topic in ("/x", "/y")
+        for name in ("j1", "j2", "j3")
+    ]
+    assert [one.sentence for one in joined(faults)] == [
+        "/x and /y, j1 and j3, each: 1 of 400",
+        "/x and /y, j2, each: 3 of 400",
+    ]
+
+
+def test_long_lists_are_cut():
+    assert listed(["a"]) == "a"
+    assert listed(list("abcdefgh")) == "a, b, c, d, e, f, g and h"
+    assert listed(list("abcdefghi")) == "a, b, c, d, e, f, g and 2 more"

@@ -1,0 +1,76 @@
+"""Every script of the manual runs: each has --quick, few draws and short runs, for this test."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import undulog
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+RUN_ELSEWHERE = {"conf.py", "notebook_page.py"}
+"""Run by Sphinx (``make docs``), the second by test_notebook.py, too."""
+
+PICTURES = {"pictures.py", "side_by_side.py"}
+"""Need the viewer's driver."""
+
+OWN_TESTS = {"paper_figures.py", "oscillator_tables.py"}
+TABLES = sorted(
+    path.name for path in DOCS.glob("*.py") if path.name not in RUN_ELSEWHERE | PICTURES | OWN_TESTS
+)
+
+pytestmark = pytest.mark.slow
+
+
+def printed(*words):
+    """What a script prints; it has to end well, with warnings as errors."""
+    threads = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-W", "error", *map(str, words)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=os.environ | threads
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_are_printed(name):
+    lines = printed(DOCS / name, "--quick").splitlines()
+    assert len(lines) > 3
+    assert any(character.isdigit() for character in lines[-1])
+
+
+def test_the_oscillator_table_predicts_the_closed_loop():
+    """Three yaw joints are few, but the closed loop has gone where P and R say."""
+    text = printed(DOCS / "oscillator_tables.py", "--quick")
+    moved, off = (
+        float(text.partition(label)[2].partition("%")[0]) for label in ("moved by", "off by")
+    )
+    assert 0 < off < moved
+
+
+def test_the_figures_of_the_paper_are_drawn(tmp_path):
+    printed(DOCS / "paper_figures.py", tmp_path / "sessions", tmp_path / "images", "--quick")
+    assert names(tmp_path / "images") == {path.name for path in DOCS.glob("images/paper-*.svg")}
+
+
+def test_the_pictures_of_the_manual_are_drawn(tmp_path, vulkan, capsys):
+    session, result, page = (tmp_path / f for f in ("session.mcap", "result.json", "report.html"))
+    for words in (
+        ["sim", "run", "weak-servo-pi3", "--duration", "14.5", "-o", session],
+        ["analyse", session, "-o", result],
+        ["report", session, "-o", page],
+    ):
+        assert undulog.run([str(word) for word in words]) == 0, capsys.readouterr().err
+    images = tmp_path / "images"
+    printed(DOCS / "pictures.py", tmp_path, images, "--quick")
+    assert names(images) == {"clip.gif", "replay-mean-cycle.png", "response.svg"}
+    printed(DOCS / "side_by_side.py", images, "--quick")
+    assert names(images) <= names(DOCS / "images")
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
