@@ -644,6 +644,83 @@ def _(robot, rng, j):
     return (Change(j, position=_grown(robot, j, rng, stuck)),), _responds(j, RESPONSE)
 
 
+@fault("lag grows")
+def _(robot, rng, j):
+    """The position becomes later from cycle to cycle."""
+    size = 2 * _relative(robot, j, rng, 0.3)
+    position = robot.moved(j, more_lag=size * robot.t_s[:, j] / robot.duration_s)
+    return (Change(j, position=position),), _responds(j, LAG)
+
+
+@fault("weak to one side")
+def _(robot, rng, j):
+    """The position is smaller on one side of its middle."""
+    size = min(2 * _relative(robot, j, rng, 0.25), 0.7)
+    moved, about = robot.moved(j), robot.bias[j] + robot.zero[j]
+    side = rng.choice([-1, 1]) * (moved - about) > 0
+    position = np.where(side, about + (1 - size) * (moved - about), moved)
+    return (Change(j, position=position),), _responds(j, GAIN | OFFSET)
+
+
+# -- faults that nobody foresaw ------------------------------------------------------------------
+
+
+@fault("jam that comes loose again")
+def _(robot, rng, j):
+    """The position stands still for a third of the time, then follows again."""
+    start = float(rng.uniform(0.2, 0.4)) * robot.duration_s
+    t = robot.t_s[:, j]
+    acts = (t >= start) & (t < start + rng.uniform(0.25, 0.4) * robot.duration_s)
+    change = Change(j, position=_hold(robot.moved(j), acts))
+    kinds = standing(robot.channels, "pushing") | PAUSED
+    names = frozenset({"jammed", "stalled", "intermittent"})
+    return (change,), Truth((JointTruth(j, names, kinds, since_s=start),))
+
+
+@fault("single samples read zero")
+def _(robot, rng, j):
+    """Samples of the position are zero at random."""
+    lost = rng.random(len(robot.t_s)) < rng.uniform(0.02, 0.1)
+    kinds = frozenset({"noisy_sensor", "lost_samples"})
+    return (Change(j, reading=lambda read: np.where(lost, 0.0, read)),), Truth(
+        (JointTruth(j, kinds, kinds | {"wrapped_sensor"}, compared=False),)
+    )
+
+
+@fault("sensor clipped at the end of its range")
+def _(robot, rng, j):
+    """The position has flat tops at one end; all else goes on."""
+    side, about = rng.choice([-1, 1]), robot.bias[j]
+    level = rng.uniform(0.1, 0.6) * robot.swing(j)
+    kinds = _clipped(robot) | {"clipped_sensor"}
+    if not robot.channels.second:
+        kinds |= STOPPED | PAUSED
+    return (
+        Change(j, reading=lambda read: about + side * np.minimum(side * (read - about), level)),
+    ), Truth((JointTruth(j, frozenset({"clipped_sensor"}), kinds, GAIN | OFFSET, checked=False),))
+
+
+@fault("follows its neighbour's command")
+def _(robot, rng, j):
+    """The position is in step with the joint beside it."""
+    other = j + 1 if j + 1 < robot.m else j - 1
+    change = Change(j, position=robot.moved(j, of=other), wanted=robot.wanted(other, at=j))
+    kinds = frozenset({"swapped"})
+    return (change,), Truth((JointTruth(j, kinds, kinds, RESPONSE | OFFSET, checked=False),))
+
+
+@fault("off by a whole turn from the beginning")
+def _(robot, rng, j):
+    """The position is off by a whole turn of the counter."""
+    turn = rng.choice([-1, 1]) * 2 * np.pi
+    kinds = frozenset({"wrapped_sensor"})
+    if not robot.channels.second:
+        kinds |= {"slipped"}
+    return (Change(j, reading=lambda read: read + turn),), Truth(
+        (JointTruth(j, kinds, kinds | {"slipped_sensor"}, OFFSET, checked=False),)
+    )
+
+
 # -- several, few, none --------------------------------------------------------------------------
 
 
@@ -663,6 +740,8 @@ for _pair in (
     ("dead from the beginning", "inverted"),
     ("sensor frozen half-way", "gain less"),
     ("gain less", "lag more"),
+    ("gain less", "gain less"),
+    ("stale samples", "encoder slips"),
 ):
     fault(f"two at once: {_pair[0]}; {_pair[1]}", joints=(7, 40))(_both(*_pair))
 
