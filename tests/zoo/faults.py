@@ -706,6 +706,9 @@ def _(robot, rng, j):
     other = j + 1 if j + 1 < robot.m else j - 1
     change = Change(j, position=robot.moved(j, of=other), wanted=robot.wanted(other, at=j))
     kinds = frozenset({"swapped"})
+    apart = np.angle(np.exp(1j * (robot.phase[other] - robot.phase[j])))
+    if abs(apart) > np.radians(120):  # as good as inverted
+        kinds |= either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
     return (change,), Truth((JointTruth(j, kinds, kinds, RESPONSE | OFFSET, checked=False),))
 
 
