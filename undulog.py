@@ -45,6 +45,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "sim serve": ("sim.serve.cli:serve", "Be a robot on a bus, in real time."),
     "drive": ("sim.drive.cli:drive", "Drive a gait, a plan or recorded commands."),
     "analyse": ("analysis.cli:analyse", "Numbers: response, energy, spread over the segments."),
+    "predict": (
+        "analysis.oscillators.cli:predict",
+        "From kicks: how oscillators that feel their servos synchronise.",
+    ),
     "compare": ("analysis.compare.cli:compare", "What differs between two sessions or groups."),
     "plan lag-sweep": (
         "analysis.plan.sweep_cli:lag_sweep",

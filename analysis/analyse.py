@@ -25,12 +25,13 @@ from .estimators.series import Series, clean_together
 from .estimators.spectrum import BINS_PER_SIDE
 from .fitting import GaitFit, fit_gait
 from .flags import find_artefacts
-from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
+from .gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
+from .group_facts import group_facts
 from .indices import heterogeneity_indices
 from .joints import Energies, Span, joint_energies, joint_results
 from .oscillators.session import session_couplings
-from .reading import Warn, by_plane, drag_ratio, read_columns, settle_time_s
-from .response import CONFIDENCE, around, t_factor
+from .reading import Warn, drag_ratio, read_columns, settle_time_s
+from .response import CONFIDENCE
 from .results.analysis import (
     Analysis,
     Estimate,
@@ -198,7 +199,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         joints=joints,
         body=body,
         heterogeneity=heterogeneity,
-        coupling=one_gait_coupling(0 if gait is None else len(gait.answered)),
+        coupling=one_gait_coupling(0 if gait is None else len(gait.all_answered)),
         warnings=(*session.warnings, *warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
@@ -255,26 +256,18 @@ def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Str
     window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
     if gait is None:
         return GaitFacts(Estimate(), (window,))
-    half = t_factor(gait.omega_dof) * gait.omega_error / (2 * np.pi)
-    frequency = gait.fit.frequency_hz
-    steps: dict[str, float] = {}
-    main, largest = None, 0.0
-    for plane, names in by_plane(session.robot, gait.driven).items():
-        if len(names) > 1:
-            waves = gait.fit.fundamental[[gait.command_of(name) for name in names]]
-            steps[plane] = phase_step(waves)
-            if np.abs(waves).max() > largest:
-                main, largest = plane, float(np.abs(waves).max())
+    groups = group_facts(session.robot, gait, span, stretch, session.start_ns)
     return GaitFacts(
-        frequency_hz=Estimate(frequency, around(frequency, half)),
+        frequency_hz=groups[0].frequency_hz,
         windows=(window,),
-        wave=None if main is None else wave_name(steps[main]),
-        lag_per_joint_rad=steps,
+        wave=groups[0].wave,
+        lag_per_joint_rad=groups[0].lag_per_joint_rad,
         fitted=Window(
             (stretch.start_ns - session.start_ns) / _NS,
             (stretch.stop_ns - session.start_ns) / _NS,
-            stretch.duration_s * frequency,
+            stretch.duration_s * gait.fit.frequency_hz,
         ),
+        groups=groups,
     )
 
 

@@ -80,12 +80,12 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
     moving = [one for one in series if one.count > MIN_SAMPLES and np.ptp(one.values) > 0]
     if not moving or duration_s <= 0:
         return None
-    scouts = sorted(moving, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
+    scouts = _liveliest(moving)
     peak = _periodogram_peak(scouts, duration_s)
     best: Rhythm | None = None
     # A second harmonic that is stronger than the fundamental makes the peak an octave too high.
     for omega in () if peak is None else (peak, peak / 2):
-        rhythm = _refine(scouts, moving, omega)
+        rhythm = _refined(scouts, moving, omega)
         if rhythm is None or rhythm.omega * duration_s < 2 * np.pi * MIN_CYCLES:
             continue
         if best is None or rhythm.explained > best.explained:
@@ -154,7 +154,24 @@ def wave_name(step_rad: float) -> str:
     return "head-to-tail" if step_rad < 0 else "tail-to-head"
 
 
-def _refine(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
+def refine(series: Sequence[Series], omega: float) -> Rhythm | None:
+    """Fit a rhythm to channels that share it.
+
+    Args:
+        series: Channels that move.
+        omega: Where to start [rad/s].
+
+    Returns:
+        The rhythm; None where the samples are too few or no frequency fits.
+    """
+    return _refined(_liveliest(series), series, omega)
+
+
+def _liveliest(series: Sequence[Series]) -> list[Series]:
+    return sorted(series, key=lambda one: float(np.var(one.values)), reverse=True)[:_SCOUTS]
+
+
+def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
     """The rhythm of the scouts near a frequency, and what it explains of all channels."""
     model = allowed_model(series, omega)
     if any(one.count <= model.size + 1 for one in series):

@@ -1,4 +1,4 @@
-"""The heterogeneity indices of a session: one set for each driven plane."""
+"""The heterogeneity indices of a session: one set for each driven plane and group."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def heterogeneity_indices(
     energies: Mapping[str, Energies],
     warn: Warn,
 ) -> dict[str, Index]:
-    """Indices of each driven plane.
+    """Indices of each driven plane, and in it of each group of joints that share a rhythm.
 
     Args:
         robot: The robot, or None; then all joints are one chain.
@@ -33,26 +33,33 @@ def heterogeneity_indices(
 
     Returns:
         Every index of :data:`analysis.heterogeneity.KINDS`, None where it can't be computed. Where
-        both planes are driven each has its own, named e.g. ``gain_cv_horizontal``.
+        both planes are driven each has its own, named e.g. ``gain_cv_horizontal``; where joints of
+        one plane have several frequencies each group has its own, e.g. ``gain_cv_vertical_group1``.
     """
     unknown = {name: index(name) for name in KINDS}
-    if gait is None or gait.response is None:
+    if gait is None or all(group.response is None for group in gait.groups):
         warn("no joint's gain and lag are known: the heterogeneity indices are null")
         return unknown
     known = {joint.name for joint in joints if joint.lag_rad.value is not None}
     old = {joint.name for joint in joints if joint.name in known and "stale" in joint.flags}
     if old != known:  # where all samples are late by a hold, that makes no difference
         known -= old
-    planes = by_plane(robot, gait.driven)
+    groups = [by_plane(robot, group.driven) for group in gait.groups]
+    planes = list(dict.fromkeys(plane for group in groups for plane in group))
     result: dict[str, Index] = {}
-    for plane, names in planes.items():
+    parts = [(plane, k) for plane in planes for k, group in enumerate(groups) if plane in group]
+    for plane, k in parts:
+        names = groups[k][plane]
         sound = [name for name in names if name in known]
-        found = unknown | _of_plane(plane, names, sound, gait, warn)
+        several = sum(plane in group for group in groups) > 1
+        label = f"{plane} {gait.groups[k].fit.frequency_hz:.4g} Hz" if several else plane
+        found = unknown | _of_plane(label, names, sound, gait.groups[k], warn)
         powers = [energies[name].mechanical for name in sound]
         per_cycle = [power.abs_j for power in powers if power is not None]
         if per_cycle and len(per_cycle) == len(sound):
             found |= energy_indices(np.stack(per_cycle))
         suffix = f"_{plane}" if len(planes) > 1 else ""
+        suffix += f"_group{k}" if several else ""
         result |= {f"{name}{suffix}": one for name, one in found.items()}
     warn(
         "boundary or module: not separable from a wave in one direction (module_share is null); "

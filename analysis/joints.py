@@ -9,10 +9,11 @@ import numpy as np
 
 from capture import Session
 from capture.arrays import FloatArray
+from capture.log.power_topics import PowerTopic
 from capture.robot import Robot
 
-from .energy.joint import Energy, integrate, power_of
-from .estimators.series import Series, coverage
+from .energy.joint import Energy, add_up, integrate, power_of
+from .estimators.series import Series, clean, coverage
 from .estimators.threads import in_threads
 from .fitting import GaitFit
 from .reading import Columns, Warn, planes_of
@@ -43,10 +44,18 @@ class Span:
 
 @dataclass(frozen=True)
 class Energies:
-    """Mechanical and electrical energy of one joint; None where it was not recorded."""
+    """Energies of one joint.
+
+    Attributes:
+        mechanical: By torque and velocity; None where they were not recorded.
+        electrical: By voltage and current; None likewise.
+        sampled: Which of the two are products of samples: what the factors do within a sampling
+            interval is not in them.
+    """
 
     mechanical: Energy | None
     electrical: Energy | None
+    sampled: frozenset[str] = frozenset()
 
 
 def joint_energies(
@@ -74,16 +83,19 @@ def joint_energies(
 
     def of_joint(name: str) -> Energies:
         powers: dict[str, Series] = {}
+        found: dict[str, Energy | None] = {}
+        window = span.start_s, span.stop_s, max(span.cycles, 1)
         for kind, (first, second), wrong in (
             ("mechanical", (columns.effort, columns.velocity), false),
             ("electrical", (columns.current, columns.voltage), false_el),
         ):
-            if name in first and name in second and name not in wrong:
+            if name in wrong:  # what accumulates powers goes by the same sensors
+                continue
+            found[kind] = _accumulated(columns, kind, name, span.origin_ns, window)
+            if found[kind] is None and name in first and name in second:
                 powers[kind] = power_of(first[name], second[name], span.origin_ns)
-        cycles = max(span.cycles, 1)
-        each = integrate([*powers.values()], span.start_s, span.stop_s, cycles)
-        found = dict(zip(powers, each, strict=True))
-        return Energies(found.get("mechanical"), found.get("electrical"))
+        found |= zip(powers, integrate([*powers.values()], *window), strict=True)
+        return Energies(found.get("mechanical"), found.get("electrical"), frozenset(powers))
 
     samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
     found = in_threads(of_joint, columns.names, samples, session.forget)
@@ -101,6 +113,24 @@ def joint_energies(
             "the time that has samples"
         )
     return result
+
+
+def _accumulated(
+    columns: Columns, kind: str, name: str, origin_ns: int, window: tuple[float, float, int]
+) -> Energy | None:
+    """Energy by the powers that the log has themselves, or None."""
+    net, plus = (
+        columns.powers[topic].get(name)
+        for topic in (
+            (PowerTopic.MECHANICAL, PowerTopic.MECHANICAL_PLUS)
+            if kind == "mechanical"
+            else (PowerTopic.ELECTRICAL, PowerTopic.ELECTRICAL_PLUS)
+        )
+    )
+    if net is None or plus is None:
+        return None
+    mean, positive = (clean(name, one.t_ns, one.values, origin_ns) for one in (net, plus))
+    return add_up(mean, positive, *window)
 
 
 def joint_results(
@@ -136,7 +166,9 @@ def joint_results(
         own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
         if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
             own.append("gaps")
-        gain, lag = _estimates(gait, name)
+        index = None if gait is None else gait.group_of(name)
+        group = None if gait is None or index is None else gait.groups[index]
+        gain, lag = _estimates(group, name)
         power = energies[name]
         mechanical, electrical = power.mechanical, power.electrical
         results.append(
@@ -154,6 +186,8 @@ def joint_results(
                 coverage=fraction,
                 samples=0 if part is None else part.count,
                 flags=tuple(own),
+                group=index,
+                frequency_hz=None if group is None else group.fit.frequency_hz,
             )
         )
     return tuple(results)

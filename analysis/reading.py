@@ -9,6 +9,7 @@ from typing import Any, cast
 
 from capture import Session
 from capture.errors import MissingChannelError
+from capture.log.power_topics import PowerTopic
 from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
 
@@ -28,7 +29,8 @@ _OF_ITS_OWN = {
 }
 
 _CONTRACT = {"/joint_sample_offset", "/joint_command_offset", "/joint_temperature", "/gait"} | {
-    *("/energy_ledger", CURRENT_TOPIC, VOLTAGE_TOPIC, "/joint_velocity", "/joint_effort")
+    *("/energy_ledger", CURRENT_TOPIC, VOLTAGE_TOPIC, "/joint_velocity", "/joint_effort"),
+    *PowerTopic,
 }
 """JointStates that are neither commands nor positions."""
 
@@ -50,6 +52,7 @@ class Columns:
         current: Motor current [A].
         voltage: Motor voltage [V].
         reference: Positions by a second sensor [rad].
+        powers: Mean powers [W] that were accumulated within each sampling interval, by topic.
         topics: Quantity, as the attributes above are called, to the topic that it was read from.
     """
 
@@ -61,6 +64,7 @@ class Columns:
     current: Mapping[str, Signal]
     voltage: Mapping[str, Signal]
     reference: Mapping[str, Signal]
+    powers: Mapping[PowerTopic, Mapping[str, Signal]]
     topics: Mapping[str, str]
 
     def of(self, quantity: str) -> Mapping[str, Signal]:
@@ -109,6 +113,7 @@ def read_columns(
         "effort": (response_topic, "effort"),
         "current": (CURRENT_TOPIC, "position"),
         "voltage": (VOLTAGE_TOPIC, "position"),
+        **{topic: (topic, "position") for topic in PowerTopic},
     }
     if reference_topic is not None:
         wanted["reference"] = (reference_topic, "position")
@@ -141,7 +146,8 @@ def read_columns(
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
             warn(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}")
-    if "velocity" not in found or "effort" not in found:
+    accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
+    if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
         warn(f"{response_topic} carries no {lacking}: mechanical energies are null")
     _check_voltage(session, found, warn)
@@ -158,6 +164,7 @@ def read_columns(
     return Columns(
         names=tuple(seen),
         **{key: by_name.get(key, absent) for key in QUANTITIES},
+        powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
         topics={key: wanted[key][0] for key in found},
     )
 
@@ -256,11 +263,13 @@ def _check_voltage(session: Session, found: dict[str, JointSignals], warn: Warn)
         for key, topic in (("current", CURRENT_TOPIC), ("voltage", VOLTAGE_TOPIC))
         if key not in found
     ]
+    accumulated = PowerTopic.ELECTRICAL in found and PowerTopic.ELECTRICAL_PLUS in found
     if lacking:
-        warn(f"no {' and no '.join(lacking)}: electrical energies are null")
+        if not accumulated:
+            warn(f"no {' and no '.join(lacking)}: electrical energies are null")
         found.pop("current", None)
         return
-    if "scenario" not in session.metadata.get("undulog", {}):
+    if not accumulated and "scenario" not in session.metadata.get("undulog", {}):
         warn(
             f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, E_el is "
             "too large"

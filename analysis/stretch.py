@@ -13,6 +13,7 @@ from capture.errors import DataError, LogError, UsageError
 from .estimators.series import clean
 from .gait import MIN_CYCLES
 from .reading import COMMAND_TOPIC, RESPONSE_TOPIC, Columns, Warn, settle_time_s
+from .soft_start import steady_part
 from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
 
 GAIT_TOPIC = "/gait"
@@ -107,7 +108,8 @@ def choose_stretch(session: Session, columns: Columns, options: Options, warn: W
             "analysed, unsettled as it is"
         )
         later = chosen
-    return _in_motion(columns, later)
+    stated = settle_s > 0 or GAIT_TOPIC in session.channels
+    return _in_motion(columns, later, options, warn, stated=stated)
 
 
 def recorded(session: Session, columns: Columns, options: Options) -> Stretch:
@@ -183,8 +185,10 @@ def _gait_runs(session: Session, chosen: Stretch, settle_s: float, warn: Warn) -
     return []
 
 
-def _in_motion(columns: Columns, stretch: Stretch) -> Stretch:
-    """Without standing still at the ends."""
+def _in_motion(
+    columns: Columns, stretch: Stretch, options: Options, warn: Warn, *, stated: bool
+) -> Stretch:
+    """Without standing still at the ends; without a soft start where the session states none."""
     origin = stretch.start_ns
     series = [
         clean(name, signal.t_ns, signal.values, origin).between(0.0, stretch.duration_s)
@@ -193,8 +197,30 @@ def _in_motion(columns: Columns, stretch: Stretch) -> Stretch:
     span = moving(series)
     if span is None:
         return stretch
+    if not stated:
+        soft = span
+        span = steady_part([one.between(span[0], span[1]) for one in series], *span)
+        span = (
+            span[0] if options.start_s is None else soft[0],
+            span[1] if options.stop_s is None else soft[1],
+        )
+        _warn_soft(soft, span, warn)
     start, stop = (origin + round(time_s * _NS) for time_s in span)
     period = max((one.period_s for one in series if one.count > 1), default=0.0)
     # Moving to the last sample: that sample's own interval belongs to it.
     ends = stretch.stop_ns - stop <= 2 * round(period * _NS)
     return stretch.intersect(start, None if ends else stop)
+
+
+def _warn_soft(motion: tuple[float, float], steady: tuple[float, float], warn: Warn) -> None:
+    """Report what is left out by the amplitude of the commands."""
+    ends = (
+        ("start", "before", steady[0] - motion[0], "--start"),
+        ("stop", "after", motion[1] - steady[1], "--stop"),
+    )
+    for kind, when, left_s, option in ends:
+        if left_s > 0:
+            warn(
+                f"soft {kind}: {left_s:.1f} s {when} the commands have their steady amplitude are "
+                f"left out (choose with {option})"
+            )

@@ -18,6 +18,10 @@ _SHORT = {
     "/joint_temperature": "Temperature",
     "/joint_velocity": "Velocity",
     "/energy_ledger": "Ledger",
+    "/joint_power/mechanical": "Mechanical power",
+    "/joint_power/mechanical_plus": "Mechanical power, positive part",
+    "/joint_power/electrical": "Electrical power",
+    "/joint_power/electrical_plus": "Electrical power, positive part",
 }
 _UNITS = {"degC": "°C"}
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import rerun as rr
 
-from analysis.results.analysis import Analysis
+from analysis.results.analysis import Analysis, GroupFacts
 from analysis.text.formats import utc
 from capture import Session
 
@@ -114,11 +114,23 @@ def _gait(analysis: Analysis | None) -> list[str]:
     if analysis is None or analysis.gait.frequency_hz.value is None:
         return []
     text = f"{analysis.gait.frequency_hz.value:.3f} Hz"
+    if len(analysis.gait.groups) > 1:
+        return [_group(group) for group in analysis.gait.groups]
     if analysis.gait.wave is not None:
         text += f", wave {analysis.gait.wave}"
     for plane, lag in analysis.gait.lag_per_joint_rad.items():
         text += f", {math.degrees(lag):.1f}° a joint ({plane})"
     return [text]
+
+
+def _group(group: GroupFacts) -> str:
+    """Frequency, number of joints and wave of one group."""
+    text = f"{group.frequency_hz.value:.3f} Hz ({len(group.joints)} joints)"
+    if group.wave is not None:
+        text += f", wave {group.wave}"
+    for plane, lag in group.lag_per_joint_rad.items():
+        text += f", {math.degrees(lag):.1f}° a joint ({plane})"
+    return text
 
 
 def _health(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:

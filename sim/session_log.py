@@ -3,10 +3,11 @@
 What the sensors tell is written when it arrives at the robot's computer: ``header.stamp`` is the
 sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
 joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
-means over one control period, so that energies computed from the log are right
-(:mod:`sim.sensing.polling`). Commands, gait, odometry and ledger are the twin's own and carry the
-tick. Time is simulated: nothing of the machine's clock enters the file, and the same scenario gives
-the same bytes.
+means over one control period (:mod:`sim.sensing.polling`). Their products miss what happens within
+a period, so each joint's powers are logged besides, accumulated at the physics rate. Commands,
+gait, odometry, powers and ledger are the twin's own; powers carry the middle of their period, the
+others the tick. Time is simulated: nothing of the machine's clock enters the file, and the same
+scenario gives the same bytes.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from importlib.metadata import version
 
 import numpy as np
 
+from capture.log.power_topics import PowerTopic
 from capture.log.sensor_channels import open_sensor
 from capture.log.writer import SessionWriter
 from capture.robot.kinematics import rotation_from_quaternion
 
+from .physics.energy_flows import JOINT_TERMS
 from .physics.engine import Kernels
 from .physics.ledger import TERMS
 from .scenario import CONTROL_RATE_HZ, Scenario
@@ -35,6 +38,16 @@ GAIT_UNIT = "rad, omega in rad/s"
 
 _TF_EVERY = 5  # ticks: 20 Hz, a view aid
 _TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
+_POWER_TERMS = {
+    PowerTopic.MECHANICAL: JOINT_TERMS.index("mechanical_net"),
+    PowerTopic.MECHANICAL_PLUS: JOINT_TERMS.index("mechanical_plus"),
+    PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
+    PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
+}
+"""Rows of :attr:`sim.twin.Sample.joint_energy` whose rates of change are logged."""
+
+_POWER_PER_W = float(2**24)
+"""Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes."""
 
 
 def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mapping[str, str]:
@@ -89,6 +102,8 @@ class SessionLog:
         self._voltage = writer.joint_state("/joint_voltage", names, unit="V")
         told = twin.gait.names  # recorded commands may come without their gait
         self._gait = writer.joint_state("/gait", told, unit=GAIT_UNIT) if told else None
+        self._powers = {topic: writer.joint_state(topic, names, unit="W") for topic in _POWER_TERMS}
+        self._booked = 0, np.zeros((len(JOINT_TERMS), len(names)))
         self._energy = writer.joint_state("/energy_ledger", TERMS, unit="J")
         self._odometry = writer.odometry("/odom", frame="world", child=head)
         self._transforms = writer.transforms(
@@ -134,6 +149,7 @@ class SessionLog:
         if self._gait is not None:
             self._gait.write(t_ns, sample.gait.values)
         self._energy.write(t_ns, sample.energy)
+        self._write_powers(sample)
         position, quaternion = body.position[:, 0], body.quaternion[:, 0]
         into_head = rotation_from_quaternion(quaternion).T
         self._odometry.write(
@@ -170,6 +186,18 @@ class SessionLog:
         self._offsets.write(t_ns, sample.offset_s, log_time_ns=now_ns)
         self._current.write(t_ns, sample.current, log_time_ns=now_ns)
         self._voltage.write(t_ns, sample.voltage, log_time_ns=now_ns)
+
+    def _write_powers(self, sample: Sample) -> None:
+        """Write the joints' mean powers since the sample before."""
+        (tick, energy), self._booked = self._booked, (sample.tick, sample.joint_energy)
+        if sample.tick == tick:  # the first sample
+            return
+        length_ns = (sample.tick - tick) * _TICK_NS
+        power = (sample.joint_energy - energy) * (1e9 / length_ns)
+        power = np.rint(power * _POWER_PER_W) / _POWER_PER_W
+        middle_ns = self._t_ns - length_ns // 2
+        for topic, row in _POWER_TERMS.items():
+            self._powers[topic].write(middle_ns, power[row], log_time_ns=self._t_ns)
 
     def _note(self, sample: Sample) -> None:
         """Say what deserves saying about a sample."""

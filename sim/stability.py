@@ -28,8 +28,12 @@ from capture.robot import Plane, Robot
 from .physics.servo import COULOMB_SPEED, Servos
 from .scenario import Scenario
 from .world import FrictionLaw
+from .world.obstacle_contact import yielding
 
-_BOUNDED = ("world.ground.slip_speed", "servo.coulomb_friction")
+_BOUNDED = (
+    *("world.ground.slip_speed", "servo.coulomb_friction"),
+    "world.obstacle_contact.slip_speed",
+)
 _ACROSS, _TURN, _OTHER, _BASE = range(4)
 """The base has three coordinates: its shift across the body, its turn, and, as the third, its roll
 (horizontal plane) or its shift along the body (vertical plane)."""
@@ -237,8 +241,8 @@ def _obstacle_parts(
 ) -> Iterator[_Part]:
     """An obstacle at the end of a link, the one with the least mass behind it.
 
-    Obstacles push sideways only. How much of their friction's smoothing is used depends on the
-    press, which is not known beforehand.
+    Obstacles push sideways only. Their friction is at most a damper that stops the link, were it
+    free, within one step, however hard it is pressed (:mod:`sim.world.obstacle_contact`).
     """
     if plane is Plane.VERTICAL or not scenario.world.obstacles:
         return
@@ -246,6 +250,12 @@ def _obstacle_parts(
     half = np.array([[link.length / 2] for link in scenario.robot.links])
     ends = np.concatenate([shift + half * turn, shift - half * turn])
     give = (ends * np.linalg.solve(mass, ends.T).T).sum(axis=1)  # 1 / mass behind each
-    weakest, one = ends[[np.argmax(give)]], np.ones(1)
+    at = int(np.argmax(give))
+    weakest, one = ends[[at]], np.ones(1)
     yield _Part("world.obstacle_contact.stiffness", dt**2 * material.stiffness * one, weakest)
     yield _Part("world.obstacle_contact.damping", 2 * dt * material.damping * one, weakest)
+    if material.mu > 0.0:
+        link = scenario.robot.links[at % len(half)]
+        arm = (link.length / 2) ** 2 + link.radius**2
+        stopping = 2.0 / yielding(arm * one, link.mass * one, min(link.inertia) * one)
+        yield _Part("world.obstacle_contact.slip_speed", stopping, weakest)

@@ -89,6 +89,8 @@ def _fit_for_null(
     unknown = [n for n in robot.joint_names if n not in responses or responses[n].count < 2]
     if unknown:
         raise DataError(f"no angles of {', '.join(unknown)}")
+    if gait.others:
+        raise DataError("joints have several frequencies, and the null has one")
     planes = by_plane(robot, gait.driven)
     if len(planes) > 1:
         raise DataError("both planes are driven, and the null is planar")

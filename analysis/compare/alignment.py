@@ -11,9 +11,9 @@ from capture.errors import DataError
 
 from ..experiment.runs import (
     SAME_COMMAND,
-    SAME_FREQUENCY,
     GaitRun,
     command_change,
+    other_frequency,
 )
 from ..text import formats
 
@@ -92,14 +92,19 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
     Returns:
         The reason, or None within 0.5 % of the frequency and 1 % of every command's amplitude.
     """
-    if abs(run.frequency_hz - model.frequency_hz) > SAME_FREQUENCY * model.frequency_hz:
-        return (
-            f"{run.label} has {run.frequency_hz:.4g} Hz, {model.label} {model.frequency_hz:.4g} Hz"
-        )
+    different = other_frequency(run, model)
+    if different is not None:
+        return f"{run.label} has {different[0]} Hz, {model.label} {different[1]} Hz"
     own, other = (
         np.array([one.command[one.names.index(name)] for name in names]) for one in (run, model)
     )
-    change = command_change(own, other)
+    groups, others = ([one.group[one.names.index(name)] for name in names] for one in (run, model))
+    if groups != others:
+        return f"{run.label} has other joints than {model.label} at one frequency"
+    change = np.ones_like(own)
+    for group in set(groups):
+        members = [k for k, one in enumerate(groups) if one == group]
+        change[members] = command_change(own[members], other[members])
     deviation = np.abs(change - 1)
     worst = int(np.argmax(deviation))
     if deviation[worst] <= SAME_COMMAND:

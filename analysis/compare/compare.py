@@ -176,7 +176,7 @@ def _waveforms(
     for name in names:
         if not all(name in one.cycles for one in (*a, *b)):
             continue
-        sides = [[_by_first(one, name, names[0]) for one in side] for side in (a, b)]
+        sides = [[_by_first(one, name, names) for one in side] for side in (a, b)]
         if design == "sessions":
             first, second = sides[0][0], sides[1][0]
             difference = independent(first, second)
@@ -203,10 +203,13 @@ def _waveforms(
     return tuple(found)
 
 
-def _by_first(one: Seen, name: str, reference: str) -> Quantities:
-    """A mean cycle by the phase of the first joint in common."""
+def _by_first(one: Seen, name: str, names: Sequence[str]) -> Quantities:
+    """A mean cycle by the phase of the first joint in common that has the same frequency."""
     run = one.run
-    commands = run.command[[0, run.names.index(reference)]]
+    group = run.group[run.names.index(name)]
+    members = [k for k, own in enumerate(run.group) if own == group]
+    reference = next(k for k in members if run.names[k] in names)
+    commands = run.command[[members[0], reference]]
     return turned(one.cycles[name], float(np.angle(commands[0] / commands[1])))
 
 

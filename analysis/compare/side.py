@@ -39,7 +39,7 @@ class Seen:
         facts: What it says of how it was made.
         estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
             cost of transport of the body.
-        cycles: Mean cycle of each joint by the phase of the first driven joint's command [rad].
+        cycles: Mean cycle of each joint by the phase of the first command of its group [rad].
     """
 
     analysis: Analysis
@@ -109,16 +109,19 @@ def turned(cycle: Quantities, by_rad: float) -> Quantities:
 def _responses(measured: Measured, run: GaitRun) -> dict[Key, Known]:
     gait = measured.gait
     found: dict[Key, Known] = {}
-    if gait is None or gait.response is None:
+    if gait is None:
         return found
     sound = {n for n, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
-    response = gait.response
-    for k, name in enumerate(gait.answered):
-        if name in sound:
-            dof = float(response.dof[k])
-            gain = float(np.log(response.gain[k]))
-            found["gain", name] = gain, float(response.log_gain_variance[k]), dof
-            found["lag", name] = float(response.lag_rad[k]), float(response.lag_variance[k]), dof
+    for group in gait.groups:
+        response = group.response
+        if response is None:
+            continue
+        for k, name in enumerate(group.answered):
+            if name in sound:
+                dof = float(response.dof[k])
+                gain, lag = float(np.log(response.gain[k])), float(response.lag_rad[k])
+                found["gain", name] = gain, float(response.log_gain_variance[k]), dof
+                found["lag", name] = lag, float(response.lag_variance[k]), dof
     return found
 
 
@@ -143,15 +146,16 @@ def _cycles(measured: Measured, run: GaitRun) -> dict[str, Quantities]:
     found: dict[str, Quantities] = {}
     if gait is None:
         return found
-    for k, name in enumerate(gait.answered):
-        cut = cycles_by_phase(
-            measured.responses[name],
-            gait.fit,
-            len(gait.driven) + k,
-            zero_rad=float(np.angle(run.command[0])),
-            start_s=span.start_s,
-            stop_s=span.stop_s,
-        )
-        if len(cut) > 1:
-            found[name] = from_runs(cut)
+    for group, members in zip(gait.groups, run.by_group, strict=True):
+        for k, name in enumerate(group.answered):
+            cut = cycles_by_phase(
+                measured.responses[name],
+                group.fit,
+                len(group.driven) + k,
+                zero_rad=float(np.angle(run.command[members[0]])),
+                start_s=span.start_s,
+                stop_s=span.stop_s,
+            )
+            if len(cut) > 1:
+                found[name] = from_runs(cut)
     return found

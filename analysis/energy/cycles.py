@@ -80,6 +80,7 @@ def energy_result(
         source,
         transport,
         closure,
+        _unknown(energies.values()),
     )
 
 
@@ -99,6 +100,19 @@ def electrical_source(session: Session, columns: Columns) -> str | None:
     if "scenario" in session.metadata.get("undulog", {}):
         return "simulated"
     return "supply" if _all_steady(columns.voltage[name].values for name in both) else "motor"
+
+
+def _unknown(energies: Iterable[Energies]) -> str | None:
+    """What the log leaves open, in one sentence."""
+    sampled = frozenset[str]().union(*(one.sampled for one in energies))
+    factors = {"mechanical": "torque and velocity", "electrical": "voltage and current"}
+    parts = [f"{kind} energies are products of sampled {factors[kind]}" for kind in sorted(sampled)]
+    if not parts:
+        return None
+    return (
+        f"{' and '.join(reversed(parts))}: what these do within a sampling interval is not in the "
+        "log, so the error is unknown"
+    )
 
 
 def _all_steady(voltages: Iterable[FloatArray]) -> bool:

@@ -2,8 +2,10 @@
 
 E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
 can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
-times motor current, signed and clipped. Gaps are not bridged: the weights of
-:func:`analysis.estimators.series.sample_weights` count no time inside them.
+times motor current, signed and clipped. Where the log has the powers themselves, accumulated within
+each sampling interval (:class:`capture.log.power_topics.PowerTopic`), their means are added up;
+else sampled factors are multiplied, and what the two do within an interval is lost. Gaps are not
+bridged: no time inside them counts.
 """
 
 from __future__ import annotations
@@ -70,6 +72,38 @@ def integrate(
         plus = cycle_sums(np.maximum(work, 0.0, out=work), last.starts)
         found.append(Energy(net, plus, last.coverage, last.covered))
     return found
+
+
+def add_up(net: Series, plus: Series, start_s: float, stop_s: float, cycles: int) -> Energy | None:
+    """Add up mean powers over one window; each holds for one sampling interval about its time.
+
+    Args:
+        net: Mean powers [W], shape (n,).
+        plus: Means of their positive parts [W], at the same times.
+        start_s: Start of the window [s].
+        stop_s: Its end [s].
+        cycles: Parts of equal length that the window is cut into, c.
+
+    Returns:
+        The energies, or None where the window has no samples or the two differ in their times.
+    """
+    if stop_s <= start_s or net.count < 2 or not np.array_equal(net.t_s, plus.t_s):
+        return None
+    length_s = net.period_s
+    begin = net.t_s - length_s / 2
+    edges = np.linspace(start_s, stop_s, cycles + 1)
+    last = np.maximum(np.searchsorted(begin, edges, side="right") - 1, 0)
+    within = np.clip(edges - begin[last], 0.0, length_s)
+
+    def of(values: FloatArray) -> FloatArray:
+        before = np.concatenate(([0.0], np.cumsum(values)))[last] * length_s
+        return np.diff(before + values[last] * within)
+
+    time_s = of(np.ones(net.count))
+    if not time_s.any():
+        return None
+    share = np.minimum(time_s * cycles / (stop_s - start_s), 1.0)
+    return Energy(of(net.values), of(plus.values), float(share.mean()), share)
 
 
 def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:

@@ -1,13 +1,12 @@
 """Energies against the twin's own ledger, where a session has one.
 
-The twin books energy at its physics rate; an analysis integrates samples that are ten times
-rarer and always fall at the same instant of the control cycle. Where the two differ, that is the
-sampling, and it is said.
+The twin books energy at its physics rate. An analysis that has to multiply samples misses what
+happens between them; where the two differ by much, there is a warning.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -20,6 +19,15 @@ from ..reading import Warn
 from ..results.energy import Closure
 
 LEDGER_TOPIC = "/energy_ledger"
+TERMS = {
+    "net": ("mechanical", "mechanical_net"),
+    "plus": ("mechanical", "mechanical_plus"),
+    "abs": ("mechanical", "mechanical_abs"),
+    "el": ("electrical", "electrical_net"),
+    "el_clipped": ("electrical", "electrical_plus"),
+}
+"""Energy to what it is of, and to its term in the ledger."""
+
 TOLERANCE = 0.05
 """Difference, as a share of the absolute energy, that is worth a warning."""
 
@@ -38,13 +46,54 @@ def check_ledger(
     Returns:
         The closure, or None where the session has no ledger.
     """
-    if LEDGER_TOPIC not in session.channels:
-        return None
     try:
-        ledger = session.joints(LEDGER_TOPIC)
+        booked = booked_energies(session, span)
     except (DataError, LogError) as error:
         warn(f"{LEDGER_TOPIC} can't be read: {error}")
         return None
+    if booked is None:
+        return None
+    found = whole_robot(energies)
+    off: dict[str, float] = {}
+    for name, (kind, term) in TERMS.items():
+        if name in found and term in booked:
+            off[name] = found[name] - booked[term]
+            scale = max(found["abs" if kind == "mechanical" else "el_abs"], abs(booked[term]))
+            if name in ("net", "el") and abs(off[name]) > TOLERANCE * scale:
+                warn(
+                    f"{kind} energy is {found[name]:.4g} J from the samples but {booked[term]:.4g} "
+                    f"J in the twin's ledger ({LEDGER_TOPIC}): samples once a control cycle miss "
+                    "what happens within it"
+                )
+    whole = booked.get("mechanical_abs", 0.0)
+
+    def share(energy_j: float | None) -> float | None:
+        return None if energy_j is None or whole <= 0 else energy_j / whole
+
+    return Closure(
+        mechanical_balance=share(booked.get("mechanical_residual")),
+        electrical_balance=share(booked.get("electrical_residual")),
+        **{name: share(off.get(name)) for name in TERMS},
+    )
+
+
+def booked_energies(session: Session, span: Span) -> dict[str, float] | None:
+    """What the twin's ledger books over a window.
+
+    Args:
+        session: An open session.
+        span: The window.
+
+    Returns:
+        Energies of the whole robot [J], by the ledger's terms; None where there is no ledger.
+
+    Raises:
+        DataError: If the ledger's topic can't be read.
+        LogError: If the file can't.
+    """
+    if LEDGER_TOPIC not in session.channels:
+        return None
+    ledger = session.joints(LEDGER_TOPIC)
     booked: dict[str, float] = {}
     for name, t_ns, values in zip(ledger.names, ledger.t_ns, ledger.values, strict=True):
         term = clean(name, t_ns, values, span.origin_ns)
@@ -54,32 +103,27 @@ def check_ledger(
                 float(np.interp(t, term.t_s, term.values)) for t in (span.stop_s, span.start_s)
             )
             booked[name] = late - early
+    return booked
+
+
+def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
+    """Energies of all joints together.
+
+    Args:
+        energies: Of the joints.
+
+    Returns:
+        Sums [J], by the names in :data:`TERMS`, with ``el_abs`` besides; those that no joint has
+        are absent.
+    """
     joints = list(energies)
-    mechanical = [one.mechanical for one in joints if one.mechanical is not None]
-    electrical = [one.electrical for one in joints if one.electrical is not None]
-    off: dict[str, float] = {}
-    for name, found in (("mechanical", mechanical), ("electrical", electrical)):
-        if not found or f"{name}_net" not in booked:
-            continue
-        ours = sum(float(one.net_j.sum()) for one in found)
-        scale = sum(float(one.abs_j.sum()) for one in found)
-        theirs = booked[f"{name}_net"]
-        off[name] = ours - theirs
-        if abs(ours - theirs) > TOLERANCE * max(scale, abs(theirs)):
-            warn(
-                f"{name} energy is {ours:.4g} J from the samples but {theirs:.4g} J in the twin's "
-                f"ledger ({LEDGER_TOPIC}): samples once a control cycle miss what happens within it"
-            )
-    whole = booked.get("mechanical_abs", 0.0)
-
-    def share(energy_j: float | None) -> float | None:
-        return None if energy_j is None or whole <= 0 else energy_j / whole
-
-    absolute = sum(float(one.abs_j.sum()) for one in mechanical) if mechanical else None
-    return Closure(
-        mechanical_balance=share(booked.get("mechanical_residual")),
-        electrical_balance=share(booked.get("electrical_residual")),
-        net=share(off.get("mechanical")),
-        abs=share(None if absolute is None else absolute - whole),
-        el=share(off.get("electrical")),
-    )
+    sums: dict[str, float] = {}
+    for kind, names in (
+        ("mechanical", ("net", "plus", "abs")),
+        ("electrical", ("el", "el_clipped", "el_abs")),
+    ):
+        known = [one for one in (getattr(joint, kind) for joint in joints) if one is not None]
+        for name, part in zip(names, ("net_j", "plus_j", "abs_j"), strict=True):
+            if known:
+                sums[name] = sum(float(getattr(one, part).sum()) for one in known)
+    return sums

@@ -4,7 +4,8 @@ The model of channel k, sampled at its own times t, is (IEEE Std 1057, sine fit,
 
     y_k(t) = sum_d b_kd t^d + Re sum_h a_kh exp(j h omega t),    h = 1 .. harmonics
 
-with one omega for all channels. Given omega it is linear; omega itself is found by Gauss-Newton
+with one omega for all channels, and further sines of known frequencies where other channels have
+rhythms of their own. Given omega it is linear; omega itself is found by Gauss-Newton
 on the variable projection functional (Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973, in Kaufman's
 form, BIT 15, 1975). The noise level of each channel is unknown, so the weights are those of
 maximum likelihood: one over the channel's own residual variance, renewed at every step.
@@ -40,8 +41,8 @@ class HarmonicFit:
         omega: Shared angular frequency [rad/s].
         amplitudes: Complex amplitudes a_kh at t = 0 in the unit of the channel, shape (K, h).
         trend: Polynomial coefficients b_kd, ascending powers of t [unit/s^d], shape (K, d + 1).
-        inverse_gram: (Phi^T Phi)^-1 for the parameters (b in scaled time, then Re a, Im a of each
-            harmonic), shape (K, p, p).
+        inverse_gram: (Phi^T Phi)^-1 for the parameters (b in scaled time, then Re and Im of each
+            further line and of each harmonic), shape (K, p, p).
         information: |P g|^2, the squared length of dy/domega outside the span of the model:
             Fisher information of omega is their sum over noise variance, shape (K,).
         weight: One over residual variance, the channel's weight in the fit of omega, shape (K,).
@@ -50,6 +51,7 @@ class HarmonicFit:
         count: Samples, shape (K,).
         mean_time_s: Mean sampling time, shape (K,).
         model: What was fitted.
+        lines: Complex amplitudes of the model's further lines, shape (K, lines).
     """
 
     omega: float
@@ -63,6 +65,7 @@ class HarmonicFit:
     count: FloatArray
     mean_time_s: FloatArray
     model: HarmonicModel
+    lines: ComplexArray
 
     @property
     def frequency_hz(self) -> float:
@@ -89,11 +92,12 @@ class HarmonicFit:
             scale: Unit of the rows' scaled time [s].
 
         Returns:
-            Trend in scaled time, then real and imaginary part of each harmonic, shape (k, p).
+            Trend in scaled time, then real and imaginary part of each further line and of each
+            harmonic, shape (k, p).
         """
         index = np.asarray(channels, dtype=np.int64)
         trend = self.trend[index] * scale ** np.arange(self.model.trend + 1.0)
-        parts = self.amplitudes[index]
+        parts = np.concatenate([self.lines[index], self.amplitudes[index]], axis=1)
         harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(index.size, -1)
         return np.concatenate([trend, harmonic], axis=1)
 
@@ -112,6 +116,8 @@ class HarmonicFit:
             value = value * t_s + coefficient
         for h, amplitude in enumerate(self.amplitudes[channel], start=1):
             value = value + np.real(amplitude * np.exp(1j * h * self.omega * t_s))
+        for line, amplitude in zip(self.model.lines, self.lines[channel], strict=True):
+            value = value + np.real(amplitude * np.exp(1j * line * t_s))
         return value
 
 
@@ -213,6 +219,7 @@ def _gathered(
     """All groups' parameters in the order of the channels, after a last small step of omega."""
     amplitudes = np.zeros((count, model.harmonics), dtype=np.complex128)
     trend = np.zeros((count, model.trend + 1))
+    lines = np.zeros((count, len(model.lines)), dtype=np.complex128)
     inverse = np.zeros((count, model.size, model.size))
     information, weight, rss, total, samples, mean_time = np.zeros((6, count))
     for k, one in solved:
@@ -221,8 +228,10 @@ def _gathered(
         theta = one.theta + one.drift * (step * moments.scale)
         trend[k] = (theta[: model.trend + 1] * scale[:, None]).T
         trend[k, 0] += moments.mean
-        parts = theta[model.trend + 1 :].reshape(model.harmonics, 2, -1)
+        parts = theta[model.first :].reshape(model.harmonics, 2, -1)
         amplitudes[k] = (parts[:, 0] + 1j * parts[:, 1]).T
+        others = theta[model.trend + 1 : model.first].reshape(len(model.lines), 2, len(k))
+        lines[k] = (others[:, 0] + 1j * others[:, 1]).T
         inverse[k] = one.inverse_gram
         left = one.rss - 2 * one.projected * (step * moments.scale)
         weight[k], rss[k], total[k] = one.weight, np.maximum(left, 0.0), moments.power
@@ -240,4 +249,5 @@ def _gathered(
         count=samples,
         mean_time_s=mean_time,
         model=model,
+        lines=lines,
     )

@@ -32,15 +32,22 @@ class HarmonicModel:
     Attributes:
         harmonics: Highest harmonic, at least 1.
         trend: Degree of the polynomial beside them; 0 is a constant.
+        lines: Angular frequencies of further sines, of rhythms that other channels have [rad/s].
     """
 
     harmonics: int = 3
     trend: int = 0
+    lines: tuple[float, ...] = ()
+
+    @property
+    def first(self) -> int:
+        """Index of the fundamental's first row: polynomial and further lines come before it."""
+        return self.trend + 1 + 2 * len(self.lines)
 
     @property
     def size(self) -> int:
-        """Parameters of one channel, p = trend + 1 + 2 harmonics."""
-        return self.trend + 1 + 2 * self.harmonics
+        """Parameters of one channel, p = trend + 1 + 2 lines + 2 harmonics."""
+        return self.first + 2 * self.harmonics
 
 
 @dataclass(frozen=True)
@@ -73,7 +80,7 @@ class Solved:
 def basis(
     t_s: FloatArray, omega: float, model: HarmonicModel, scale: float, spare: int = 0
 ) -> FloatArray:
-    """Rows of the model: powers of t/scale, then cos and -sin of each harmonic.
+    """Rows of the model: powers of t/scale, then cos and -sin of each line and each harmonic.
 
     With cos and -sin, the coefficients are the real and imaginary part of the complex amplitude.
 
@@ -91,7 +98,11 @@ def basis(
     rows[0] = 1.0
     for d in range(1, model.trend + 1):
         rows[d] = rows[d - 1] * (t_s / scale)
-    turned = rows[model.trend + 1 : model.size].reshape(model.harmonics, 2, -1)
+    for k, line in enumerate(model.lines):
+        place = model.trend + 1 + 2 * k
+        rows[place], sine = cos_sin(line * t_s)
+        np.negative(sine, out=rows[place + 1])
+    turned = rows[model.first : model.size].reshape(model.harmonics, 2, -1)
     turned[0, 0], sine = cos_sin(omega * t_s)
     np.negative(sine, out=turned[0, 1])
     # cos((h + 1) x) = 2 cos x cos(h x) - cos((h - 1) x), and the sine likewise.
@@ -157,7 +168,7 @@ def _moments(group: Sequence[Series], omega: float, model: HarmonicModel) -> Mom
     power = np.zeros(len(group))
     for part in chunks(t_s.size):
         rows = basis(t_s[part], omega, model, scale, spare=q - p)
-        np.multiply(rows[model.trend + 1 : p], t_s[part] / scale, out=rows[p:])
+        np.multiply(rows[model.first : p], t_s[part] / scale, out=rows[p:])
         values = np.stack([one.values[part] for one in group]) - mean[:, None]
         gram += rows @ rows.T
         cross += rows @ values.T
@@ -179,7 +190,7 @@ def _solve(moments: Moments, model: HarmonicModel) -> Solved:
     theta = inverse @ cross[:p]
     rss = np.maximum(moments.power - np.einsum("pk,pk->k", theta, cross[:p]), 0.0)
     # g = dy/d(omega scale) = sum_h h (t/scale) (Im-part row * Re a - Re-part row * Im a).
-    gamma = -_turned(theta[model.trend + 1 :], model)
+    gamma = -_turned(theta[model.first :], model)
     slope = gram[:p, p:] @ gamma
     squared = np.einsum("dk,dk->k", gamma, gram[p:, p:] @ gamma) - np.einsum(
         "pk,pk->k", slope, inverse @ slope
@@ -188,7 +199,7 @@ def _solve(moments: Moments, model: HarmonicModel) -> Solved:
     projected = np.einsum("dk,dk->k", gamma, left)
     # The normal equations' derivative: the rows turn, and so does the model.
     change = -slope
-    change[model.trend + 1 :] += _turned(left, model)
+    change[model.first :] += _turned(left, model)
     return Solved(
         moments,
         theta,

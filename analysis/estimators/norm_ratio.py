@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from scipy.special import chdtri
 
 from capture.arrays import ComplexArray, FloatArray
 
@@ -21,7 +22,10 @@ DRAWS = 400
 
 
 class Noisy(Protocol):
-    """A matrix with standard errors and their degrees of freedom, all of shape (m, m)."""
+    """A matrix with standard errors and their degrees of freedom, all of shape (n, m).
+
+    ``correlation`` is that of a column's errors, shape (n, n), or None where they are independent.
+    """
 
     @property
     def value(self) -> FloatArray: ...  # noqa: D102
@@ -29,6 +33,8 @@ class Noisy(Protocol):
     def error(self) -> FloatArray: ...  # noqa: D102
     @property
     def dof(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def correlation(self) -> FloatArray | None: ...  # noqa: D102
 
 
 def noise_draws(matrix: Noisy, seed: int) -> FloatArray:
@@ -39,11 +45,18 @@ def noise_draws(matrix: Noisy, seed: int) -> FloatArray:
         seed: Of the draws.
 
     Returns:
-        Student draws, shape (DRAWS, m, m).
+        Student draws, shape (DRAWS, n, m). Where errors of a column are correlated their variances
+        come from the same runs, so all are too small together.
     """
     random = np.random.default_rng(seed)
-    dof = np.broadcast_to(matrix.dof, (DRAWS, *matrix.dof.shape))
-    return matrix.error * random.standard_t(dof)
+    if matrix.correlation is None:
+        dof = np.broadcast_to(matrix.dof, (DRAWS, *matrix.dof.shape))
+        return matrix.error * random.standard_t(dof)
+    values, vectors = np.linalg.eigh(matrix.correlation)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    normal = root @ random.standard_normal((DRAWS, *matrix.error.shape))
+    level = random.uniform(size=(DRAWS, 1, 1))
+    return matrix.error * normal * np.sqrt(matrix.dof / chdtri(matrix.dof, level))
 
 
 def norm_ratio(

@@ -134,7 +134,7 @@ def rounding_covariance(
     Returns:
         Of (Re a, Im a), shape (2, 2), from draws that are the same at each call.
     """
-    t_s, model, first = one.t_s, fit.model, fit.model.trend + 1
+    t_s, model, first = one.t_s, fit.model, fit.model.first
     scale = time_scale(t_s)
     theta = fit.parameters([channel], scale)[0]
     weight = fit.inverse_gram[channel][first : first + 2]

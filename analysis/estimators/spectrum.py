@@ -185,7 +185,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
     exact = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
     floor = np.maximum(exact - level, 0.0)
     level += floor
-    first = fit.model.trend + 1
+    first = fit.model.first
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
     spread = np.trace(block, axis1=1, axis2=2)
     covariance = level[:, None, None] * block
@@ -296,7 +296,7 @@ def residuals(
     t_s = group[0].t_s
     scale = time_scale(t_s)
     theta = fit.parameters(members, scale)
-    first = fit.model.trend + 1
+    first = fit.model.first
     wider = replace(fit.model, harmonics=fit.model.harmonics + 1)
     for part in chunks(t_s.size):
         rows = basis(t_s[part], fit.omega, wider, scale)
@@ -355,7 +355,7 @@ def _turned_rows(rows: FloatArray, edges: IntArray, model: HarmonicModel) -> Com
     Of a harmonic they are those of its neighbours: cos(h x) exp(-j x) is half the sum of
     exp(j (h - 1) x) and exp(-j (h + 1) x), and -sin(h x) exp(-j x) is j / 2 of their difference.
     """
-    first, h = model.trend + 1, model.harmonics
+    first, h = model.first, model.harmonics
     sums = np.add.reduceat(rows, edges, axis=1)
     parts = sums[first:].reshape(h + 1, 2, -1)
     back: ComplexArray = parts[:, 0] + 1j * parts[:, 1]  # exp(-j m x), m = 1 .. h + 1

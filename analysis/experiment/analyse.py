@@ -18,8 +18,9 @@ from ..analyse import Examined, examine_session
 from ..coupling import one_gait_coupling
 from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..kicks.answer import kick_answer
-from ..kicks.coupling import ROW_TOLERANCE, kick_coupling
+from ..kicks.coupling import kick_coupling
 from ..kicks.experiment import find_kicks
+from ..kicks.matrices import ROW_TOLERANCE
 from ..kicks.runs import MOST_KICK, MOST_PATTERN, SAME
 from ..oscillators.body import body_oscillators
 from ..reading import Warn

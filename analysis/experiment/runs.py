@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import zip_longest
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from capture.arrays import ComplexArray, FloatArray, IntArray
 from capture.robot import Robot
 
 from ..fitting import GaitFit
@@ -21,6 +22,7 @@ from ..gait import phase_step, wave_name
 from ..reading import by_plane
 from ..results.analysis import Analysis
 from ..text import formats
+from ..text.deciding import distinct
 
 SAME_COMMAND = 0.01
 """Largest deviation of a command, over its amplitude, that is the same gait still."""
@@ -45,11 +47,14 @@ class GaitRun:
         robot: Name of the robot, or None.
         start_ns: When it started [Unix ns].
         names: Driven joints, head to tail, m; none where there is no gait.
-        planes: Planes they are in.
-        frequency_hz: Of the gait.
-        command: Complex amplitudes of the commands [rad], shape (m,).
-        wave: Which way the wave runs.
+        planes: Planes they are in; of several groups, those of the group that is in most.
+        frequency_hz: Of the gait; of several groups, the largest group's.
+        command: Complex amplitudes of the commands, each at its group's frequency [rad], (m,).
+        wave: Which way the wave runs; of several groups, the largest group's.
         ratio: Response over command, NaN where it isn't known, shape (m,).
+        group: Index of each joint's group, m.
+        frequencies_hz: Of each group, the largest group first.
+        waves: Which way each group's wave runs.
     """
 
     label: str
@@ -61,6 +66,15 @@ class GaitRun:
     command: ComplexArray
     wave: str | None
     ratio: ComplexArray
+    group: tuple[int, ...] = ()
+    frequencies_hz: tuple[float, ...] = ()
+    waves: tuple[str | None, ...] = ()
+
+    @property
+    def by_group(self) -> list[IntArray]:
+        """Indices of each group's joints."""
+        groups = np.array(self.group, dtype=np.int64)
+        return [np.flatnonzero(groups == k) for k in range(len(self.frequencies_hz))]
 
 
 def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit | None) -> GaitRun:
@@ -79,24 +93,36 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
     if gait is None or not gait.driven:
         nothing = np.zeros(0, dtype=np.complex128)
         return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, nothing)
-    count = len(gait.driven)
-    command = gait.fit.fundamental[:count]
-    ratio = np.full(count, np.nan, dtype=np.complex128)
+    group_of = {joint: k for k, one in enumerate(gait.groups) for joint in one.driven}
+    chain = [joint.name for joint in analysis.joints if joint.name in group_of]
+    names = tuple(chain) if gait.others else gait.driven
+    command = np.zeros(len(names), dtype=np.complex128)
+    ratio = np.full(len(names), np.nan, dtype=np.complex128)
     known = {joint.name for joint in analysis.joints if joint.gain.value is not None}
-    if gait.response is not None:
-        for joint, one in zip(gait.answered, gait.response.ratio, strict=True):
-            if joint in known:
-                ratio[gait.command_of(joint)] = one
+    planes: list[tuple[str, ...]] = []
+    waves: list[str | None] = []
+    for group in gait.groups:
+        own = group.fit.fundamental[: len(group.driven)]
+        command[[names.index(joint) for joint in group.driven]] = own
+        planes.append(tuple(by_plane(robot, group.driven)))
+        waves.append(wave_name(phase_step(own)) if own.size > 1 else None)
+        if group.response is not None:
+            for joint, one in zip(group.answered, group.response.ratio, strict=True):
+                if joint in known:
+                    ratio[names.index(joint)] = one
     return GaitRun(
         label=label,
         robot=name,
         start_ns=start_ns,
-        names=gait.driven,
-        planes=tuple(by_plane(robot, gait.driven)),
+        names=names,
+        planes=max(planes, key=len),
         frequency_hz=gait.fit.frequency_hz,
         command=command,
-        wave=wave_name(phase_step(command)) if count > 1 else None,
+        wave=waves[0],
         ratio=ratio,
+        group=tuple(group_of[joint] for joint in names),
+        frequencies_hz=tuple(one.fit.frequency_hz for one in gait.groups),
+        waves=tuple(waves),
     )
 
 
@@ -197,33 +223,70 @@ def command_change(command: ComplexArray, model: ComplexArray) -> ComplexArray:
     return change
 
 
+def other_frequency(run: GaitRun, model: GaitRun) -> tuple[str, str] | None:
+    """Find a group whose frequency is not the model's.
+
+    Args:
+        run: A run.
+        model: Another one.
+
+    Returns:
+        Both frequencies [Hz] of the first such group, with the digits in which they differ; None
+        where they agree.
+    """
+    pairs = zip_longest(run.frequencies_hz, model.frequencies_hz, fillvalue=float("nan"))
+    for own, other in pairs:
+        if not abs(own - other) <= SAME_FREQUENCY * other:
+            return distinct(own, other)
+    return None
+
+
 def _unfit(run: GaitRun) -> str | None:
     if not run.names:
         return "has no gait"
     if len(run.planes) > 1:
         return "drives both planes; the reversal test is made of one wave"
-    if run.wave in (None, "standing"):
+    if any(wave in (None, "standing") for wave in run.waves):
         return "has no travelling wave, so there is no reverse of it"
     if not np.isfinite(run.ratio).any():
         return "has no gain and lag"
     return None
 
 
-def _difference(run: GaitRun, model: GaitRun) -> str | None:
-    """What makes a run another gait than the model's or its reverse; None if nothing does."""
+def _other_drive(run: GaitRun, model: GaitRun) -> str | None:
+    """What a run drives otherwise than the model; None if nothing but the wave differs."""
     if run.robot != model.robot:
         return f"is of {run.robot or 'no known robot'}, {model.label} of {model.robot or 'none'}"
     if run.names != model.names:
         return f"drives other joints than {model.label}"
-    if abs(run.frequency_hz - model.frequency_hz) > SAME_FREQUENCY * model.frequency_hz:
-        return f"has {run.frequency_hz:.4g} Hz, {model.label} {model.frequency_hz:.4g} Hz"
-    command = run.command if run.wave == model.wave else run.command[::-1]
-    change = command_change(command, model.command)
+    if run.group != model.group:
+        return f"has other joints than {model.label} at one frequency"
+    other = other_frequency(run, model)
+    return None if other is None else f"has {other[0]} Hz, {model.label} {other[1]} Hz"
+
+
+def _difference(run: GaitRun, model: GaitRun) -> str | None:
+    """What makes a run another gait than the model's or its reverse; None if nothing does."""
+    drive = _other_drive(run, model)
+    if drive is not None:
+        return drive
+    same = [own == way for own, way in zip(run.waves, model.waves, strict=True)]
+    if any(same) != all(same):
+        return f"has another direction of the wave than {model.label} in some groups only"
+    if not all(same) and run.group != run.group[::-1]:
+        return (
+            f"has the reverse wave of {model.label}, but its joints' frequencies, read from tail "
+            "to head, come in another order"
+        )
+    command = run.command if all(same) else run.command[::-1]
+    change = np.ones_like(command)
+    for members in model.by_group:
+        change[members] = command_change(command[members], model.command[members])
     deviation = np.abs(change - 1)
     worst = int(np.argmax(deviation))
     if deviation[worst] <= SAME_COMMAND:
         return None
-    joint = run.names[worst if run.wave == model.wave else -1 - worst]
+    joint = run.names[worst if all(same) else -1 - worst]
     percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
     degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
     return (

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..results.analysis import Coupling, Estimate
-from ..results.coupling import LocalCoupling, RowCheck
+from ..results.analysis import Coupling, Estimate, leaves_out_zero
+from ..results.coupling import LocalCoupling, RowCheck, RunScatter
 from ..text import formats
 
 
@@ -23,18 +23,64 @@ def kick_answer(coupling: Coupling) -> str:
     """
     if not isinstance(coupling, LocalCoupling):
         return f"coupling not identifiable from these kicks: {coupling.why}"
+    told = "; ".join(part for part in (_largest(coupling), _linear(coupling)) if part)
+    if not coupling.checks_pass:
+        # The first thing said: nothing below holds as it would for a settled gait.
+        told = f"doubtful, since {_rows_that_fail(coupling)} as shifting time demands; {told}"
+    size = coupling.kick_size
+    if size is not None and size.why is not None:
+        told = f"{told}; {size.why}"
+    return f"coupling around this gait: {told}"
+
+
+def _largest(coupling: LocalCoupling) -> str:
+    """The largest element of P off the diagonal that is shown to be one.
+
+    The largest of many is large by chance, too: its interval is that which holds for all elements
+    off the diagonal together.
+    """
     P = np.array(coupling.P.value)
+    half = np.array(coupling.P.ci95_half_together or coupling.P.ci95_half)
     off = ~np.eye(len(P), dtype=bool)
-    i, j = (int(k) for k in np.unravel_index(np.argmax(np.abs(P) * off), P.shape))
-    half = coupling.P.ci95_half[i][j]
-    largest = Estimate(float(P[i, j]), (float(P[i, j]) - half, float(P[i, j]) + half))
-    told = (
-        f"coupling around this gait: {coupling.joints[i]} follows the phase of "
-        f"{coupling.joints[j]} most, by {formats.estimate(largest)}"
+    shown = off & (np.abs(P) > half)
+    if not shown.any():
+        most = formats.number(float((np.abs(P) + half)[off].max()), 2)
+        return (
+            "no joint is shown to follow the phase of another, and none does by more than "
+            f"{most} (95 %, all pairs together)"
+        )
+    i, j = (int(k) for k in np.unravel_index(np.argmax(np.abs(P) * shown), P.shape))
+    low, high = float(P[i, j] - half[i, j]), float(P[i, j] + half[i, j])
+    return (
+        f"{coupling.joints[i]} follows the phase of {coupling.joints[j]} most, by "
+        f"{formats.estimate(Estimate(float(P[i, j]), (low, high)))}"
     )
-    if coupling.nonlinearity.value is None:
-        return told
-    return f"{told}; nonlinearity {formats.percent(coupling.nonlinearity)}"
+
+
+def _linear(coupling: LocalCoupling) -> str | None:
+    index = coupling.nonlinearity
+    if index.value is None:
+        return None
+    if leaves_out_zero(index.ci95):
+        return f"nonlinearity {formats.percent(index)}"
+    if index.ci95 is None:
+        return "whether it is linear is open"
+    most = formats.number(
+        100 * index.ci95[1], formats.decimals_for_values([100 * index.ci95[1]], 2)
+    )
+    return f"no nonlinearity is shown (at most {most} %)"
+
+
+def _rows_that_fail(coupling: LocalCoupling) -> str:
+    parts = (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
+    off = {
+        f"rows of {symbol} don't sum to {total}": max(
+            abs((row.total.value or 0.0) - row.expected) / max(row.standard_error, 1e-12)
+            for row in rows
+        )
+        for symbol, total, rows in parts
+    }
+    return max(off, key=lambda text: off[text])
 
 
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
@@ -48,6 +94,12 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
     """
     yield from kick_checks(coupling)
     yield from held_out_detail(coupling)
+    size = coupling.kick_size
+    if size is not None:
+        yield (
+            f"Kicks of {size.phase_rad:.2g} rad show couplings of {size.resolved:.2g} and more; "
+            f"what they do is {100 * size.curvature:.2g} % of second order: {size.verdict}."
+        )
 
 
 def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
@@ -64,6 +116,8 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
         f"Time shift: rows of P sum to 1 within {_worst(coupling.phase_rows)}, rows of R to 0 "
         f"within {_worst(coupling.gain_rows)}: {said}."
     )
+    if coupling.scatter is not None:
+        yield _scatter(coupling.scatter)
     lti = coupling.lti
     if lti.asymmetry.value is not None:
         bands = ", ".join(
@@ -94,6 +148,19 @@ def held_out_detail(coupling: LocalCoupling) -> Iterable[str]:
         )
     if coupling.valid_to is not None:
         yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
+
+
+def _scatter(scatter: RunScatter) -> str:
+    """How much runs differ, in degrees and percent."""
+    phase, gain = (np.array(one) for one in (scatter.phase_rad, scatter.log_gain))
+    noise = np.degrees(np.median(scatter.phase_noise_rad))
+    widened = "" if scatter.widened <= 1 else f"; errors widened by up to {scatter.widened:.2g}"
+    return (
+        f"Runs differ by {np.degrees(np.median(phase)):.2g}° (median of the joints, at most "
+        f"{np.degrees(phase.max()):.2g}°) and {100 * np.median(gain):.2g} % beyond the noise "
+        f"within them ({noise:.2g}°), with {scatter.dof} degrees of freedom; all intervals have "
+        f"it{widened}."
+    )
 
 
 def _worst(rows: tuple[RowCheck, ...]) -> str:

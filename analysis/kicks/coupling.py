@@ -14,28 +14,23 @@ from ..response import CONFIDENCE
 from ..results.analysis import Coupling, Estimate
 from ..results.coupling import (
     LTI_LABEL,
+    BaseResponse,
     HeldOut,
     LocalCoupling,
     Lti,
     Matrix,
     RowCheck,
+    RunScatter,
     rows_of,
 )
 from .experiment import KickExperiment
-from .local import (
-    Answers,
-    Measured,
-    answers_of,
-    central_differences,
-    nonlinearity,
-    row_sums,
-)
+from .local import Answers, Measured, RowSums, answers_of, nonlinearity
 from .lti_reading import LtiReading, lti_reading
+from .matrices import LocalMatrices, local_matrices
 from .runs import Kind, missing_kicks
+from .scatter import RunErrors
+from .size import kick_size
 from .validity import Prediction, predict, valid_to
-
-ROW_TOLERANCE = 1e-2
-"""Central differences of 0.05 leave curvature of third order in a row's sum."""
 
 
 def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
@@ -69,32 +64,36 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
             f"size; kicked is {'; '.join(lacking)}",
             record=plan,
         )
-    base = np.exp(np.log(experiment.ratio[list(experiment.runs.base)]).mean(axis=0))
+    first = experiment.ratio[experiment.runs.base[0]]
+    others = np.log(experiment.ratio[list(experiment.runs.base)] / first)
+    base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
     deviation = experiment.runs.deviation
     change = answers_of(deviation, experiment.ratio, base)
-    chosen = list(kicks)
+    each = [kicks.get(k) for k in used]
     answers = Answers(
-        change[chosen],
-        experiment.log_gain_variance[chosen],
-        experiment.lag_variance[chosen],
-        experiment.dof[chosen],
+        change[used],
+        experiment.log_gain_variance[used],
+        experiment.lag_variance[used],
+        experiment.dof[used],
     )
-    P, R = central_differences(list(kicks.values()), answers, Kind.PHASE)
-    S, G = _of_amplitude(experiment, answers, warn) or (None, None)
-    reading = lti_reading(P, R, base * experiment.command, experiment.command)
-    held = _held_out(experiment, change, base, (P, R, G, S))
+    found = local_matrices(each, answers, amplitude=_has_amplitude(experiment, warn))
+    P, R, G, S = found.P, found.R, found.G, found.S
+    correlation = found.errors.correlation
+    size = kick_size(each, answers, found)
+    reading = lti_reading(
+        P, R, base * experiment.command, experiment.command, correlation=correlation
+    )
+    held = _held_out(experiment, change, base, found)
     reached = valid_to([one for _, one in held])
-    rows = [
-        *_rows(experiment.names, P, 1.0),
-        *_rows(experiment.names, R, 0.0),
-    ]
-    checks = [one for one, _ in rows]
-    passed = all(good for _, good in rows)
+    passed = bool(found.agree.all())
     if not passed:
         warn(
             "rows of P don't sum to 1, or rows of R to 0, within their errors, as shifting time "
-            "demands of any settled gait: let each run settle longer before it is measured"
+            "demands of any settled gait: let each run settle longer before it is measured; errors "
+            f"are widened by up to {found.widened.max():.2g}"
         )
+    if size.why is not None:
+        warn(size.why)
     if not held:
         warn(
             "how far from the gait the matrices hold isn't known: record held-out runs in which "
@@ -117,49 +116,51 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         R=_matrix(R),
         G=None if G is None else _matrix(G),
         S=None if S is None else _matrix(S),
-        phase_rows=tuple(checks[:m]),
-        gain_rows=tuple(checks[m:]),
+        phase_rows=_rows(experiment.names, found.phase_rows, 1.0),
+        gain_rows=_rows(experiment.names, found.gain_rows, 0.0),
         checks_pass=passed,
-        nonlinearity=Estimate() if G is None or S is None else nonlinearity(P, R, G, S),
+        nonlinearity=Estimate()
+        if G is None or S is None
+        else nonlinearity(P, R, G, S, correlation=correlation),
         lti=_lti(reading),
         held_out=tuple(
             HeldOut(experiment.labels[k], one.size, one.error, one.error_kept, one.noise)
             for k, one in held
         ),
         valid_to=reached,
+        base=_base_response(experiment, base, found.errors),
+        scatter=_scatter(found),
+        kick_size=size,
     )
 
 
-def _of_amplitude(
-    experiment: KickExperiment, answers: Answers, warn: Warn
-) -> tuple[Measured, Measured] | None:
-    """S and G, or None with a warning where amplitudes were not kicked both ways."""
-    kicks = list(experiment.runs.kicks.values())
-    lacking = missing_kicks(kicks, Kind.AMPLITUDE, experiment.names)
-    if not lacking:
-        return central_differences(kicks, answers, Kind.AMPLITUDE)
-    warn(
-        "G, S and the nonlinearity are null: they need each joint's amplitude kicked both up and "
-        f"down by the same size; kicked is {'; '.join(lacking)}"
-    )
-    return None
+def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
+    """Whether S and G can be told; warns where amplitudes were not kicked both ways."""
+    lacking = missing_kicks(list(experiment.runs.kicks.values()), Kind.AMPLITUDE, experiment.names)
+    if lacking:
+        warn(
+            "G, S and the nonlinearity are null: they need each joint's amplitude kicked both up "
+            f"and down by the same size; kicked is {'; '.join(lacking)}"
+        )
+    return not lacking
 
 
 def _held_out(
     experiment: KickExperiment,
     change: ComplexArray,
     base: ComplexArray,
-    measured: tuple[Measured, Measured, Measured | None, Measured | None],
+    found: LocalMatrices,
 ) -> list[tuple[int, Prediction]]:
     """The held-out runs, by their place in the experiment."""
-    P, R, G, S = measured
+    P, R, G, S = found.P, found.R, found.G, found.S
     matrices = (
         P.value,
         R.value,
         None if G is None else G.value,
         None if S is None else S.value,
     )
-    variance = experiment.log_gain_variance + experiment.lag_variance
+    between = found.errors.between.reshape(2, -1).sum(axis=0)
+    variance = experiment.log_gain_variance + experiment.lag_variance + between
     return [
         (
             k,
@@ -176,25 +177,46 @@ def _held_out(
     ]
 
 
-def _rows(names: Sequence[str], matrix: Measured, expected: float) -> list[tuple[RowCheck, bool]]:
-    """Sums with their intervals, and whether each agrees, all of 2 m rows together at 95 %."""
-    sums = row_sums(matrix)
-    one_by_one = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
-    together = sums.error * stdtrit(sums.dof, 1 - (1 - CONFIDENCE) / (4 * len(names)))
-    return [
-        (
-            RowCheck(
-                name,
-                expected,
-                Estimate(float(total), (float(total - half), float(total + half))),
-                float(error),
-            ),
-            bool(abs(total - expected) <= ROW_TOLERANCE + bound),
+def _rows(names: Sequence[str], sums: RowSums, expected: float) -> tuple[RowCheck, ...]:
+    """Sums with their intervals, one by one."""
+    half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
+    return tuple(
+        RowCheck(
+            name,
+            expected,
+            Estimate(float(total), (float(total - wide), float(total + wide))),
+            float(error),
         )
-        for name, total, half, bound, error in zip(
-            names, sums.value, one_by_one, together, sums.error, strict=True
-        )
-    ]
+        for name, total, wide, error in zip(names, sums.value, half, sums.error, strict=True)
+    )
+
+
+def _base_response(
+    experiment: KickExperiment, base: ComplexArray, errors: RunErrors
+) -> BaseResponse:
+    m, count = len(base), len(experiment.runs.base)
+    error = np.sqrt(np.maximum(errors.variance, errors.within) / count)
+    return BaseResponse(
+        experiment.frequency_hz,
+        tuple(np.abs(base).tolist()),
+        tuple((-np.angle(base)).tolist()),
+        tuple((np.abs(base) * error[m:]).tolist()),
+        tuple(error[:m].tolist()),
+    )
+
+
+def _scatter(found: LocalMatrices) -> RunScatter:
+    m = len(found.P.value)
+    between, within = np.sqrt(found.errors.between), np.sqrt(found.errors.within)
+    return RunScatter(
+        tuple(between[:m].tolist()),
+        tuple(between[m:].tolist()),
+        tuple(within[:m].tolist()),
+        tuple(within[m:].tolist()),
+        found.errors.dof,
+        rows_of(found.errors.correlation),
+        float(found.widened.max()),
+    )
 
 
 def _lti(reading: LtiReading) -> Lti:
@@ -209,7 +231,12 @@ def _lti(reading: LtiReading) -> Lti:
 
 
 def _matrix(matrix: Measured) -> Matrix:
-    return Matrix(rows_of(matrix.value), rows_of(matrix.error), rows_of(matrix.half))
+    return Matrix(
+        rows_of(matrix.value),
+        rows_of(matrix.error),
+        rows_of(matrix.half),
+        rows_of(matrix.half_together),
+    )
 
 
 def _finite(value: float) -> float | None:

@@ -28,6 +28,7 @@ class KickExperiment:
         lag_variance: Shape (r, m).
         dof: Shape (r, m).
         labels: File names, r.
+        frequency_hz: Of the base gait.
     """
 
     index: tuple[int, ...]
@@ -39,6 +40,7 @@ class KickExperiment:
     lag_variance: FloatArray
     dof: FloatArray
     labels: tuple[str, ...]
+    frequency_hz: float
 
     def role(self, k: int) -> str | None:
         """What a run of all runs is here: ``base``, ``kick``, ``held-out`` or None."""
@@ -66,7 +68,7 @@ def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> Kick
     seen: list[tuple[int, ...]] = []
     for model in runs:
         index = tuple(k for k, run in enumerate(runs) if _same_drive(run, model))
-        if index in seen or len(model.names) < 3:
+        if index in seen or len(model.names) < 3 or len(model.frequencies_hz) > 1:
             continue
         seen.append(index)
         found = sort_kicks(np.stack([runs[k].command for k in index]))
@@ -108,4 +110,5 @@ def _experiment(
         lag_variance=noise[1],
         dof=noise[2],
         labels=tuple(runs[k].label for k in index),
+        frequency_hz=runs[index[found.base[0]]].frequency_hz,
     )

@@ -30,6 +30,7 @@ from ..estimators.norm_ratio import noise_draws, norm_ratio
 from ..response import CONFIDENCE, welch_satterthwaite
 from ..results.analysis import Estimate
 from .runs import Kick, Kind
+from .scatter import RunErrors
 
 
 @dataclass(frozen=True)
@@ -38,15 +39,17 @@ class Answers:
 
     Attributes:
         log: Change of ln|a| + j psi against the base, shape (r, m).
-        log_gain_variance: Of its real part, shape (r, m).
+        log_gain_variance: Of its real part, from the noise within each run, shape (r, m).
         phase_variance: Of its imaginary part [rad^2], shape (r, m).
         dof: Degrees of freedom of both, shape (r, m).
+        errors: How much runs differ from each other; None counts the noise within runs alone.
     """
 
     log: ComplexArray
     log_gain_variance: FloatArray
     phase_variance: FloatArray
     dof: FloatArray
+    errors: RunErrors | None = None
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,24 @@ class Measured:
         value: Shape (m, m).
         error: Standard errors, same shape; columns are independent of each other.
         dof: Degrees of freedom of the errors, same shape.
+        correlation: Of a column's errors, shape (m, m); None where they are independent.
     """
 
     value: FloatArray
     error: FloatArray
     dof: FloatArray
+    correlation: FloatArray | None = None
 
     @property
     def half(self) -> FloatArray:
-        """Half widths of the 95 % intervals, shape (m, m)."""
+        """Half widths of the 95 % intervals, one by one, shape (m, m)."""
         return self.error * stdtrit(self.dof, 0.5 + CONFIDENCE / 2)
+
+    @property
+    def half_together(self) -> FloatArray:
+        """Half widths that hold for all elements off the diagonal together (Bonferroni)."""
+        m = len(self.value)
+        return self.error * stdtrit(self.dof, 1 - (1 - CONFIDENCE) / (2 * m * (m - 1)))
 
 
 @dataclass(frozen=True)
@@ -120,6 +131,8 @@ def central_differences(
     value, variance, dof = np.zeros((3, 2, m, m))
     parts = np.stack([answers.log.imag, answers.log.real])
     noise = np.stack([answers.phase_variance, answers.log_gain_variance])
+    errors = answers.errors
+    between = np.zeros((2, m)) if errors is None else errors.between.reshape(2, m)
     for j in range(m):
         sides = [
             [k for k, one in enumerate(kicks) if _is(one, j, kind) and (one.size > 0) is up]
@@ -136,10 +149,17 @@ def central_differences(
         weight = np.array([1 / len(up)] * len(up) + [1 / len(down)] * len(down)) / span
         of_runs = noise[:, up + down] * weight[:, None] ** 2
         of_dof = np.stack([answers.dof[up + down]] * 2)
-        variance[:, :, j] = of_runs.sum(axis=1)
-        dof[:, :, j] = welch_satterthwaite(of_runs.swapaxes(0, 1), of_dof.swapaxes(0, 1))
+        variance[:, :, j] = of_runs.sum(axis=1) + between * np.sum(weight**2)
+        within = welch_satterthwaite(of_runs.swapaxes(0, 1), of_dof.swapaxes(0, 1))
+        # All runs share the estimate of what is between them: its freedom doesn't add up.
+        dof[:, :, j] = within if errors is None else np.where(between > 0, errors.dof, within)
     error = np.sqrt(variance)
-    return Measured(value[0], error[0], dof[0]), Measured(value[1], error[1], dof[1])
+    shared = (None, None)
+    if errors is not None:
+        shared = (errors.correlation[:m, :m], errors.correlation[m:, m:])
+    return Measured(value[0], error[0], dof[0], shared[0]), Measured(
+        value[1], error[1], dof[1], shared[1]
+    )
 
 
 def row_sums(matrix: Measured) -> RowSums:
@@ -149,17 +169,24 @@ def row_sums(matrix: Measured) -> RowSums:
         matrix: P or R.
 
     Returns:
-        Sums with their errors; the columns' runs are different ones, so variances add.
+        Sums with their errors; the columns' runs are different ones, so variances add. Their
+        degrees of freedom add only where each column's error is estimated by itself.
     """
     parts = matrix.error.T**2
-    return RowSums(
-        matrix.value.sum(axis=1),
-        np.sqrt(parts.sum(axis=0)),
-        welch_satterthwaite(parts, matrix.dof.T),
-    )
+    shared = matrix.correlation is not None
+    dof = matrix.dof.min(axis=1) if shared else welch_satterthwaite(parts, matrix.dof.T)
+    return RowSums(matrix.value.sum(axis=1), np.sqrt(parts.sum(axis=0)), dof)
 
 
-def nonlinearity(P: Measured, R: Measured, G: Measured, S: Measured, seed: int = 1) -> Estimate:
+def nonlinearity(
+    P: Measured,
+    R: Measured,
+    G: Measured,
+    S: Measured,
+    seed: int = 1,
+    *,
+    correlation: FloatArray | None = None,
+) -> Estimate:
     """Defect from what a linear time-invariant system shows.
 
     Args:
@@ -168,18 +195,44 @@ def nonlinearity(P: Measured, R: Measured, G: Measured, S: Measured, seed: int =
         G: d ln|a| / d ln|c|.
         S: d psi / d ln|c|.
         seed: Of the noise draws.
+        correlation: Of one run's errors, psi of all joints and then ln|a|, shape (2 m, 2 m); None
+            where they are independent.
 
     Returns:
         ||(G - P, S + R)|| / ||(P, R)|| (Frobenius), with what noise adds taken off; interval by
         :func:`analysis.estimators.norm_ratio.norm_ratio`.
     """
-    noise = [noise_draws(one, seed + k) for k, one in enumerate((P, R, G, S))]
+    m = len(P.value)
+    noise = noise_draws(stacked(((P, S), (R, G)), correlation), seed)
+    of_p, of_s, of_r, of_g = (
+        noise[:, rows, columns]
+        for rows in (slice(m), slice(m, None))
+        for columns in (slice(m), slice(m, None))
+    )
     return norm_ratio(
         np.stack([G.value - P.value, S.value + R.value]),
-        np.stack([noise[2] - noise[0], noise[3] + noise[1]], axis=1),
+        np.stack([of_g - of_p, of_s + of_r], axis=1),
         np.stack([P.value, R.value]),
-        np.stack([noise[0], noise[1]], axis=1),
+        np.stack([of_p, of_r], axis=1),
     )
+
+
+def stacked(blocks: Sequence[Sequence[Measured]], correlation: FloatArray | None) -> Measured:
+    """One matrix of several, for errors that they have in common.
+
+    Args:
+        blocks: Rows of matrices; those of one row answer the same way, those of one column are of
+            the same kicks.
+        correlation: Of a column's errors.
+
+    Returns:
+        The matrix.
+    """
+    value, error, dof = (
+        np.block([[getattr(one, part) for one in row] for row in blocks])
+        for part in ("value", "error", "dof")
+    )
+    return Measured(value, error, dof, correlation)
 
 
 def _is(kick: Kick, joint: int, kind: Kind) -> bool:

@@ -16,7 +16,7 @@ from capture.arrays import ComplexArray, FloatArray
 
 from ..estimators.norm_ratio import noise_draws, norm_ratio
 from ..results.analysis import Estimate
-from .local import Measured
+from .local import Measured, stacked
 
 BANDS = (1, 2, 3)
 
@@ -42,7 +42,13 @@ class LtiReading:
 
 
 def lti_reading(
-    P: Measured, R: Measured, response: ComplexArray, command: ComplexArray, seed: int = 11
+    P: Measured,
+    R: Measured,
+    response: ComplexArray,
+    command: ComplexArray,
+    seed: int = 11,
+    *,
+    correlation: FloatArray | None = None,
 ) -> LtiReading:
     """Read P and R as a linear time-invariant system.
 
@@ -52,6 +58,7 @@ def lti_reading(
         response: Complex amplitudes a of the base gait, shape (m,).
         command: Complex amplitudes c of the base gait, shape (m,).
         seed: Of the noise draws.
+        correlation: Of one run's errors, psi of all joints and then ln|a|, or None.
 
     Returns:
         The reading; asymmetry and bands are empty where H is singular.
@@ -62,7 +69,8 @@ def lti_reading(
     if not condition < SINGULAR:
         return LtiReading(H, condition, Estimate(), tuple(Estimate() for _ in BANDS))
     X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
-    noise = scale * (noise_draws(P, seed) - 1j * noise_draws(R, seed + 1))
+    draws = noise_draws(stacked(((P,), (R,)), correlation), seed)
+    noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
     error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
     return LtiReading(H, condition, *reciprocity(X, error))
 

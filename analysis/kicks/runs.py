@@ -25,6 +25,9 @@ MOST_KICK = 0.12
 MOST_PATTERN = 0.6
 """The largest deviation of a pattern [rad]; beyond it is another gait."""
 
+LEAST_KICK = 1e-3
+"""A deviation of one joint alone that is smaller isn't looked for [rad or log amplitude]."""
+
 LOPSIDED = 0.1
 """Kicks up and down may differ by this share of their span: what differs leaves curvature in."""
 
@@ -69,12 +72,13 @@ class KickedRuns:
     deviation: ComplexArray
 
 
-def deviation_of(command: ComplexArray, base: ComplexArray) -> ComplexArray:
+def deviation_of(command: ComplexArray, base: ComplexArray, same: float = SAME) -> ComplexArray:
     """How a run's commands deviate from the base gait, whenever it started.
 
     Args:
         command: Complex amplitudes, shape (m,), m > 2.
         base: Those of the base gait, shape (m,).
+        same: Phases that differ by less agree [rad].
 
     Returns:
         d ln|c| + j d psi_c, shape (m,). The phase is counted from what the joints that agree with
@@ -83,27 +87,29 @@ def deviation_of(command: ComplexArray, base: ComplexArray) -> ComplexArray:
     change: ComplexArray = command / base
     change = change * np.exp(-1j * np.angle(change.sum()))
     phase = np.angle(change)
-    agree: BoolArray = np.abs(phase - np.median(phase)) <= SAME
+    agree: BoolArray = np.abs(phase - np.median(phase)) <= same
     phase = phase - phase[agree].mean() if agree.any() else phase - np.median(phase)
     return (np.log(np.abs(change)) + 1j * phase).astype(np.complex128)
 
 
-def kick_of(deviation: ComplexArray) -> Kick | None:
+def kick_of(deviation: ComplexArray, same: float = SAME, most: float = MOST_KICK) -> Kick | None:
     """The kick that a deviation is.
 
     Args:
         deviation: From :func:`deviation_of`, shape (m,).
+        same: What deviates by less is the base's still.
+        most: The largest kick.
 
     Returns:
         The kick, or None where none, or more than one, part of a command deviates.
     """
     parts = np.stack([deviation.imag, deviation.real])
-    off = np.argwhere(np.abs(parts) > SAME)
+    off = np.argwhere(np.abs(parts) > same)
     if len(off) != 1:
         return None
     part, joint = (int(k) for k in off[0])
     size = float(parts[part, joint])
-    if abs(size) > MOST_KICK:
+    if abs(size) > most:
         return None
     return Kick(joint, (Kind.PHASE, Kind.AMPLITUDE)[part], size)
 
@@ -115,6 +121,23 @@ def sort_kicks(command: ComplexArray) -> KickedRuns | None:
         command: Complex amplitudes of r runs' commands, shape (r, m).
 
     Returns:
+        The runs sorted, by kicks of ``SAME`` to ``MOST_KICK``; only where there are none, by those
+        of ``LEAST_KICK`` to ``MOST_PATTERN``, which are too small or too large for most robots.
+        None where they are no kick experiment: see :func:`sort_kicks_within`.
+    """
+    found = sort_kicks_within(command, SAME, MOST_KICK)
+    return sort_kicks_within(command, LEAST_KICK, MOST_PATTERN) if found is None else found
+
+
+def sort_kicks_within(command: ComplexArray, same: float, most: float) -> KickedRuns | None:
+    """Find the base gait and kicks of given sizes around it.
+
+    Args:
+        command: Complex amplitudes of r runs' commands, shape (r, m).
+        same: The smallest kick.
+        most: The largest kick.
+
+    Returns:
         The runs sorted, or None where they are no kick experiment: fewer than two different kicks
         around one recorded base, or fewer than three joints (of two, a kick of one's phase is a
         kick of the other's at another time).
@@ -124,10 +147,10 @@ def sort_kicks(command: ComplexArray) -> KickedRuns | None:
     best: KickedRuns | None = None
     tried: list[ComplexArray] = []
     for model in command:
-        if any(np.abs(deviation_of(model, one)).max() <= SAME for one in tried):
+        if any(np.abs(deviation_of(model, one, same)).max() <= same for one in tried):
             continue
         tried.append(model)
-        found = _around(command, model)
+        found = _around(command, model, same, most)
         if best is None or len(found.kicks) > len(best.kicks):
             best = found
     if best is None:
@@ -162,17 +185,17 @@ def missing_kicks(kicks: Sequence[Kick], kind: Kind, names: Sequence[str]) -> tu
     return tuple(lacking)
 
 
-def _around(command: ComplexArray, model: ComplexArray) -> KickedRuns:
-    deviation = np.stack([deviation_of(one, model) for one in command])
+def _around(command: ComplexArray, model: ComplexArray, same: float, most: float) -> KickedRuns:
+    deviation = np.stack([deviation_of(one, model, same) for one in command])
     base: list[int] = []
     kicks: dict[int, Kick] = {}
     patterns: list[int] = []
     for k, one in enumerate(deviation):
-        kick = kick_of(one)
+        kick = kick_of(one, same, most)
         largest = max(np.abs(one.real).max(), np.abs(one.imag).max())
         if kick is not None:
             kicks[k] = kick
-        elif largest <= SAME:
+        elif largest <= same:
             base.append(k)
         elif largest <= MOST_PATTERN:
             patterns.append(k)

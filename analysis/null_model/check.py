@@ -95,6 +95,8 @@ def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
     """Why the commands are another gait's; None if they are the model's."""
     if gait is None or not gait.driven:
         return "it has no gait with commands"
+    if gait.others:
+        return "its joints have several frequencies, the model one"
     if gait.driven != model.joints:
         return f"it drives {', '.join(gait.driven)}, the model {', '.join(model.joints)}"
     frequency, own = model.frequency_hz, gait.fit.frequency_hz

@@ -12,7 +12,7 @@ from capture.arrays import FloatArray
 from ..estimators.norm_ratio import noise_draws
 from ..response import CONFIDENCE
 from ..results.analysis import Estimate
-from ..results.coupling import LocalCoupling, rows_of
+from ..results.coupling import LocalCoupling, Matrix, rows_of
 from ..text import formats
 from .comparator import explicit_coupling, homogeneous
 from .entrainment import entrainment
@@ -36,11 +36,12 @@ _MOST_DOF = 1e6
 
 @dataclass(frozen=True)
 class MeasuredP:
-    """P with its errors, each of shape (m, m)."""
+    """P with its errors, each of shape (m, m); the correlation of a column's, or None."""
 
     value: FloatArray
     error: FloatArray
     dof: FloatArray
+    correlation: FloatArray | None = None
 
 
 def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
@@ -52,7 +53,7 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     Returns:
         Modes, comparator, and what explicit coupling must add.
     """
-    P = _measured(coupling)
+    P = measured(coupling.P, phase_correlation(coupling))
     found, said = spectrum(P.value), intervals(P)
     like = spectrum(homogeneous(P.value))
     levels = pseudospectrum(P)
@@ -77,15 +78,32 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     )
 
 
-def _measured(coupling: LocalCoupling) -> MeasuredP:
+def phase_correlation(coupling: LocalCoupling) -> FloatArray | None:
+    """Correlation of the joints' phases in a run's errors, shape (m, m); None if unknown."""
+    if coupling.scatter is None:
+        return None
+    m = len(coupling.joints)
+    return np.array(coupling.scatter.correlation)[:m, :m]
+
+
+def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP:
+    """A matrix of a result with its errors.
+
+    Args:
+        matrix: Of a coupling.
+        correlation: Of a column's errors, shape (m, m), or None.
+
+    Returns:
+        Value, errors, and the degrees of freedom that the intervals' factor says.
+    """
     value, error, half = (
-        np.array(one) for one in (coupling.P.value, coupling.P.standard_error, coupling.P.ci95_half)
+        np.array(one) for one in (matrix.value, matrix.standard_error, matrix.ci95_half)
     )
     # The degrees of freedom from the factor between the two.
     factor = np.divide(half, error, out=np.full(half.shape, np.nan), where=error > 0)
     dof = np.asarray(stdtridf(0.5 + CONFIDENCE / 2, factor), dtype=np.float64)
     usable = np.where(np.isfinite(dof) & (dof > 0), dof, _MOST_DOF)
-    return MeasuredP(value, error, np.minimum(usable, _MOST_DOF))
+    return MeasuredP(value, error, np.minimum(usable, _MOST_DOF), correlation)
 
 
 def _modes(found: Spectrum, said: SpectrumIntervals) -> tuple[Mode, ...]:

@@ -130,10 +130,6 @@ def growth(P: FloatArray) -> float:
 def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
     """What the noise of P leaves open, by drawing its errors anew.
 
-    Each draw's eigenvalues are dealt to those of P so that they move least. Noise pushes
-    eigenvalues apart and lowers the lowest, in P as in the draws made of it: an interval is the
-    draws' one, mirrored at the estimate (the basic bootstrap).
-
     Args:
         P: With standard errors.
         seed: Of the draws.
@@ -141,8 +137,25 @@ def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
     Returns:
         The intervals.
     """
-    here = spectrum(P.value)
-    draws = [spectrum(P.value + noise) for noise in noise_draws(P, seed)]
+    return intervals_of(P.value, P.value + noise_draws(P, seed))
+
+
+def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
+    """What noise leaves open of the modes of I - P.
+
+    Each draw's eigenvalues are dealt to those of P so that they move least. Noise pushes
+    eigenvalues apart and lowers the lowest, in P as in the draws made of it: an interval is the
+    draws' one, mirrored at the estimate (the basic bootstrap).
+
+    Args:
+        P: Its rows sum to 1, shape (m, m).
+        drawn: P with errors that it may have, shape (draws, m, m).
+
+    Returns:
+        The intervals.
+    """
+    here = spectrum(P)
+    draws = [spectrum(one) for one in drawn]
     dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
     strong = np.array([one.strong for one in draws], dtype=np.float64)
     tails = _quantiles(strong)
@@ -157,8 +170,8 @@ def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
             (min(float(here.strong), tails[0]), max(float(here.strong), tails[1])),
         ),
         growth=_estimate(
-            growth(P.value),
-            np.array([growth(P.value + noise) for noise in noise_draws(P, seed)]),
+            growth(P),
+            np.array([growth(one) for one in drawn]),
         ),
     )
 

@@ -177,3 +177,72 @@ class BodyOscillators:
     explicit_coupling: Estimate
     pseudospectrum: Levels
     entrainment: RelativeCoupling
+
+
+@dataclass(frozen=True)
+class LoopMode:
+    """One pattern of the phases of a closed loop.
+
+    Attributes:
+        rate: At which it relaxes [1/s]; negative = it grows.
+        turning: At which it turns meanwhile [rad/s].
+        pattern_abs: Share of each joint, of a vector of length 1, shape (m,).
+        pattern_rad: Phase of each joint in it [rad], shape (m,).
+    """
+
+    rate: Estimate
+    turning: Estimate
+    pattern_abs: tuple[float, ...]
+    pattern_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """What is left of a kick, at k times.
+
+    Attributes:
+        times_s: After the kick [s], k.
+        phase_rad: Deviations [rad], shape (k, m).
+        low_rad: Low ends of their 95 % intervals [rad], shape (k, m).
+        high_rad: High ends [rad], shape (k, m).
+    """
+
+    times_s: tuple[float, ...]
+    phase_rad: Rows
+    low_rad: Rows
+    high_rad: Rows
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """How oscillators that feel their servos relax: d phi' = J d phi, predicted from kicks.
+
+    Attributes:
+        answer: One sentence.
+        joints: Names, head to tail, m.
+        eps: Of the feedback [1/s].
+        age_s: How old an angle is on average when it is used [s].
+        frequency_hz: Of the gait that was kicked.
+        bias: b = g sin Delta, which takes the steady part of the feedback away, m.
+        J: Rates [1/s], row = oscillator that is turned, shape (m, m).
+        J_standard_error: Same shape.
+        modes: The slowest first, m - 1; all phases together neither relax nor grow.
+        relaxation: What is left of a kick, if one was asked for.
+        valid_to: Largest deviation that held-out runs support [rad]; None where there are none.
+        fastest: Largest rate of a deviation [1/s].
+        limits: What the prediction holds for, what speaks against it first.
+    """
+
+    answer: str
+    joints: tuple[str, ...]
+    eps: float
+    age_s: float
+    frequency_hz: float
+    bias: tuple[float, ...]
+    J: Rows
+    J_standard_error: Rows
+    modes: tuple[LoopMode, ...]
+    relaxation: Relaxation | None
+    valid_to: float | None
+    fastest: float
+    limits: tuple[str, ...]

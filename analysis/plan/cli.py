@@ -17,38 +17,54 @@ if TYPE_CHECKING:
     from .gait_base import BaseGait
 
 
+LEAST, MOST = 0.01, 0.12
+"""Kicks that the analysis takes for kicks; of others it says that they are too small or large."""
+
+
 def phase_kicks(
     *,
     like: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     runs: int = 1,
+    base_runs: int = 6,
+    kick: float = 0.05,
     settle: float = 10.0,
     measure: float = 10.0,
     json: bool = False,
 ) -> None:
     """Write the commands of kicks around a recorded gait, which tell its coupling.
 
-    One run as it is, four of each driven joint (phase +0.05 and -0.05 rad, amplitude +5 and
-    -5 %), three held-out random patterns. Drive each with `undulog drive`, then give all
-    recordings to `undulog analyse`.
+    Six runs of the gait itself, which show how much runs differ, four of each driven joint (phase
+    +0.05 and -0.05 rad, amplitude +5 and -5 %), three held-out random patterns. Drive each with
+    `undulog drive`, then give all recordings to `undulog analyse`.
 
     Example: `undulog plan phase-kicks --like run.mcap -o kicks`
 
     Args:
         like: A session of the gait.
         output: Folder for the sessions.
-        runs: How often each of them is run.
+        runs: How often each of them is run; those of the gait as it is are shared out.
+        base_runs: Runs of the gait as it is, in all.
+        kick: Size of the kicks, of phase [rad] and of log amplitude.
         settle: Time before what is measured [s].
         measure: Length of what is measured [s].
         json: Print one JSON object.
     """
+    if base_runs < 1 or not LEAST <= kick <= MOST:
+        raise UsageError(f"--base-runs is at least 1, --kick {LEAST:g} to {MOST:g}")
 
     def design(base: BaseGait) -> tuple[PlannedRun, ...]:
         from .designs import phase_kicks as kicks
 
         if len(base.driven) < 3:
             raise UsageError(f"{like}: it drives {len(base.driven)} joints; kicks need at least 3")
-        return kicks(tuple(base.names[k] for k in base.driven), base.amplitude, runs)
+        return kicks(
+            tuple(base.names[k] for k in base.driven),
+            base.amplitude,
+            runs,
+            kick=kick,
+            base_runs=base_runs,
+        )
 
     _plan("phase-kicks", like, output, design, (runs, settle, measure), as_json=json)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,9 @@ from capture.arrays import ComplexArray
 
 KICK = 0.05
 """Of phase [rad] and of log amplitude."""
+
+BASE_RUNS = 6
+"""Of the gait as it is: how much they differ is how much runs scatter."""
 
 HELD_OUT = (0.05, 0.1, 0.15)
 """Largest random phase of each held-out pattern [rad]."""
@@ -58,25 +62,34 @@ class PlannedRun:
 
 
 def phase_kicks(
-    names: tuple[str, ...], amplitude: ComplexArray, repeats: int = 1, seed: int = 1
+    names: tuple[str, ...],
+    amplitude: ComplexArray,
+    repeats: int = 1,
+    seed: int = 1,
+    *,
+    kick: float = KICK,
+    base_runs: int = BASE_RUNS,
 ) -> tuple[PlannedRun, ...]:
-    """One run as it is, each joint kicked four ways, and held-out patterns.
+    """Runs of the gait as it is, each joint kicked four ways, and held-out patterns.
 
     Args:
         names: Of the m driven joints.
         amplitude: Of the gait, shape (m,).
         repeats: How often all of it is run.
         seed: Of the held-out patterns and of the order.
+        kick: Of phase [rad] and of log amplitude.
+        base_runs: Runs without a kick in all, at least one a repeat.
 
     Returns:
-        (4 m + 1 + 3) runs a repeat, in random order, so that warming up looks like no kick.
+        4 m + 3 runs and those without a kick a repeat, in random order, so that warming up looks
+        like no kick but like scatter.
     """
     random = np.random.default_rng(seed)
     runs: list[PlannedRun] = []
     for _ in range(repeats):
-        once = [PlannedRun("base", amplitude, {"kind": "base"})]
+        once = [PlannedRun("base", amplitude, {"kind": "base"})] * math.ceil(base_runs / repeats)
         for joint, name in enumerate(names):
-            for kind, step in (("phase", KICK * 1j), ("amplitude", KICK)):
+            for kind, step in (("phase", kick * 1j), ("amplitude", kick)):
                 for sign, word in ((1, "up"), (-1, "down")):
                     off = np.zeros(len(names), dtype=np.complex128)
                     off[joint] = sign * step

@@ -51,6 +51,12 @@ def base_gait(session: Session) -> BaseGait:
     gait = examine_session(session).gait
     if gait is None or not gait.driven:
         raise UsageError(f"{session.path}: it commands no steady gait; name a session that does")
+    if gait.others:
+        frequencies = ", ".join(f"{one.fit.frequency_hz:.4g} Hz" for one in gait.groups)
+        raise UsageError(
+            f"{session.path}: its joints have several frequencies ({frequencies}); name a session "
+            "of one"
+        )
     m = len(gait.driven)
     harmonics = gait.fit.amplitudes[:m]
     overtones = np.abs(harmonics[:, 1:]).max(initial=0.0, axis=1) / np.abs(harmonics[:, 0])

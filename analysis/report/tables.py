@@ -50,12 +50,13 @@ def response_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
         joints: In chain order.
 
     Returns:
-        Three columns.
+        Three columns; the frequency before them where joints have several.
     """
     command = tuple(formats.degrees(Estimate(j.command_amplitude_rad)) for j in joints)
     gain = tuple(j.gain for j in joints)
     lag = tuple(formats.degrees(j.lag_rad) for j in joints)
     return (
+        *_frequency_column(joints),
         Column("command [°]", "amplitude of the command at the gait frequency", command, 2),
         Column(
             "gain [1]",
@@ -70,6 +71,13 @@ def response_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
             formats.decimals_for(lag, most=3),
         ),
     )
+
+
+def _frequency_column(joints: Sequence[JointResult]) -> list[Column]:
+    if len({joint.group for joint in joints} - {None}) < 2:
+        return []
+    cells = tuple(Estimate(joint.frequency_hz) for joint in joints)
+    return [Column("frequency [Hz]", "of the joint's group, for command, gain and lag", cells, 4)]
 
 
 def energy_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
@@ -106,7 +114,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
     """
     gait, joints = analysis.gait, analysis.joints
     driven = [joint for joint in joints if is_driven(joint)]
-    frequency = formats.estimate(gait.frequency_hz, " Hz", most=4)
+    frequency = formats.gait_frequency(gait)
     facts = [
         Fact("Gait frequency", frequency, _analysed(analysis)),
         Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),

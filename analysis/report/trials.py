@@ -127,9 +127,11 @@ def coupling_trials(coupling: Coupling) -> list[Trial]:
     return found
 
 
-def _of(plane: str) -> str:
+def _of(end: str) -> str:
+    plane, _, group = end.partition("group")
     words = {"horizontal": "the yaw joints", "vertical": "the pitch joints"}
-    return words.get(plane, "the driven joints")
+    word = words.get(plane.rstrip("_"), "the driven joints")
+    return f"{word} of group {group}" if group else word
 
 
 def _common(index: Index, whose: str) -> Trial:

@@ -85,8 +85,27 @@ class SessionFacts:
 
 
 @dataclass(frozen=True)
+class GroupFacts:
+    """Joints that share a rhythm.
+
+    Attributes:
+        frequency_hz: Their frequency with interval.
+        joints: Names of the driven joints that have it, head to tail.
+        windows: Whole cycles of it at the end of the fitted stretch.
+        wave: As in :class:`GaitFacts`.
+        lag_per_joint_rad: As in :class:`GaitFacts`.
+    """
+
+    frequency_hz: Estimate
+    joints: tuple[str, ...]
+    windows: tuple[Window, ...] = ()
+    wave: str | None = None
+    lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
+
+
+@dataclass(frozen=True)
 class GaitFacts:
-    """The rhythm that was found.
+    """The rhythm that was found; where joints have several, that of the largest group.
 
     Attributes:
         frequency_hz: Gait frequency with interval; value None where there is no gait.
@@ -96,6 +115,8 @@ class GaitFacts:
         lag_per_joint_rad: Commanded phase step from joint to joint, by plane.
         fitted: The stretch whose samples gain, lag and frequency are fitted to: the windows and
             the part of a cycle that is left over; None where there is no gait.
+        groups: Joints by frequency, the largest group first, which the values above are of; one
+            group where all driven joints share a frequency, none where there is no gait.
     """
 
     frequency_hz: Estimate
@@ -103,6 +124,7 @@ class GaitFacts:
     wave: str | None = None
     lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
     fitted: Window | None = None
+    groups: tuple[GroupFacts, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,7 +134,7 @@ class JointResult:
     Attributes:
         name: Joint name.
         plane: ``horizontal``, ``vertical`` or None where no robot description says.
-        command_amplitude_rad: Amplitude of the command at the gait frequency.
+        command_amplitude_rad: Amplitude of the command at the frequency of its group.
         gain: Amplitude of the response over that of the command.
         lag_rad: Lag of the response behind the command, in (-pi, pi]; positive = late.
         energy_net_j: Integral of torque times velocity.
@@ -124,6 +146,9 @@ class JointResult:
         samples: Response samples used.
         flags: Artefacts seen in the analysed stretch, e.g. ``saturated``;
             :attr:`Analysis.artefacts` says when.
+        group: Index of the joint's group in :attr:`GaitFacts.groups`, 0 is the largest; None
+            where the gait does not drive it.
+        frequency_hz: Frequency of that group, at which gain and lag are given; or None.
     """
 
     name: str
@@ -139,6 +164,8 @@ class JointResult:
     coverage: float
     samples: int
     flags: tuple[str, ...] = ()
+    group: int | None = None
+    frequency_hz: float | None = None
 
 
 @dataclass(frozen=True)
@@ -274,6 +301,10 @@ class Analysis(Shown):
             A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
         """
         gait = dataclasses.asdict(self.gait) | _flat("frequency_hz", self.gait.frequency_hz)
+        gait["groups"] = [
+            dataclasses.asdict(group) | _flat("frequency_hz", group.frequency_hz)
+            for group in self.gait.groups
+        ]
         return {
             "answer": dataclasses.asdict(self.answer),
             "session": dataclasses.asdict(self.session),

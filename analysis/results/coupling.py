@@ -37,11 +37,14 @@ class Matrix:
         value: Shape (m, m).
         standard_error: Same shape.
         ci95_half: Half widths of the 95 % intervals, one by one (Student's t), same shape.
+        ci95_half_together: Of those that hold for all elements off the diagonal together
+            (Bonferroni), same shape; None in results of earlier versions.
     """
 
     value: Rows
     standard_error: Rows
     ci95_half: Rows
+    ci95_half_together: Rows | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ class HeldOut:
         size: Largest deviation of a command from the base [rad or log amplitude].
         error: ||a - predicted|| / ||a||.
         error_kept: The same of 'each joint keeps its response to its own command'.
-        noise: What the run's noise alone makes of either.
+        noise: What the run's noise and the scatter between runs alone make of either.
     """
 
     session: str
@@ -103,6 +106,72 @@ class HeldOut:
     error: float
     error_kept: float
     noise: float
+
+
+@dataclass(frozen=True)
+class BaseResponse:
+    """How the joints answer the gait that is kicked: the mean over the runs without a kick.
+
+    Attributes:
+        frequency_hz: Of the gait.
+        gain: Of m joints.
+        lag_rad: Of m joints [rad].
+        gain_error: Standard errors, scatter between runs included.
+        lag_error: The same of the lags [rad].
+    """
+
+    frequency_hz: float
+    gain: tuple[float, ...]
+    lag_rad: tuple[float, ...]
+    gain_error: tuple[float, ...]
+    lag_error: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RunScatter:
+    """How much runs differ from each other.
+
+    Attributes:
+        phase_rad: Standard deviation of each joint's phase between runs, beyond the noise within
+            them [rad], m; 0 where none is found.
+        log_gain: The same of its log amplitude.
+        phase_noise_rad: That of the noise within a run [rad], m.
+        log_gain_noise: The same of the log amplitude.
+        dof: Degrees of freedom of the estimates.
+        correlation: Of a run's errors, m phases and m log amplitudes, shape (2 m, 2 m).
+        widened: Largest factor on the errors that the sums of rows demand; 1 where they agree.
+    """
+
+    phase_rad: tuple[float, ...]
+    log_gain: tuple[float, ...]
+    phase_noise_rad: tuple[float, ...]
+    log_gain_noise: tuple[float, ...]
+    dof: int
+    correlation: Rows
+    widened: float
+
+
+@dataclass(frozen=True)
+class KickSize:
+    """Whether the kicks suit the robot.
+
+    Attributes:
+        phase_rad: Mean size of the kicks of phase [rad].
+        log_amplitude: Mean size of the kicks of log amplitude; None without such kicks.
+        resolved: Coupling that an element of P off the diagonal must have to be shown, the median
+            over the elements (95 %, all together).
+        curvature: Size of the second-order part of what the kicks did over the first-order part,
+            what noise adds taken off.
+        verdict: ``fits``, ``too small`` or ``too large``.
+        why: Why it does not fit, and what to record; None if it does.
+    """
+
+    phase_rad: float
+    log_amplitude: float | None
+    resolved: float
+    curvature: float
+    verdict: str
+    why: str | None
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -127,6 +196,9 @@ class LocalCoupling(Coupling):
         held_out: Predictions of runs that were not used.
         valid_to: Largest deviation up to which all of them are predicted at least twice as well
             as by 'each joint keeps its response'; None where there are none, or the first fails.
+        base: Response to the gait; None in results of earlier versions, as those below.
+        scatter: How much runs differ from each other; in all errors and intervals.
+        kick_size: Whether the kicks are too small or too large.
     """
 
     joints: tuple[str, ...]
@@ -143,3 +215,6 @@ class LocalCoupling(Coupling):
     lti: Lti
     held_out: tuple[HeldOut, ...]
     valid_to: float | None
+    base: BaseResponse | None = None
+    scatter: RunScatter | None = None
+    kick_size: KickSize | None = None

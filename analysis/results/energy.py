@@ -71,6 +71,8 @@ class Closure:
         net: E_net from the logged samples minus the ledger's.
         abs: The same of E_abs.
         el: The same of E_el.
+        plus: The same of E_plus.
+        el_clipped: The same of E_el, clipped.
     """
 
     mechanical_balance: float | None
@@ -78,6 +80,8 @@ class Closure:
     net: float | None
     abs: float | None
     el: float | None
+    plus: float | None = None
+    el_clipped: float | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,8 @@ class EnergyResult:
             an upper bound), or None.
         transport: Cost of transport.
         closure: Against the twin's ledger, or None where the log has none.
+        unknown: Which energies are products of samples, so that what happens within a sampling
+            interval is not in them, by an unknown amount; None where all were accumulated.
     """
 
     start_s: tuple[float, ...]
@@ -101,3 +107,4 @@ class EnergyResult:
     electrical: str | None
     transport: Transport
     closure: Closure | None
+    unknown: str | None = None

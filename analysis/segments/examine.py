@@ -51,14 +51,14 @@ class Findings:
     Attributes:
         stand_out: Joints that stand out, worst first.
         shape: Shapes of the rest whose simultaneous interval excludes zero, largest first.
-        undecided: Planes in which joints differ and which one can't be decided.
+        undecided: Planes and groups in which joints differ and which one can't be decided.
         alike: Whether the rest of the compared joints is shown to be alike; None where it isn't.
         compared: Names of the joints that were compared.
     """
 
     stand_out: tuple[StandOut, ...] = ()
     shape: tuple[Shape, ...] = ()
-    undecided: tuple[str, ...] = ()
+    undecided: tuple[tuple[str, int], ...] = ()
     alike: bool | None = None
     compared: tuple[str, ...] = ()
 
@@ -79,7 +79,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
     critical = critical_value([family_of(profile) for _, _, profile in profiles], LEVEL)
     out: list[StandOut] = []
     shapes: list[Shape] = []
-    undecided: dict[str, None] = {}
+    undecided: dict[tuple[str, int], None] = {}
     excluded: dict[int, set[int]] = {id(chain): set() for chain in some}
     for chain, quantity, profile in profiles:
         if len(chain.names) < MIN_JOINTS:
@@ -95,7 +95,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
         ]
         if len(chain.names) < MIN_JOINTS:
             if found:
-                undecided[chain.plane] = None
+                undecided[chain.plane, chain.group] = None
             continue
         shapes += [_shape(chain, quantity, each, critical) for each in found]
     alike = bool(some) and all(_alike(chain, excluded[id(chain)]) for chain in some)

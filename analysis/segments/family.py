@@ -75,7 +75,10 @@ def scatter_of(errors: ResponseErrors) -> tuple[Scatter, Scatter]:
     """
     columns = np.concatenate([errors.bins.real, errors.bins.imag], axis=1)
     nothing = np.zeros_like(errors.turn)
-    return Scatter(columns, errors.own, nothing), Scatter(columns, errors.own, errors.turn)
+    return (
+        Scatter(columns, errors.rounding[:, 0, 0], nothing),
+        Scatter(columns, errors.rounding[:, 1, 1], errors.turn),
+    )
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ def compare_joints(
     Returns:
         The findings; none without a gait.
     """
-    if gait is None or gait.response is None:
+    if gait is None:
         return Findings()
     out = {each.joint for each in faulty if set(each.kinds) - _COMPARABLE}
     results = list(joints)
@@ -162,8 +162,13 @@ def compare_joints(
     if old != sound:  # where all samples are late by a hold, that makes no difference
         sound -= old
     chains: list[Chain] = []
-    for plane, names in by_plane(robot, commanded).items():
-        own = [name for name in names if name in sound and name in gait.answered]
-        response = gait.response.select([gait.answered.index(name) for name in own])
-        chains.append(Chain(plane, 0, tuple(names), tuple(own), response))
+    for index, group in enumerate(gait.groups):
+        if group.response is None:
+            continue
+        # A joint that is commanded but in no group has its place in the chain all the same.
+        members = [name for name in commanded if gait.group_of(name) in (index, None)]
+        for plane, names in by_plane(robot, members).items():
+            own = [name for name in names if name in sound and name in group.answered]
+            response = group.response.select([group.answered.index(name) for name in own])
+            chains.append(Chain(plane, index, tuple(names), tuple(own), response))
     return examine(chains)

@@ -124,7 +124,7 @@ def command_tones(session: Session, options: Options, examined: Examined) -> Com
         The gait's frequency alone, or the tones of a multisine; None of anything else.
     """
     gait, robot = examined.gait, examined.analysis.session.robot
-    if gait is not None and gait.driven:
+    if gait is not None and gait.driven and not gait.others:
         m = len(gait.driven)
         left = float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum())
         if left < _PURE:

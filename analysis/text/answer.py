@@ -8,6 +8,7 @@ simultaneous interval excludes zero; only equivalence tests of every commanded j
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -106,20 +107,22 @@ def compose(facts: Facts) -> Answer:
 
 
 def find(indices: Mapping[str, Index], stem: str) -> dict[str, Index]:
-    """The indices of one kind that have a value, by plane.
+    """The indices of one kind that have a value, by plane and group.
 
     Args:
-        indices: Name to index; where both planes are driven, names end in the plane.
+        indices: Name to index; where both planes are driven, names end in the plane, where joints
+            of one plane have several frequencies, in the group.
         stem: Name without the plane, e.g. ``gain_cv``.
 
     Returns:
-        ``horizontal``, ``vertical`` or an empty string, to the index.
+        End of the name, e.g. ``horizontal``, ``vertical_group1`` or an empty string, to the index.
     """
-    planes = {stem: "", f"{stem}_horizontal": "horizontal", f"{stem}_vertical": "vertical"}
+    pattern = re.compile(rf"{re.escape(stem)}_?((?:horizontal|vertical)?(?:_?group\d+)?)")
+    found = {name: pattern.fullmatch(name) for name in indices}
     return {
-        planes[name]: index
-        for name, index in indices.items()
-        if name in planes and index.value is not None
+        match[1]: indices[name]
+        for name, match in found.items()
+        if match is not None and indices[name].value is not None
     }
 
 
@@ -185,8 +188,7 @@ def _named(facts: Facts) -> str:
 def _undecided(findings: Findings, facts: Facts) -> str:
     if not findings.undecided:
         return ""
-    planes = {joint.plane for joint in facts.joints if joint.gain.value is not None}
-    word = _joints_word(next(iter(findings.undecided)), planes)
+    word = _joints_word(facts, *findings.undecided[0])
     return f"the {word} differ, but with fewer than 4 sound ones it can't be decided which one"
 
 
@@ -254,11 +256,10 @@ def _everyone(facts: Facts) -> bool:
 
 def _shapes(facts: Facts) -> str:
     """The largest shape of lag and of gain of each plane."""
-    planes = {joint.plane for joint in facts.joints if joint.gain.value is not None}
     clauses: list[str] = []
     chains = dict.fromkeys((each.plane, each.group) for each in facts.findings.shape)
     for plane, group in sorted(chains):
-        word = _joints_word(plane, planes)
+        word = _joints_word(facts, plane, group)
         for quantity in ("lag", "gain"):
             own = [
                 each
@@ -311,18 +312,20 @@ def _shape(shape: Shape, joints: str) -> str:
     )
 
 
-def _joints_word(plane: str, planes: set[str | None]) -> str:
-    """What to call the joints of a plane."""
-    words = {"horizontal": "yaw joints", "vertical": "pitch joints"}
-    del planes
-    return words.get(plane, "joints")
+def _joints_word(facts: Facts, plane: str, group: int) -> str:
+    """What to call the joints of a plane and rhythm group."""
+    word = {"horizontal": "yaw joints", "vertical": "pitch joints"}.get(plane, "joints")
+    if len(facts.gait.groups) < 2:
+        return word
+    frequency = facts.gait.groups[group].frequency_hz
+    return f"{word} at {formats.number(frequency.value, 3)} Hz"
 
 
 def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
     """How many joints respond, to which gait, and the range of their lags."""
     if facts.gait.frequency_hz.value is None:
         return _why_not(facts, "no gait")
-    frequency = formats.estimate(facts.gait.frequency_hz, " Hz", most=4)
+    frequency = formats.gait_frequency(facts.gait)
     silent = {each.joint for each in facts.not_following}
     responding = [joint for joint in known if joint.name not in silent]
     text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"

@@ -69,7 +69,7 @@ def warn_flags(
     lost = [
         joint.name
         for joint in joints
-        if gait is not None and joint.name in gait.answered and joint.lag_rad.value is None
+        if gait is not None and joint.name in gait.all_answered and joint.lag_rad.value is None
     ]
     if lost:
         warn(

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
 
-from ..results.analysis import Estimate, Interval
+from ..results.analysis import Estimate, GaitFacts, Interval
 
 MISSING = "\N{EN DASH}"
 """Printed where a value could not be computed."""
@@ -69,6 +69,26 @@ def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
     digits = decimals_for([quantity], most=most)
     text = number(quantity.value, digits) + unit
     return text if quantity.ci95 is None else f"{text} {interval(quantity.ci95, digits)}"
+
+
+def gait_frequency(gait: GaitFacts) -> str:
+    """The gait's frequency, or the frequency of each group of joints.
+
+    Args:
+        gait: The gait.
+
+    Returns:
+        For example ``0.97 Hz [0.969, 0.971]`` or ``1.432 Hz (8 joints) and 0.954 Hz (8 joints)``,
+        each with its interval.
+    """
+    if len(gait.groups) < 2:
+        return estimate(gait.frequency_hz, " Hz", most=4)
+    parts = [
+        f"{estimate(group.frequency_hz, ' Hz', most=4)} ({len(group.joints)} "
+        f"joint{'' if len(group.joints) == 1 else 's'})"
+        for group in gait.groups
+    ]
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
 def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) -> int:

@@ -47,6 +47,8 @@ def _energy(energy: EnergyResult) -> Iterator[str]:
     if known:
         way = formats.estimate(cost.distance_m, " m", most=3)
         yield f"Cost of transport E/(m g d): {', '.join(known)}, over {way}"
+    if energy.unknown is not None:
+        yield formats.sentence(energy.unknown)
     closure = energy.closure
     if closure is not None and closure.mechanical_balance is not None:
         parts = [f"balance {100 * closure.mechanical_balance:.3f} %"]

@@ -155,6 +155,9 @@ def _joint_table(analysis: Analysis) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("joint", no_wrap=True)
     table.add_column("plane", no_wrap=True)
+    several = len(analysis.gait.groups) > 1
+    if several:
+        table.add_column("Hz", justify="right", no_wrap=True)
     for name in ("command°", "gain (95 %)", "lag° (95 %)"):
         table.add_column(name, justify="right", no_wrap=True)
     for name, _ in shown:
@@ -168,6 +171,7 @@ def _joint_table(analysis: Analysis) -> Table:
         amplitude = joint.command_amplitude_rad
         table.add_row(
             *_names(joint),
+            *([formats.number(joint.frequency_hz, 3)] if several else []),
             formats.number(None if amplitude is None else math.degrees(amplitude), 1),
             _estimate(joint.gain, gain_digits),
             _estimate(joint.lag_rad, lag_digits, math.degrees(1)),
@@ -234,13 +238,19 @@ def _index_table(indices: dict[str, Index]) -> Table:
 def _method(analysis: Analysis) -> str:
     spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in analysis.gait.windows)
     cycles = sum(w.cycles for w in analysis.gait.windows)
-    if analysis.gait.frequency_hz.value is None:
+    gait = analysis.gait
+    if gait.frequency_hz.value is None:
         return f"Method: energies integrated on the samples' own times over {spans}."
-    fitted = analysis.gait.fitted
+    fitted = gait.fitted
     span = "" if fitted is None else f" of {fitted.start_s:.2f} to {fitted.stop_s:.2f} s"
-    rhythm = formats.estimate(analysis.gait.frequency_hz, " Hz", most=6)
+    rhythm = f"one frequency for all joints: {formats.estimate(gait.frequency_hz, ' Hz', most=6)}"
+    if len(gait.groups) > 1:
+        rhythm = (
+            "one frequency for each group of joints, with the harmonics of all in every joint: "
+            f"{formats.gait_frequency(gait)}"
+        )
     return (
-        f"Method: harmonic least squares{span} on each sample's own time, one frequency for all "
-        f"joints: {rhythm}; 95 % intervals from the residual's spectrum beside it, Student's t; "
+        f"Method: harmonic least squares{span} on each sample's own time, {rhythm}; "
+        "95 % intervals from the residual's spectrum beside it, Student's t; "
         f"lag positive = response late; energies over {cycles:.0f} whole cycles, {spans}."
     )

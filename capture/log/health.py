@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from ..following.fault import Fault
+from ..following.fault import Fault as JointFault
 from .frames import FRAME_TOPIC_PREFIXES, bus_of
 from .freeze import FROZEN_SAMPLES
 from .joined import Fault, Finding
@@ -253,7 +253,7 @@ def _is_frozen(joint: JointHealth) -> bool:
     return (joint.frozen_s or 0) >= FROZEN_SECONDS
 
 
-def judge_fault(fault: Fault) -> Finding:
+def judge_following(fault: JointFault) -> Finding:
     """Finding on a joint that does not follow its command.
 
     Args:

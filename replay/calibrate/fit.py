@@ -8,14 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
+from analysis.analyse import examine_session
 from capture import Session
-from capture.errors import DataError
+from capture.arrays import FloatArray
+from capture.errors import DataError, UndulogError
 from sim.physics.engine import Kernels
 from sim.scenario import Scenario
 
 from ..again.run import find_repetition
+from .alternatives import Alternative, alternatives
 from .answers import Answers, read_measured
 from .determined import Ridge, half_widths, ridges, what_would_tell
+from .lack_of_fit import LackOfFit, halves, lack_of_fit
 from .misfit import Misfit, misfit
 from .parameters import DELAY, Unknown, module_unknown, unknowns, with_values
 from .solve import Solution, solve
@@ -60,7 +64,7 @@ class Fitted:
         module: The joint whose own it is, or None.
         start: Where the fit started.
         value: Where it ended.
-        ci95: 95 % interval.
+        ci95: 95 % interval; None where the twin doesn't fit, since it would hold for noise alone.
         determined: Whether the session tells it.
     """
 
@@ -70,7 +74,7 @@ class Fitted:
     module: str | None
     start: float
     value: float
-    ci95: tuple[float, float]
+    ci95: tuple[float, float] | None
     determined: bool
 
 
@@ -87,6 +91,7 @@ class Calibration:
         would_tell: What else to record.
         before, after: Joint to misfit.
         search: What came of the search for a module, if there was one.
+        lack: Whether the twin fits at all.
         memory: Autocorrelation time of what is left, in samples; 1 is white noise.
         iterations: Of the last fit.
         converged: Whether it came to an end.
@@ -103,6 +108,7 @@ class Calibration:
     before: dict[str, Misfit]
     after: dict[str, Misfit]
     search: Search | None
+    lack: LackOfFit
     memory: float
     iterations: int
     converged: bool
@@ -147,6 +153,7 @@ def calibrate(
     settle_s = scenario.settle_s if wish.settle_s is None else wish.settle_s
     with Session.open(path) as session:
         measured = read_measured(session, settle_s, scenario.duration_s)
+        omega = _omega(session)
     if strange := [name for name in measured.joints if name not in scenario.robot.joint_names]:
         raise DataError(f"{path}: {scenario.robot.name} has no joint {', '.join(strange)}")
     count = sum(map(len, measured.angles))
@@ -170,7 +177,25 @@ def calibrate(
     if wish.search:
         search, with_module = find_weak_module(answers, first, wish.spread, told)
         solution = with_module if search.named else first
-    return _calibration(path, answers, first, solution, search=search, within=wish.within)
+    lack = lack_of_fit(
+        measured,
+        solution.after,
+        omega,
+        halves(solution.columns, solution.after, solution.x, solution.precision),
+        alternatives(answers, solution),
+    )
+    return _calibration(
+        path, answers, first, solution, search=search, lack=lack, within=wish.within
+    )
+
+
+def _omega(session: Session) -> float | None:
+    """Angular frequency of the commands [rad/s], or None where they are no steady gait."""
+    try:
+        gait = examine_session(session).gait
+    except UndulogError:  # a session without a gait can be fitted, too
+        return None
+    return None if gait is None or not gait.driven else gait.fit.omega
 
 
 def _calibration(
@@ -180,12 +205,18 @@ def _calibration(
     solution: Solution,
     *,
     search: Search | None,
+    lack: LackOfFit,
     within: float,
 ) -> Calibration:
-    half = half_widths(solution.covariance)
+    low, high = _ends(solution, lack.alternatives)
     parameters = [
-        _fitted(one, x, h, within)
-        for one, x, h in zip(solution.unknowns, solution.x.tolist(), half.tolist(), strict=True)
+        _fitted(one, x, ends, within, fits=not lack.found)
+        for one, x, ends in zip(
+            solution.unknowns,
+            solution.x.tolist(),
+            zip(low.tolist(), high.tolist(), strict=True),
+            strict=True,
+        )
     ]
     return Calibration(
         session=str(path),
@@ -194,11 +225,13 @@ def _calibration(
         parameters=tuple(parameters),
         ridges=ridges(solution.unknowns, solution.covariance),
         would_tell=what_would_tell(
-            solution.unknowns, [i for i, one in enumerate(parameters) if not one.determined]
+            solution.unknowns,
+            [i for i, one in enumerate(parameters) if not (one.determined or lack.found)],
         ),
         before=_misfits(answers, first.before),
         after=_misfits(answers, solution.after),
         search=search,
+        lack=lack,
         memory=solution.memory,
         iterations=solution.iterations,
         converged=solution.converged,
@@ -207,7 +240,21 @@ def _calibration(
     )
 
 
-def _fitted(one: Unknown, x: float, half: float, within: float) -> Fitted:
+def _ends(solution: Solution, others: Sequence[Alternative]) -> tuple[FloatArray, FloatArray]:
+    """Ends of the 95 % intervals of x: of this law, and of those that could be the ground's."""
+    half = half_widths(solution.covariance)
+    low, high = solution.x - half, solution.x + half
+    for one in others:
+        if one.widens:
+            wide, there = half_widths(one.covariance), solution.x + one.shift
+            low, high = np.minimum(low, there - wide), np.maximum(high, there + wide)
+    return low, high
+
+
+def _fitted(
+    one: Unknown, x: float, ends: tuple[float, float], within: float, *, fits: bool
+) -> Fitted:
+    half = max(x - ends[0], ends[1] - x)
     # A dead time is no share of itself: 5 % of a control period stand for 5 %.
     wide = one.value(half) * 100.0 if one.name == DELAY else float(np.expm1(half))
     return Fitted(
@@ -217,8 +264,8 @@ def _fitted(one: Unknown, x: float, half: float, within: float) -> Fitted:
         module=one.module,
         start=one.start,
         value=one.value(x),
-        ci95=(one.value(x - half), one.value(x + half)),
-        determined=wide <= within,
+        ci95=(one.value(ends[0]), one.value(ends[1])) if fits else None,
+        determined=fits and wide <= within,
     )
 
 

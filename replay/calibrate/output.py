@@ -52,11 +52,13 @@ def robot_text(calibration: Calibration) -> str:
         if servo.get(key) != value:  # what was not fitted stays as it was written
             servo[key] = value
     head = [f"# {robot.name}, its servo fitted to {Path(calibration.session).name}."]
+    if calibration.lack.found:
+        head.append("# The twin does not fit that session: what follows has no interval.")
     for one in calibration.parameters:
-        low, high = one.ci95
         unit = "" if one.unit == "1" else f" {one.unit}"
         known = "" if one.determined else "; not determined by this session"
-        head.append(f"# {one.label}: {one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}{known}")
+        within = "" if one.ci95 is None else f", 95 % {one.ci95[0]:.4g} to {one.ci95[1]:.4g}"
+        head.append(f"# {one.label}: {one.value:.4g}{unit}{within}{known}")
     text = "\n".join([*head, "", tomlkit.dumps(values)])
     parse_robot(text, "fitted robot", dict(robot.databases))  # it can be read back
     return text

@@ -65,9 +65,14 @@ class Solution:
     converged: bool
 
     @property
+    def precision(self) -> FloatArray:
+        """Diagonal of P^-1, shape (K,)."""
+        return _precision(self.unknowns)
+
+    @property
     def normal(self) -> FloatArray:
         """A, shape (K, K)."""
-        return _normal(self.columns, self.sigma, _precision(self.unknowns))
+        return _normal(self.columns, self.sigma, self.precision)
 
 
 def solve(
@@ -170,6 +175,32 @@ def derivatives(
         up, down = answers.at(wanted, x + shift), answers.at(wanted, x - shift)
         found.append(tuple((a - b) / (2 * STEP) for a, b in zip(up, down, strict=True)))
     return tuple(np.stack(parts, axis=1) for parts in zip(*found, strict=True))
+
+
+def covariance_with(
+    columns: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    sigma: FloatArray,
+    precision: FloatArray,
+    prior: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """One step of a fit with other columns, and the covariance there.
+
+    Args:
+        columns: Derivatives, shapes (n_j, K).
+        residuals: [rad], shapes (n_j,).
+        sigma: Deviation of each joint's residual [rad], shape (r,).
+        precision: Diagonal of P^-1, shape (K,).
+        prior: P^-1 x where the residuals were taken, shape (K,).
+
+    Returns:
+        The step, shape (K,), and the covariance, shape (K, K).
+    """
+    normal = _normal(columns, sigma, precision)
+    step = np.linalg.solve(normal, _slope(columns, residuals, sigma) - prior)
+    left = [r - c @ step for c, r in zip(columns, residuals, strict=True)]
+    scores = score_covariance(columns, left, sigma, precision)
+    return np.asarray(step, dtype=np.float64), _covariance(scores, normal, precision)
 
 
 def _residuals(

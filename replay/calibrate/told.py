@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .determined import Ridge
+from .alternatives import Alternative
+from .determined import Z95, Ridge
 from .fit import Calibration, Fitted
+from .lack_of_fit import LEVEL, LackOfFit
 from .misfit import Misfit
 from .parameters import DELAY
 
@@ -26,6 +28,8 @@ def told(calibration: Calibration) -> Iterator[str]:
         The answer first, joints last.
     """
     before, after = (_rms(one) for one in (calibration.before, calibration.after))
+    if calibration.lack.found:
+        yield from _lack(calibration.lack)
     yield (
         f"{calibration.session} in {calibration.world}: twin and robot are {before:.3g} rad apart "
         f"(RMS) before, {after:.3g} rad after; {calibration.iterations} iterations, "
@@ -33,16 +37,19 @@ def told(calibration: Calibration) -> Iterator[str]:
     )
     if not calibration.converged:
         yield "The fit did not come to an end: take its numbers as a step on the way."
-    yield "Parameters (95 % interval; before):"
+    fits = not calibration.lack.found
+    yield "Parameters (95 % interval; before):" if fits else "Parameters (no interval; before):"
     width = max(len(one.label) for one in calibration.parameters)
     for one in calibration.parameters:
         yield f"  {_parameter(one, width)}"
-    yield from _undetermined(calibration)
+    if fits:
+        yield from _undetermined(calibration)
     yield from _search(calibration)
+    yield from _checked(calibration.lack)
     if calibration.memory > NOT_NOISE:
         yield (
             f"What is left has a memory of {calibration.memory:.0f} samples: it isn't the noise of "
-            "encoders alone. The twin lacks something that the robot has; no interval covers that."
+            "encoders alone."
         )
     yield "Joints (before -> after):"
     for joint, first in calibration.before.items():
@@ -69,7 +76,7 @@ def reported(calibration: Calibration) -> dict[str, Any]:
                 "unit": one.unit,
                 "start": one.start,
                 "value": one.value,
-                "ci95": list(one.ci95),
+                "ci95": None if one.ci95 is None else list(one.ci95),
                 "determined": one.determined,
             }
             for one in calibration.parameters
@@ -83,11 +90,30 @@ def reported(calibration: Calibration) -> dict[str, Any]:
             "module": search.module,
             "p": search.p,
             "tried": search.tried,
-            "named": search.named,
+            "named": search.named and not calibration.lack.found,
         },
         "misfit": {
             joint: {"before": vars(first), "after": vars(calibration.after[joint])}
             for joint, first in calibration.before.items()
+        },
+        "fits": not calibration.lack.found,
+        "lack_of_fit": {
+            "p": calibration.lack.p,
+            "worst": calibration.lack.worst,
+            "gait_hz": calibration.lack.gait_hz,
+            "joints": {joint: vars(one) for joint, one in calibration.lack.joints.items()},
+            "alternatives": [
+                {
+                    "label": one.label,
+                    "size": one.size,
+                    "ci95": [one.size - Z95 * one.error, one.size + Z95 * one.error],
+                    "p": one.p,
+                }
+                for one in calibration.lack.alternatives
+            ],
+            "unfitted": None
+            if calibration.lack.unfitted is None
+            else vars(calibration.lack.unfitted),
         },
         "rms_rad": {"before": _rms(calibration.before), "after": _rms(calibration.after)},
         "residual_memory_samples": calibration.memory,
@@ -98,16 +124,75 @@ def reported(calibration: Calibration) -> dict[str, Any]:
     }
 
 
+def _lack(lack: LackOfFit) -> Iterator[str]:
+    """The first line of a fit that doesn't fit."""
+    parts: list[str] = []
+    if lack.alternatives:
+        best = min(lack.alternatives, key=lambda one: one.p)
+        if sum(one.widens is best.widens for one in lack.alternatives) * best.p < LEVEL:
+            parts.append(f"{best.label} would fit better ({_size(best)})")
+    off = [j for j, one in lack.joints.items() if len(lack.joints) * one.p < LEVEL]
+    if off:
+        periodic = lack.joints[lack.worst].periodic_rad
+        size = "" if periodic is None else f" by {periodic:.2g} rad (RMS)"
+        how = "is no noise" if periodic is None else "comes back with every cycle"
+        others = f" and {len(off) - 1} more" if len(off) > 1 else ""
+        parts.append(f"what is left at {lack.worst}{others} {how}{size}")
+    if lack.unfitted is not None and lack.unfitted.p < LEVEL:
+        parts.append(
+            "the two halves of the session ask for different parameters "
+            f"({lack.unfitted.unfitted_rad:.3g} rad off where not fitted, "
+            f"{lack.unfitted.fitted_rad:.3g} where fitted)"
+        )
+    why = "; ".join(parts) or "its joints and halves together leave more than noise"
+    yield (
+        f"The twin doesn't fit this session ({_p(lack.p)}): {why}. It lacks something that the "
+        "robot has: another friction law, play, a weak module (--modules). The values are those "
+        "that fit best; they have no intervals, and none is determined."
+    )
+
+
+def _size(other: Alternative) -> str:
+    """How much of another law, with its 95 % interval."""
+    low, high = other.size - Z95 * other.error, other.size + Z95 * other.error
+    if other.widens:
+        return f"weight {other.size:.2f} [{low:.2f}, {high:.2f}], 0 is the twin's law"
+    return f"{other.size:.2g} rad [{low:.2g}, {high:.2g}]"
+
+
+def _checked(lack: LackOfFit) -> Iterator[str]:
+    if lack.found:
+        return
+    what = "the gait's harmonics" if lack.gait_hz is not None else "the residual's memory"
+    off = ""
+    if lack.unfitted is not None:
+        size = lack.unfitted.unfitted_rad
+        off = f"; each half under the parameters of the other is {size:.3g} rad off"
+    open_laws = [one.label for one in lack.alternatives if one.widens and one.could_be]
+    if open_laws:
+        yield (
+            f"Not told by this session: {' or '.join(open_laws)} would do as well; intervals have "
+            "it in them."
+        )
+    yield f"Fits: nothing but noise is shown at {what} ({_p(lack.p)}){off}."
+
+
+def _p(p: float) -> str:
+    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
+
+
 def _rms(misfits: dict[str, Misfit]) -> float:
     return float(np.sqrt(np.mean([one.rms**2 for one in misfits.values()])))
 
 
 def _parameter(one: Fitted, width: int) -> str:
-    low, high = one.ci95
     scale, unit = (1e3, "ms") if one.name == DELAY else (1.0, "" if one.unit == "1" else one.unit)
-    numbers = f"{scale * one.value:.4g} [{scale * low:.4g}, {scale * high:.4g}]"
+    numbers = f"{scale * one.value:.4g}"
+    if one.ci95 is not None:
+        low, high = one.ci95
+        numbers += f" [{scale * low:.4g}, {scale * high:.4g}]"
     before = "" if one.name == DELAY else f"; {scale * one.start:.4g}"
-    open_ = "" if one.determined else ", undetermined"
+    open_ = "" if one.determined or one.ci95 is None else ", undetermined"
     return f"{one.label:{width}}  {numbers} {unit}".rstrip() + before + open_
 
 
@@ -133,8 +218,13 @@ def _search(calibration: Calibration) -> Iterator[str]:
     search = calibration.search
     if search is None:
         return
-    p = "p < 0.001" if search.p < 0.001 else f"p = {search.p:.3f}"
-    if search.named:
+    p = _p(search.p)
+    if search.named and calibration.lack.found:
+        yield (
+            f"Of {search.tried} modules {search.module} lessens the misfit most; whether it "
+            "differs is open, since the twin doesn't fit."
+        )
+    elif search.named:
         yield f"Of {search.tried} modules {search.module} differs ({p}, family-wise)."
     else:
         yield (

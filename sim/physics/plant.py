@@ -42,7 +42,12 @@ class Plant:
         self._below = np.zeros((3, len(radius)))
         self._below[2] = -radius
         self._obstacle_law = (
-            obstacle_law(world.obstacles, world.obstacle_contact, radius, length)
+            obstacle_law(
+                *(world.obstacles, world.obstacle_contact, radius, length),
+                mass=np.array([link.mass for link in robot.links]),
+                inertia=np.array([min(link.inertia) for link in robot.links]),
+                dt=self.dt,
+            )
             if world.obstacles
             else None
         )

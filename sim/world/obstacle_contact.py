@@ -6,6 +6,13 @@ normal is horizontal, out of the obstacle. So obstacles push sideways only: a li
 an edge is not carried by the top. The friction is regularised as on the ground
 (:mod:`sim.physics.contact`): what is held by it creeps.
 
+A robot presses against an obstacle much harder than a link lies on the ground, so that friction
+smoothed over a slip speed alone would be a damper that turns the slip of a light link over at every
+step: the links would tremble at half the physics rate, and samples at the control rate, which meet
+one phase of it only, would show smooth speeds that no joint has. So it is smoothed besides over the
+slip that it can stop within one step, mu N dt / m, m being what a free link opposes at the point of
+contact (in the chain it is more). That goes to zero with the step.
+
 As the nearest point of the axis moves along the link, the depth changes only by the motion of the
 body there (the derivative along the axis is zero, or the end stops it), so the spring stores and
 gives back its energy exactly, k depth^2 / 2.
@@ -87,6 +94,10 @@ def obstacle_law(
     material: ObstacleMaterial,
     radius: FloatArray,
     length: FloatArray,
+    *,
+    mass: FloatArray,
+    inertia: FloatArray,
+    dt: float,
 ) -> ObstacleLaw:
     """The obstacles' law, ready for one body.
 
@@ -95,6 +106,9 @@ def obstacle_law(
         material: Of all of them.
         radius: Radii of the links [m], shape (n,).
         length: Lengths of the links, joint to joint [m], shape (n,).
+        mass: Of the links [kg], shape (n,).
+        inertia: Their least principal moments [kg m^2], shape (n,).
+        dt: Physics step, 0 for the law without steps [s].
 
     Returns:
         A pure function of the links' centres, orientations (x, y, z, w), velocities and angular
@@ -148,11 +162,27 @@ def obstacle_law(
         speed = (normal * at_point).sum(axis=0)
         press = normal_force(depth, -speed, material.stiffness, material.damping)
         slip = at_point - speed * normal
-        smoothed = np.sqrt((slip * slip).sum(axis=0) + material.slip_speed**2)
+        give = yielding((arm * arm).sum(axis=0), mass[link], inertia[link])
+        stopped = material.mu * press * dt * give
+        smoothed = np.sqrt((slip * slip).sum(axis=0) + material.slip_speed**2 + stopped**2)
         force = press * (normal - material.mu * slip / smoothed)
         return ObstacleContact(link, position[:, link] + arm, at_point, normal, depth, force)
 
     return contact
+
+
+def yielding(arm_squared: FloatArray, mass: FloatArray, inertia: FloatArray) -> FloatArray:
+    """By how much a free link gives way where it is pushed, in the direction it gives way most.
+
+    Args:
+        arm_squared: Square of the distance from its centre [m^2], shape (p,).
+        mass: [kg], shape (p,).
+        inertia: Least principal moment [kg m^2], shape (p,).
+
+    Returns:
+        Velocity that an impulse gives the point, at most [1/kg], shape (p,).
+    """
+    return 1.0 / mass + arm_squared / inertia
 
 
 class _Touch(NamedTuple):

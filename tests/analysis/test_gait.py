@@ -86,8 +86,12 @@ def test_planes_with_different_frequencies_are_not_averaged():
     named |= {f"v{i}": Series(f"v{i}", t, 0.1 * np.sin(4.3 * t - i)) for i in range(2)}
     said = []
     fit = fit_gait(named, named, 10.0, said.append)
-    assert fit.driven == tuple(f"h{i}" for i in range(5))
-    assert any("2 joints are commanded something else" in text for text in said)
+    assert [group.driven for group in fit.groups] == [
+        tuple(f"h{i}" for i in range(5)),
+        ("v0", "v1"),
+    ]
+    assert [group.fit.omega for group in fit.groups] == pytest.approx([3.0, 4.3], rel=1e-9)
+    assert not any("commanded something else" in text for text in said)
 
 
 def test_steady_runs_of_the_logged_gait():

@@ -41,6 +41,7 @@ def write_twin(
     change=None,
     odometry=True,
     ledger=None,
+    powers=None,
 ):
     """A robot with perfect servos (by default) that moves as the viscous null says, K = 6."""
     robot = load_robot("snake25")
@@ -76,6 +77,9 @@ def write_twin(
         odometry = w.odometry("/odom", frame="world", child="link01") if odometry else None
         terms = ("mechanical_net", "electrical_net")
         booked = w.joint_state("/energy_ledger", terms, unit="J") if ledger else None
+        accumulated = {
+            name: w.joint_state(f"/joint_power/{name}", names, unit="W") for name in powers or ()
+        }
         rng = np.random.default_rng(1)
         for k in ticks:
             t_ns = EPOCH_NS + int(k) * TICK_NS
@@ -91,6 +95,8 @@ def write_twin(
             gait.write(
                 t_ns, np.tile([0.3 * ramp, OMEGA, -np.pi / 3, 0.0, OMEGA * k / 100], len(planes))
             )
+            for name, channel in accumulated.items():
+                channel.write(t_ns + TICK_NS // 2, np.full(25, powers[name]))
             if booked is not None:
                 booked.write(t_ns, np.array(ledger) * k / 100)
             if odometry is not None:
@@ -182,6 +188,29 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     said = [text for text in analysed(path).warnings if "ledger" in text]
     assert len(said) == 1
     assert said[0].startswith("electrical energy is 300 J from the samples but 240 J")
+
+
+def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_path, twin):
+    without = analysed(twin)
+    assert without.energy.unknown == (
+        "mechanical energies are products of sampled torque and velocity and electrical energies "
+        "are products of sampled voltage and current: what these do within a sampling interval is "
+        "not in the log, so the error is unknown"
+    )
+    assert not any("interval is not in the log" in text for text in without.warnings)
+    mechanical = {"mechanical": -0.5, "mechanical_plus": 0.25}
+    result = analysed(write_twin(tmp_path / "m.mcap", powers=mechanical, odometry=False))
+    assert "mechanical energies" not in result.energy.unknown
+    for joint in result.joints:
+        assert joint.energy_net_j == pytest.approx(-6.0)
+        assert joint.energy_plus_j == pytest.approx(3.0)
+        assert joint.energy_abs_j == pytest.approx(12.0)
+        assert joint.energy_el_j == pytest.approx(12.0)  # 0.5 A at 2 V
+    both = mechanical | {"electrical": 1.5, "electrical_plus": 1.75}
+    result = analysed(write_twin(tmp_path / "b.mcap", powers=both, odometry=False))
+    assert result.energy.unknown is None
+    assert [joint.energy_el_j for joint in result.joints] == pytest.approx([18.0] * 25)
+    assert [joint.energy_el_clipped_j for joint in result.joints] == pytest.approx([21.0] * 25)
 
 
 def test_a_change_of_gait_splits_the_session(tmp_path):

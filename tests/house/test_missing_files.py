@@ -41,6 +41,8 @@ LINES = [
     "analyse {no}.mcap",
     "analyse {run} {no}.mcap",
     "analyse {run} --null {no}.json",
+    "predict {no}.mcap --eps 0.3",
+    "predict {no}.json --eps 0.3",
     "compare {run} {no}.mcap",
     "plan lag-sweep --like {no}.mcap -o {out}",
     "plan multisine --like {no}.mcap -o {out}",

@@ -18,8 +18,10 @@ FIELD = (
 )
 
 
-def law(obstacles, material=STUFF, links=1):
-    return obstacle_law(obstacles, material, np.full(links, RADIUS), np.full(links, LENGTH))
+def law(obstacles, material=STUFF, links=1, dt=0.0):
+    sizes = np.full(links, RADIUS), np.full(links, LENGTH)
+    masses = {"mass": np.full(links, MASS), "inertia": np.full(links, INERTIA)}
+    return obstacle_law(obstacles, material, *sizes, **masses, dt=dt)
 
 
 def about_z(angle):
@@ -143,6 +145,34 @@ def test_friction_and_damper_only_take(seed):
     assert ((contact.force * slip).sum(axis=0) <= 1e-12).all()
     stored = 5000.0 * contact.depth
     assert ((press - stored) * speed <= 1e-9).all()
+
+
+@pytest.mark.parametrize("dt", [1e-3, 2.5e-4])
+def test_friction_never_turns_the_slip_of_a_free_link_within_a_step(dt):
+    links = random_links(7)
+    contact, position = law(FIELD, links=400, dt=dt)(*links), links[0]
+    press = (contact.force * contact.normal).sum(axis=0)
+    friction = contact.force - press * contact.normal
+    arm = contact.point - position[:, contact.link]
+    slip = contact.velocity - (contact.velocity * contact.normal).sum(axis=0) * contact.normal
+    # A free ball of the link's mass and least moment, the bluntest body that there could be.
+    turn = np.cross(np.cross(arm, friction, axis=0), arm, axis=0) / INERTIA
+    after = slip + dt * (friction / MASS + turn)
+    after -= (after * contact.normal).sum(axis=0) * contact.normal
+    assert (np.linalg.norm(dt * friction, axis=0) > 0.02 * MASS).any()
+    assert ((after * slip).sum(axis=0) >= -1e-12).all()
+
+
+def test_the_bound_on_friction_goes_with_the_step():
+    links = random_links(8)
+    exact = law(FIELD, links=400)(*links)
+    worst = []
+    for dt in (1e-4, 1e-5, 1e-6, 1e-7):
+        found = law(FIELD, links=400, dt=dt)(*links)
+        np.testing.assert_array_equal(found.depth, exact.depth)
+        worst.append(np.linalg.norm(found.force - exact.force, axis=0).max())
+    assert all(np.diff(worst) < 0.0)
+    assert worst[-1] < 1e-4 * np.linalg.norm(exact.force, axis=0).max()
 
 
 @pytest.mark.parametrize("angle", [0.3, 2.0, -1.2])

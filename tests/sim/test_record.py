@@ -26,6 +26,7 @@ from sim import (
     load_scenario,
     parse_scenario,
 )
+from sim.physics.energy_flows import JOINT_TERMS
 from sim.physics.ledger import TERMS
 from sim.record import record
 from sim.sensing.contract import JointSample
@@ -34,6 +35,12 @@ from sim.urdf import urdf
 
 HUNDREDTH_NS = 10_000_000
 UNDULOG = (sys.executable, "-m", "undulog")
+POWERS = {
+    "mechanical": "mechanical_net",
+    "mechanical_plus": "mechanical_plus",
+    "electrical": "electrical_net",
+    "electrical_plus": "electrical_plus",
+}
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +102,7 @@ def test_the_channels_are_those_of_the_contract(session):
         "/joint_sample_offset": "s",
         "/joint_current": "A",
         "/joint_voltage": "V",
+        **{f"/joint_power/{name}": "W" for name in POWERS},
         "/gait": "rad, omega in rad/s",
         "/gait/mode": None,
         "/energy_ledger": "J",
@@ -113,6 +121,18 @@ def test_the_channels_are_those_of_the_contract(session):
     assert counts["/imu"] == 60
     assert counts["/sonar"] == counts["/compass"] == 12
     assert {counts[f"/ir/{i + 1:02d}"] for i in range(15)} <= {15, 16}  # every 38 ms
+
+
+def test_powers_of_a_period_are_what_the_ledger_books_in_it(session, truth, scenario):
+    middles = scenario.epoch_ns + HUNDREDTH_NS * np.arange(60) + HUNDREDTH_NS // 2
+    for name, term in POWERS.items():
+        power = session.joints(f"/joint_power/{name}")
+        assert power.names == scenario.robot.joint_names
+        assert all(np.array_equal(t, middles) for t in power.t_ns)
+        row = JOINT_TERMS.index(term)
+        booked = np.diff([sample.joint_energy[row] for sample in truth], axis=0)
+        rounded = 0.5 * 2.0**-24 * 0.01
+        np.testing.assert_allclose(np.array(power.values).T * 0.01, booked, rtol=0, atol=rounded)
 
 
 def test_joints_come_back_exactly(session, run, scenario):

@@ -93,19 +93,26 @@ def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name):
 
 def test_an_obstacle_uses_the_range_as_the_end_of_the_chain_gives_way(nudged):
     # Two links with a loose gear: 1 / mass at the end, from free links and the joint between them.
-    material = ObstacleMaterial(stiffness=3e4, damping=5.0)
-    world = dataclasses.replace(
-        IN_SPACE, obstacles=(Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
-    )
-    found = stability(nudged(2, world=world, gear_stiffness=1e-9, gear_damping=1e-9))
+    def found(material):
+        world = dataclasses.replace(
+            IN_SPACE, obstacles=(Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
+        )
+        scenario = nudged(2, world=world, gear_stiffness=1e-9, gear_damping=1e-9)
+        return stability(scenario)[Plane.HORIZONTAL]
+
+    material = ObstacleMaterial(stiffness=3e4, damping=5.0, mu=0.0)
     free = np.diag(1 / np.array([0.1, 5e-5, 0.1, 5e-5]))  # shift and turn, shift and turn
     joint = np.array([1.0, -0.03, -1.0, -0.03])
     end = np.array([1.0, 0.03, 0.0, 0.0])
     held = free @ joint
     give = end @ free @ end - (end @ held) ** 2 / (joint @ held)
     expected = (2e-3 * 5.0 + 1e-6 * 3e4) * give / 4
-    assert found[Plane.HORIZONTAL].share == pytest.approx(expected, rel=1e-6)
-    assert found[Plane.HORIZONTAL].stiffest == "world.obstacle_contact.stiffness"
+    assert found(material).share == pytest.approx(expected, rel=1e-6)
+    assert found(material).stiffest == "world.obstacle_contact.stiffness"
+    # Friction stops the free link's end, 39 mm from its centre, within a step: 2 dt c = 2 m.
+    friction = 2.0 / (1 / 0.1 + (0.03**2 + 0.025**2) / 4e-5) * give / 4
+    rough = dataclasses.replace(material, mu=0.3)
+    assert found(rough).share == pytest.approx(expected + friction, rel=1e-6)
 
 
 def test_a_ground_that_does_not_carry_a_link_is_named(make_scenario, make_robot):
@@ -139,3 +146,9 @@ def test_the_default_robot_on_the_default_ground(nudged, links, planar, rate_hz,
 @pytest.mark.parametrize("name", scenario_names())
 def test_shipped_scenarios_are_within_the_bound(name):
     assert not warnings(load_scenario(name))
+
+
+def test_among_obstacles_the_shipped_robot_needs_two_kilohertz():
+    slow, fast = (load_scenario("random-walk", {"physics_rate_hz": hz}) for hz in (1000, 2000))
+    assert any("too stiff for steps of 1 ms" in text for text in warnings(slow))
+    assert not warnings(fast)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.energy.joint import integrate, power_of
+from analysis.energy.joint import add_up, integrate, power_of
 from analysis.estimators.series import (
     Series,
     clean,
@@ -84,3 +84,46 @@ def test_each_cycle_has_its_own_energy_and_coverage():
     np.testing.assert_allclose(energy.net_j[whole], 0.7, atol=1e-9)
     np.testing.assert_allclose(energy.covered[whole], 1.0, atol=1e-9)
     assert energy.covered[3] == pytest.approx(0.5, abs=0.011)
+
+
+def accumulated(power, count, start_s=-3.0, length_s=0.01, fine=200):
+    """Means of a power and of its positive part over intervals, by the midpoint rule."""
+    at = start_s + (np.arange(count * fine).reshape(count, fine) + 0.5) * length_s / fine
+    t = start_s + (np.arange(count) + 0.5) * length_s
+    values = power(at)
+    return Series("q", t, values.mean(axis=1)), Series("q", t, np.maximum(values, 0).mean(axis=1))
+
+
+def test_accumulated_powers_keep_what_happens_within_an_interval():
+    # A ripple in step with the sampling, and one that changes the sign within an interval.
+    def power(t):
+        return 0.3 + 2.0 * np.sin(2 * np.pi * 100 * t) + np.sin(2 * np.pi * t)
+
+    net, plus = accumulated(power, 800)
+    energy = add_up(net, plus, -3.0, 5.0, 8)
+    np.testing.assert_allclose(energy.net_j, 0.3, atol=1e-12)
+    fine = power((np.arange(800_000) + 0.5) * 1e-5)
+    np.testing.assert_allclose(energy.abs_j.sum(), np.abs(fine).sum() * 1e-5, rtol=1e-4)
+    np.testing.assert_allclose(energy.covered, 1.0)
+    (product,) = integrate([net], -3.0, 5.0, 8)
+    assert product.abs_j.sum() < 0.6 * energy.abs_j.sum()  # the sign of the mean alone
+
+
+def test_a_window_takes_its_part_of_the_intervals_at_its_edges():
+    net, plus = accumulated(lambda t: 1.0 + t, 800)  # stamps from -2.995 on
+    energy = add_up(net, plus, -1.0037, 2.0021, 1)
+    exact = 3.0058 + (2.0021**2 - 1.0037**2) / 2
+    assert energy.net_j[0] == pytest.approx(exact, abs=2 * 0.01**2 / 8)
+    assert energy.plus_j[0] == pytest.approx(exact + 0.0037**2 / 2, abs=2 * 0.01**2 / 8)
+
+
+def test_a_lost_message_is_a_gap_of_one_interval():
+    net, plus = accumulated(np.ones_like, 800)
+    kept = np.delete(np.arange(800), [5, 6, 400])
+    lost = [Series("q", one.t_s[kept], one.values[kept]) for one in (net, plus)]
+    energy = add_up(*lost, -3.0, 5.0, 8)
+    np.testing.assert_allclose(energy.net_j, [0.98, 1, 1, 1, 0.99, 1, 1, 1])
+    np.testing.assert_allclose(energy.covered, energy.net_j)
+    assert energy.coverage == pytest.approx(7.97 / 8)
+    assert add_up(net, lost[1], -3.0, 5.0, 8) is None
+    assert add_up(net, plus, 6.0, 7.0, 1) is None

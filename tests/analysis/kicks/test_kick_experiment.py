@@ -87,7 +87,11 @@ def test_the_matrices_are_those_planted(result):
     assert inside >= 0.9 * 4 * M * M
     # sigma sqrt(2/N)/|a| a run, two runs a difference, over 0.1.
     expected = SIGMA * math.sqrt(2 / 300) / np.abs(H @ BASE) * math.sqrt(2) / 0.1
-    np.testing.assert_allclose(np.mean(coupling.P.standard_error, axis=1), expected, rtol=0.3)
+    ratio = np.mean(coupling.P.standard_error, axis=1) / expected
+    # Never below the noise within runs; above it by what nine combinations of runs tell.
+    assert ratio.min() > 0.7
+    assert ratio.max() < 2.0
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.25)
     assert coupling.checks_pass
     for rows, total in ((coupling.phase_rows, 1.0), (coupling.gain_rows, 0.0)):
         assert all(row.expected == total for row in rows)

@@ -21,6 +21,7 @@ class Table:
     value: np.ndarray
     error: np.ndarray
     dof: np.ndarray
+    correlation: None = None
 
 
 def noisy(P, sigma, rng=None):

@@ -58,11 +58,11 @@ def planned(capsys, *words):
 def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
     words = ("--like", like, "-o", tmp_path / "kicks", "--settle", 3, "--measure", 5)
     files = planned(capsys, "phase-kicks", *words)
-    assert len(files) == 4 * 4 + 1 + 3
+    assert len(files) == 4 * 4 + 6 + 3
     found = [phasors(file, 3.0) for file in files]
     command = np.stack([one[0][YAW] for one in found])
     runs = sort_kicks(command)
-    assert (len(runs.base), len(runs.kicks), len(runs.patterns)) == (1, 16, 3)
+    assert (len(runs.base), len(runs.kicks), len(runs.patterns)) == (6, 16, 3)
     for kind in Kind:
         assert missing_kicks(list(runs.kicks.values()), kind, "abcd") == ()
     np.testing.assert_allclose(np.abs(command[runs.base[0]]), 0.3, rtol=1e-5)
@@ -100,6 +100,6 @@ def test_what_is_refused(like, tmp_path, capsys):
     assert not folder.exists()
     short = [str(like), "--settle", "1", "--measure", "1"]
     assert undulog.run([*words, *short]) == 0
-    assert capsys.readouterr().out.startswith(f"{folder}: phase-kicks, 20 runs of 2 s")
+    assert capsys.readouterr().out.startswith(f"{folder}: phase-kicks, 25 runs of 2 s")
     assert undulog.run([*words, *short]) != 0
     assert "exists" in capsys.readouterr().err

@@ -1,0 +1,361 @@
+"""Find the joints that share a rhythm, from their commands.
+
+The gait of a snake robot may have a frequency for each plane (omega_h and omega_v in Eqs. 2 and 6
+of Meister et al., 2011) or for any other part of its joints. Each channel's own frequency is
+estimated, and channels whose frequencies the record's length T can't resolve are one group: two
+tones closer than about 1.5/T can't be told apart in a response that holds both.
+
+Through the body each response also holds the other groups' tones. So the model of every channel has
+the harmonics of all groups (:func:`further_lines`), and coincident ones, as 2 omega_1 and 3 omega_2
+at 3:2, only once. A nonlinear body makes tones at m omega_1 + n omega_2, too; one that falls on a
+group's own tone can't be separated from its response (:func:`mixed_tones`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from capture.arrays import BoolArray, FloatArray
+
+from .estimators.harmonic import HarmonicFit, fit_at
+from .estimators.harmonic_moments import HarmonicModel
+from .estimators.series import Series
+from .gait import (
+    DRIVEN_SHARE,
+    HARMONICS,
+    MIN_EXPLAINED,
+    NYQUIST_SHARE,
+    Rhythm,
+    allowed_model,
+    find_rhythm,
+    refine,
+)
+
+RESOLUTION = 1.5
+"""Frequencies closer than this many cycles over the record are not resolved."""
+
+COINCIDENT = 0.5
+"""Harmonics of two groups closer than this many cycles over the record are one column."""
+
+MIXING_ORDER = 6
+"""Highest |m| + |n| of a tone m f1 + n f2 that is looked for at a group's tone."""
+
+MODELLED_ORDER = 4
+"""Highest |m| + |n| of a mixed tone that is fitted beside a group's own."""
+
+_MOST_LINES = 24
+"""Lines beside a group's harmonics, at most; lower orders come first."""
+
+_SAMPLES_PER_LINE = 8
+"""Samples that a channel needs for each of these lines."""
+
+_CLEAR = 0.98
+"""A command explained to less than this may have a frequency of its own: a tenth of a cycle over
+the record off leaves 3 %."""
+
+_OWN_SHARE = 0.02
+"""A channel whose fundamental has less than this share of its harmonics' power has another one."""
+
+_SAME = 0.1
+"""Frequencies closer than this many cycles over the record are the same."""
+
+_SIGMAS = 5.0
+"""And so are those closer than this many standard errors."""
+
+
+@dataclass(frozen=True)
+class Unresolved:
+    """Joints at two frequencies that the record is too short to separate.
+
+    Attributes:
+        kept: Names of those that are analysed with one frequency.
+        left: Names of those that are not analysed; none where one frequency fits all.
+        low_hz: Lowest frequency [Hz].
+        high_hz: Highest frequency [Hz].
+    """
+
+    kept: tuple[str, ...]
+    left: tuple[str, ...]
+    low_hz: float
+    high_hz: float
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Channels by rhythm.
+
+    Attributes:
+        rhythms: One a group, the largest group first.
+        explained: Share of all moving channels' variance that their groups' rhythms explain, or
+            rhythms of their own that are not resolved.
+        unresolved: Groups that hold, or are beside, a frequency that is too close.
+        astray: Names of channels that move, but not by a rhythm of a group.
+    """
+
+    rhythms: tuple[Rhythm, ...]
+    explained: float
+    unresolved: tuple[Unresolved, ...] = ()
+    astray: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MixedTone:
+    """A harmonic of a group, or a tone of two groups together, that falls on a group's own tone.
+
+    Attributes:
+        group: Index of the group on whose frequency it falls.
+        factors: Whole factor of each group's frequency in it, by index; none of them is 0, and
+            the sum is above 0.
+    """
+
+    group: int
+    factors: Mapping[int, int]
+
+
+@dataclass(frozen=True)
+class _Tone:
+    """A channel's own rhythm."""
+
+    series: Series
+    rhythm: Rhythm
+
+    @property
+    def error(self) -> float:
+        """Standard error of its frequency in white noise [rad/s]."""
+        information = float(np.sum(self.rhythm.fit.weight * self.rhythm.fit.information))
+        return information**-0.5 if information > 0 else float("inf")
+
+
+def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
+    """Find the rhythms of the channels.
+
+    Args:
+        series: Channels with names of their own; those that never move are ignored.
+        duration_s: Length of the stretch [s].
+
+    Returns:
+        The groups; a single one, however little it explains, where channels have no rhythms of
+        their own. None where there is no rhythm at all.
+    """
+    common = find_rhythm(series, duration_s)
+    if common is None:
+        return None
+    moving = [one for one in series if one.name in common.names]
+    lively = _lively(common.fit)
+    if np.all(_own(common.fit)[lively]):
+        return Groups((common,), common.explained)
+    active = [one for one, chosen in zip(moving, lively, strict=True) if chosen]
+    tones = [
+        _Tone(one, rhythm)
+        for one in active
+        if (rhythm := find_rhythm([one], duration_s)) is not None
+        and rhythm.explained >= MIN_EXPLAINED
+        and _fundamental_share(rhythm.fit)[0] >= _OWN_SHARE
+    ]
+    bin_rad_s = 2 * np.pi / duration_s
+    rhythms: list[Rhythm] = []
+    unresolved: list[Unresolved] = []
+    for cluster in _clusters(tones, RESOLUTION * bin_rad_s):
+        rhythm, close = _one_rhythm(cluster, _SAME * bin_rad_s)
+        rhythms += [] if rhythm is None else [rhythm]
+        unresolved += [] if close is None else [close]
+    alone = len(rhythms) == 1 and abs(rhythms[0].omega - common.omega) < COINCIDENT * bin_rad_s
+    if not rhythms or (alone and not any(close.left for close in unresolved)):
+        return Groups((common,), common.explained, tuple(unresolved))
+    left = {name for close in unresolved for name in close.left}
+    grouped = {name for rhythm in rhythms for name in rhythm.names}
+    rest = [one for one in active if one.name not in grouped | left]
+    rhythms = _with_compound(rhythms, active, rest, duration_s)
+    rhythms.sort(key=lambda one: (-len(one.names), -float(one.fit.total.sum()), one.omega))
+    total = float(common.fit.total.sum())
+    undecided = [one.rhythm for one in tones if one.series.name in left]
+    known = sum(float((one.fit.total - one.fit.rss).sum()) for one in (*rhythms, *undecided))
+    grouped = {name for rhythm in rhythms for name in rhythm.names}
+    astray = tuple(one.name for one in active if one.name not in grouped | left)
+    return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
+
+
+def group_model(
+    series: Sequence[Series], omegas: Sequence[float], group: int, duration_s: float
+) -> HarmonicModel:
+    """The basis of a group's channels: own harmonics, and the tones of the other groups.
+
+    Args:
+        series: Channels of the group.
+        omegas: Angular frequencies of all groups [rad/s].
+        group: Index of the group.
+        duration_s: Length of the record [s].
+
+    Returns:
+        As many lines as the slowest channel's sampling rate and samples allow.
+    """
+    model = allowed_model(series, omegas[group])
+    highest = NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
+    most = min(_MOST_LINES, min(one.count for one in series) // _SAMPLES_PER_LINE)
+    lines = further_lines(omegas, group, model.harmonics, highest, duration_s)
+    return replace(model, lines=lines[:most])
+
+
+def further_lines(
+    omegas: Sequence[float], group: int, harmonics: int, highest: float, duration_s: float
+) -> tuple[float, ...]:
+    """Frequencies of the other groups' tones, for the model of one group's channels.
+
+    They are the harmonics of the other groups and the mixed tones m omega_1 + n omega_2 with
+    |m| + |n| up to ``MODELLED_ORDER``, which would count as noise otherwise.
+
+    Args:
+        omegas: Angular frequencies of all groups [rad/s].
+        group: Index of the group.
+        harmonics: How many harmonics of its own its model has.
+        highest: Highest frequency that the sampling rate allows [rad/s].
+        duration_s: Length of the record [s].
+
+    Returns:
+        Angular frequencies [rad/s] without those that coincide with an own harmonic, with zero or
+        with each other; mixed tones only where they are resolved from all of these.
+    """
+    near = COINCIDENT * 2 * np.pi / duration_s
+    taken = [0.0, *(order * omegas[group] for order in range(1, harmonics + 1))]
+    lines: list[float] = []
+    for order in range(1, HARMONICS + 1):
+        for k, omega in enumerate(omegas):
+            line = order * omega
+            apart = min(abs(line - other) for other in (*taken, *lines))
+            if k != group and line <= highest and apart > near:
+                lines.append(line)
+    # Mixed tones may only be absent from the noise beside the tone, so none is worth an error bar.
+    near *= RESOLUTION / COINCIDENT
+    for factors in _combinations(len(omegas)):
+        line = abs(sum(factor * omegas[k] for k, factor in factors.items()))
+        order = sum(abs(factor) for factor in factors.values())
+        if order > MODELLED_ORDER:
+            break
+        apart = min(abs(line - other) for other in (*taken, *lines))
+        if len(factors) > 1 and line <= highest and apart > near:
+            lines.append(line)
+    return tuple(lines)
+
+
+def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
+    """Find the tones of other groups, or of several together, that fall on a group's own tone.
+
+    Args:
+        omegas: Angular frequencies of the groups [rad/s].
+        duration_s: Length of the record [s].
+
+    Returns:
+        For each group the tone of lowest order |m| + |n|, up to ``MIXING_ORDER``, that the record
+        does not resolve from it.
+    """
+    near = RESOLUTION * 2 * np.pi / duration_s
+    found: list[MixedTone] = []
+    for group, omega in enumerate(omegas):
+        for factors in _combinations(len(omegas)):
+            tone = sum(factor * omegas[k] for k, factor in factors.items())
+            if factors != {group: 1} and abs(abs(tone) - omega) < near:
+                sign = 1 if tone > 0 else -1
+                found.append(MixedTone(group, {k: sign * one for k, one in factors.items()}))
+                break
+    return found
+
+
+def _combinations(count: int) -> Iterator[dict[int, int]]:
+    """Whole factors of one or two frequencies, of rising order, each tone with one sign."""
+    for order in range(1, MIXING_ORDER + 1):
+        for k in range(count):
+            yield {k: order}
+        for a, b in combinations(range(count), 2):
+            for first in range(1, order):
+                yield {a: first, b: order - first}
+                yield {a: first, b: first - order}
+
+
+def _lively(fit: HarmonicFit) -> BoolArray:
+    size = np.sqrt(fit.total / fit.count)
+    return size > DRIVEN_SHARE * np.max(size, initial=0.0)
+
+
+def _own(fit: HarmonicFit) -> BoolArray:
+    """Whether the common rhythm is each channel's own and not a subharmonic of it."""
+    return (fit.explained >= _CLEAR) & (_fundamental_share(fit) >= _OWN_SHARE)
+
+
+def _fundamental_share(fit: HarmonicFit) -> FloatArray:
+    """Share of the fundamental in the power of each channel's harmonics, shape (K,)."""
+    power = np.abs(fit.amplitudes) ** 2
+    total = power.sum(axis=1)
+    return np.divide(power[:, 0], total, out=np.zeros_like(total), where=total > 0)
+
+
+def _clusters(tones: Sequence[_Tone], apart: float) -> list[list[_Tone]]:
+    """Tones whose frequencies have no gap wider than ``apart`` [rad/s] between them."""
+    ordered = sorted(tones, key=lambda one: one.rhythm.omega)
+    clusters: list[list[_Tone]] = [ordered[:1]] if ordered else []
+    for before, after in pairwise(ordered):
+        if after.rhythm.omega - before.rhythm.omega < apart:
+            clusters[-1].append(after)
+        else:
+            clusters.append([after])
+    return clusters
+
+
+def _one_rhythm(cluster: Sequence[_Tone], same: float) -> tuple[Rhythm | None, Unresolved | None]:
+    """The rhythm of a cluster, and whether it holds frequencies that differ."""
+    parts: list[list[_Tone]] = [[cluster[0]]]
+    for before, after in pairwise(cluster):
+        doubt = _SIGMAS * float(np.hypot(before.error, after.error))
+        if after.rhythm.omega - before.rhythm.omega > max(same, doubt):
+            parts.append([after])
+        else:
+            parts[-1].append(after)
+    rhythm = _shared(cluster)
+    if len(parts) == 1:
+        return rhythm, None
+    low, high = (cluster[k].rhythm.omega / (2 * np.pi) for k in (0, -1))
+    names = tuple(one.series.name for one in cluster)
+    if rhythm is not None and np.all(rhythm.fit.explained >= MIN_EXPLAINED):
+        return rhythm, Unresolved(names, (), low, high)
+    largest = max(
+        parts, key=lambda part: (len(part), sum(float(t.rhythm.fit.total.sum()) for t in part))
+    )
+    kept = tuple(one.series.name for one in largest)
+    left = tuple(name for name in names if name not in kept)
+    return _shared(largest), Unresolved(kept, left, low, high)
+
+
+def _shared(tones: Sequence[_Tone]) -> Rhythm | None:
+    """One rhythm of several channels, in their order in the chain."""
+    omega = float(np.mean([one.rhythm.omega for one in tones]))
+    return refine([one.series for one in tones], omega)
+
+
+def _with_compound(
+    rhythms: Sequence[Rhythm], active: Sequence[Series], rest: Sequence[Series], duration_s: float
+) -> list[Rhythm]:
+    """Fit the groups with each other's tones; a channel of several goes where its largest is."""
+    omegas = [one.omega for one in rhythms]
+    names = [set(one.names) for one in rhythms]
+
+    def fitted(series: Sequence[Series], group: int) -> HarmonicFit | None:
+        model = group_model(series, omegas, group, duration_s)
+        enough = all(one.count > model.size + 1 for one in series)
+        return fit_at(series, omegas[group], model) if enough else None
+
+    for one in rest:
+        found = [fit for group in range(len(omegas)) if (fit := fitted([one], group)) is not None]
+        if len(found) == len(omegas) and found[0].explained[0] >= MIN_EXPLAINED:
+            names[int(np.argmax([abs(fit.fundamental[0]) for fit in found]))].add(one.name)
+    result: list[Rhythm] = []
+    for group, rhythm in enumerate(rhythms):
+        members = [one for one in active if one.name in names[group]]
+        fit = fitted(members, group)
+        if fit is None or (len(rhythms) == 1 and len(members) == len(rhythm.names)):
+            result.append(rhythm)
+        else:
+            result.append(Rhythm(tuple(one.name for one in members), fit))
+    return result

@@ -1,0 +1,131 @@
+"""The table of docs/energy.md: energies by the log against the twin's ledger, every scenario.
+
+``.venv/bin/python docs/energy_tables.py`` runs all shipped scenarios, which takes some minutes, and
+prints the table as Markdown; ``--write`` puts it into the page. With names, those only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import tempfile
+from pathlib import Path
+
+from analysis.analyse import measure_session
+from analysis.energy.ledger import TERMS, booked_energies, whole_robot
+from analysis.joints import joint_energies
+from analysis.reading import RESPONSE_TOPIC, read_columns
+from capture import Session
+from sim import load_scenario, scenario_names
+from sim.physics.engine import Kernels
+from sim.record import record
+
+BAR = 0.005
+"""Largest error of an energy of the whole robot."""
+
+NET_FLOOR = 0.05
+"""E_net may vanish: its error is held against at least this part of E_abs."""
+
+PAGE = Path(__file__).with_name("energy.md")
+BEGIN, END = "<!-- table by energy_tables.py -->", "<!-- end of the table -->"
+TITLES = {"net": "E_net", "plus": "E_plus", "abs": "E_abs", "el": "E_el", "el_clipped": "E_el+"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Figures:
+    """One session's energies against its ledger.
+
+    Attributes:
+        booked: By the ledger [J], by name as in ``TITLES``.
+        errors: Of the accumulated powers, shares of the booked energy (E_net: see ``NET_FLOOR``).
+        sampled: Of products of samples alone, likewise.
+        balance: What is left of the ledger's mechanical and electrical balance, shares of E_abs.
+        flags: Joints and what their sensors are blamed for; nothing, on the twin.
+    """
+
+    booked: dict[str, float]
+    errors: dict[str, float]
+    sampled: dict[str, float]
+    balance: tuple[float, float]
+    flags: tuple[tuple[str, str], ...]
+
+
+def figures(path):
+    """Hold a recorded session's energies against its ledger, over the analysed window."""
+    with Session.open(path) as session:
+        measured = measure_session(session)
+        ledger = booked_energies(session, measured.span)
+        columns = read_columns(session, "/joint_commands", RESPONSE_TOPIC, _ignore)
+        without = dataclasses.replace(columns, powers={one: {} for one in columns.powers})
+        products = joint_energies(session, without, (), measured.span, _ignore)
+    booked = {name: ledger[term] for name, (_, term) in TERMS.items()}
+    scale = booked | {"net": max(abs(booked["net"]), NET_FLOOR * booked["abs"])}
+
+    def errors(energies):
+        whole = whole_robot(energies.values())
+        return {name: (whole[name] - booked[name]) / abs(scale[name]) for name in TERMS}
+
+    artefacts = measured.analysis.artefacts
+    flags = tuple((one.joint, one.flag) for one in artefacts if one.about == "sensor")
+    left = (ledger[f"{kind}_residual"] / booked["abs"] for kind in ("mechanical", "electrical"))
+    return Figures(booked, errors(measured.energies), errors(products), tuple(left), flags)
+
+
+def run(name, folder):
+    """Run a shipped scenario and hold its energies against its ledger."""
+    path = Path(folder) / f"{name}.mcap"
+    record(load_scenario(name), path, kernels=Kernels.NUMBA, force=True)
+    found = figures(path)
+    path.unlink()
+    return found
+
+
+def row(name, found):
+    """One row of the table."""
+    booked = (found.booked[one] for one in TITLES)
+    cells = [f"{one:.3g}" if abs(one) < 1000 else f"{one:.0f}" for one in booked]
+    cells += [f"{100 * max(abs(one) for one in found.errors.values()):.4f}"]
+    cells += [f"{100 * found.sampled[one]:+.2f}" for one in TITLES]
+    return f"| `{name}` | {' | '.join(cells)} |"
+
+
+def table(rows):
+    """The table as Markdown."""
+    heads = ["scenario", *(f"{one} [J]" for one in TITLES.values()), "largest error [%]"]
+    heads += [f"{one} by samples [%]" for one in TITLES.values()]
+    ruler = "|---|" + "---:|" * (len(heads) - 1)
+    return "\n".join([f"| {' | '.join(heads)} |", ruler, *rows])
+
+
+def _ignore(_):
+    """What is missing has been said."""
+
+
+def main():
+    """Print the table, or write it into the page."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="*", help="scenarios; all that are shipped by default")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/energy.md")
+    options = parser.parse_args()
+    rows, worst, left, flags = [], 0.0, [0.0, 0.0], []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in options.names or scenario_names():
+            found = run(name, folder)
+            rows.append(row(name, found))
+            worst = max(worst, *(abs(one) for one in found.errors.values()))
+            left = [max(one, abs(own)) for one, own in zip(left, found.balance, strict=True)]
+            flags += [(name, *flag) for flag in found.flags]
+            print(rows[-1], flush=True)
+    if options.write:
+        before, _, rest = PAGE.read_text().partition(BEGIN)
+        after = rest.partition(END)[2]
+        PAGE.write_text(f"{before}{BEGIN}\n\n{table(rows)}\n\n{END}{after}")
+    else:
+        print(f"\n{table(rows)}")
+    print(f"largest error {100 * worst:.4f} %, bar {100 * BAR:g} %")
+    print(f"the ledger's own balance closes within {100 * left[0]:.3f} % and {100 * left[1]:.4f} %")
+    print(f"sensors blamed: {flags or 'none'}")
+
+
+if __name__ == "__main__":
+    main()

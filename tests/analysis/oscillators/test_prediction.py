@@ -1,0 +1,224 @@
+"""The predicted closed loop against closed forms and against oscillators that are integrated."""
+
+import dataclasses
+import json
+import math
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+import undulog
+from analysis.kicks.coupling import kick_coupling
+from analysis.oscillators.comparator import path_laplacian
+from analysis.oscillators.laplacian import of_deviations
+from analysis.oscillators.prediction import closed_loop
+from analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of
+from capture.errors import DataError, UsageError
+
+HERE = Path(__file__).parent
+tables = runpy.run_path(str(HERE.parents[2] / "docs" / "kick_tables.py"))
+scatter = runpy.run_path(str(HERE.parent / "kicks" / "test_scatter.py"))
+chain = runpy.run_path(str(HERE.parent / "linear_chain.py"))
+
+EPS = 0.3
+
+
+def measured(random=None, scatter_deg=0.0, m=5):
+    """A kick experiment on a linear chain, analysed."""
+    H, c = tables["chain"](m)
+    experiment = scatter["kicked"](
+        random or np.random.default_rng(1),
+        H,
+        c,
+        tables["plan"](m),
+        math.radians(scatter_deg),
+        noise=1e-6 if scatter_deg == 0.0 else None,
+    )
+    return H, c, kick_coupling(experiment, lambda _: None)
+
+
+def exact(P, R, gain=1.0, lag=0.0):
+    """A coupling that is known without error."""
+    m = len(P)
+    zero = np.zeros((m, m))
+
+    def matrix(value):
+        return Matrix(rows_of(value), rows_of(zero), rows_of(zero))
+
+    _, _, like = measured(m=m)
+    nothing = tuple([0.0] * m)
+    base = BaseResponse(0.5, tuple([gain] * m), tuple([lag] * m), nothing, nothing)
+    return dataclasses.replace(like, P=matrix(P), R=matrix(R), base=base)
+
+
+@pytest.mark.parametrize("m", [4, 7])
+def test_a_path_relaxes_at_its_closed_form(m):
+    K = 0.2
+    found = closed_loop(exact(np.eye(m) - K * path_laplacian(m), np.zeros((m, m))), EPS)
+    rates = 4 * EPS * K * np.sin(np.arange(1, m) * math.pi / (2 * m)) ** 2
+    np.testing.assert_allclose([one.rate.value for one in found.modes], rates, atol=1e-9)
+    for one, rate in zip(found.modes, rates, strict=True):
+        assert one.rate.ci95 == pytest.approx((rate, rate))
+    slowest = np.cos((np.arange(m) + 0.5) * math.pi / m)
+    pattern = np.array(found.modes[0].pattern_abs)
+    np.testing.assert_allclose(pattern, np.abs(slowest) / np.linalg.norm(slowest), atol=1e-9)
+    assert f"of {m - 1} patterns of the phases {m - 1} relax" in found.answer
+
+
+def test_gain_lag_and_age_enter_as_the_equation_has_them():
+    random = np.random.default_rng(2)
+    P = np.eye(4) - 0.1 * path_laplacian(4)
+    R = random.normal(size=(4, 4))
+    R -= R.mean(axis=1, keepdims=True)
+    g, lag, age = 0.8, 0.3, 0.02
+    found = closed_loop(exact(P, R, g, lag), EPS, age_s=age)
+    turn = -lag - 2 * math.pi * 0.5 * age
+    J = EPS * (g * math.cos(turn) * (P - np.eye(4)) + g * math.sin(turn) * R)
+    np.testing.assert_allclose(found.J, J, atol=1e-12)
+    np.testing.assert_allclose(found.bias, g * math.sin(turn))
+
+
+def test_integrated_oscillators_do_what_is_predicted():
+    """phi' = eps (mean of 2 (q/A) cos phi - b), q = Im(H A e^(j phi)): nothing linearised."""
+    H, c, coupling = measured()
+    A, phase = np.abs(c), np.angle(c)
+    kick = {"j2": 0.03, "j4": -0.02}
+    off = np.array([kick.get(name, 0.0) for name in coupling.joints])
+    found = closed_loop(coupling, EPS, kick=kick, until_s=20.0)
+    bias = np.array(found.bias)
+
+    def rate(_, d):
+        c_now = A * np.exp(1j * (phase + d))
+        ratio = (H @ c_now) / c_now
+        return EPS * (ratio.imag - bias)
+
+    times = found.relaxation.times_s
+    done = solve_ivp(rate, (0.0, 20.0), off, t_eval=times, rtol=1e-9, atol=1e-12)
+    error = np.linalg.norm(np.array(found.relaxation.phase_rad) - done.y.T, axis=1)
+    moved = np.linalg.norm(done.y.T[-1] - off)
+    assert moved > 0.3 * np.linalg.norm(off)
+    assert error.max() < 0.03 * np.linalg.norm(off)  # second order in a kick of 0.03 rad
+
+
+def test_intervals_of_rates_hold_under_scatter():
+    H, c, _ = measured()
+    L = H * c[None, :] / (H @ c)[:, None]
+    felt = (H @ c) / c
+    J = felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag
+    truth = EPS * np.sort(np.linalg.eigvals(of_deviations(np.eye(5) + J)).real)
+    random = np.random.default_rng(3)
+    inside = []
+    for _ in range(20):
+        found = closed_loop(measured(random, 0.1)[2], EPS)
+        ends = [one.rate.ci95 for one in found.modes]
+        # Of the sums: rates that lie close together change places.
+        inside += [low <= t <= high for (low, high), t in zip(ends, truth, strict=True)]
+    assert np.mean(inside) >= 0.91
+
+
+def test_what_is_left_of_a_kick_has_an_interval():
+    H, c, _ = measured()
+    L = H * c[None, :] / (H @ c)[:, None]
+    felt = (H @ c) / c
+    J = EPS * (felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag)
+    off = 0.1 * (np.arange(5) == 2)
+    random = np.random.default_rng(4)
+    inside = []
+    for _ in range(20):
+        coupling = measured(random, 0.03)[2]
+        found = closed_loop(coupling, EPS, kick={"j3": 0.1}, until_s=15.0).relaxation
+        truth = np.array([expm(J * t) @ off for t in found.times_s])
+        low, high = np.array(found.low_rad), np.array(found.high_rad)
+        inside.append(np.mean(((low <= truth) & (truth <= high))[1:]))
+        assert (high[-1] - low[-1]).max() < 0.05
+    assert np.mean(inside) >= 0.91
+
+
+def test_the_limits_are_stated():
+    coupling = measured()[2]
+    assert "isn't known" in closed_loop(coupling, EPS).limits[0]
+    known = dataclasses.replace(coupling, valid_to=0.1)
+    assert "beyond 0.1 rad" in closed_loop(known, EPS, kick={"j1": 0.2}).limits[0]
+    assert "holds for deviations up to 0.1 rad" in closed_loop(known, EPS).limits[0]
+    assert "take a smaller eps" in closed_loop(known, 20.0).limits[0]
+    failed = dataclasses.replace(known, checks_pass=False)
+    assert "the prediction is doubtful" in closed_loop(failed, EPS).limits[0]
+
+
+def test_what_can_not_be_predicted():
+    coupling = measured()[2]
+    with pytest.raises(UsageError, match="--eps 0"):
+        closed_loop(coupling, 0.0)
+    with pytest.raises(UsageError, match="--kick k: the joints are j1"):
+        closed_loop(coupling, EPS, kick={"k": 0.1})
+    with pytest.raises(DataError, match="analyse the sessions again"):
+        closed_loop(dataclasses.replace(coupling, base=None), EPS)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """The result file of a kick experiment, and one of its sessions."""
+    folder = tmp_path_factory.mktemp("kicked")
+    files = chain["kicked"](folder)
+    words = ["analyse", *map(str, files), "-o", str(folder / "kicks.json")]
+    assert undulog.run(words) == 0
+    return folder / "kicks.json", files
+
+
+def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
+    file, sessions = result
+    capsys.readouterr()
+    assert undulog.run(["predict", str(file), "--eps", "0.3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert undulog.run(["predict", *map(str, sessions), "--eps", "0.3", "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(found["J"], again["J"], atol=1e-12)
+    coupling = chain["CHAIN"] * chain["WAVE"][None, :] / (chain["CHAIN"] @ chain["WAVE"])[:, None]
+    felt = (chain["CHAIN"] @ chain["WAVE"]) / chain["WAVE"]
+    J = felt.real[:, None] * (coupling.real - np.eye(5)) - felt.imag[:, None] * coupling.imag
+    np.testing.assert_allclose(found["J"], 0.3 * J, atol=0.02)
+    output = tmp_path / "predicted.json"
+    words = ["predict", str(file), "--eps", "0.3", "--kick", "j2=0.05", "-o", str(output)]
+    assert undulog.run(words) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("With feedback of 0.3 1/s and the body as the only coupling, of 4")
+    assert "Of the kick" in text
+    assert json.loads(output.read_text())["relaxation"]["times_s"][0] == 0.0
+    assert undulog.run(words) == 2  # it is there
+    assert "--force" in capsys.readouterr().err
+    assert undulog.run([*words, "--force"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        ("--eps -1", 2, "--eps -1"),
+        ("--eps 0.3 --kick j2", 2, "expected JOINT=RAD"),
+        ("--eps 0.3 --kick j9=0.1", 2, "the joints are j1"),
+        ("--eps 0.3 -o a.csv", 2, "end its name in .json"),
+        ("--eps 0.3 --age -1", 2, "--age is at least 0"),
+    ],
+)
+def test_wrong_usage(result, capsys, words, code, told):
+    assert undulog.run(["predict", str(result[0]), *words.split()]) == code
+    assert told in capsys.readouterr().err
+
+
+def test_sessions_without_kicks_fail_and_say_what_to_record(result, capsys):
+    _, sessions = result
+    assert undulog.run(["predict", str(sessions[0]), "--eps", "0.3"]) == 1
+    assert "phase-kicks around this gait" in capsys.readouterr().err
+    assert undulog.run(["predict"]) == 2
+
+
+def test_a_result_of_kicks_reads_back(result):
+    from analysis import load
+
+    coupling = load(result[0]).coupling
+    assert isinstance(coupling, LocalCoupling)
+    assert coupling.base.frequency_hz == pytest.approx(1.0, rel=1e-3)
+    assert coupling.scatter.dof > 5
