@@ -16,6 +16,7 @@ from scipy.stats import norm
 
 from analysis.estimators.series import Series
 from analysis.fitting import fit_gait
+from analysis.segments.examine import Chain, examine
 from capture.following import JointMotion, joints_not_following
 from capture.following.motion import Samples
 
@@ -169,8 +170,19 @@ def stated(recorded):
         {recorded.names[j]: Series(recorded.names[j], recorded.t_s, rows[j]) for j in joints}
         for rows in (recorded.command, recorded.position)
     ]
-    fit_gait(*series, float(recorded.t_s[-1]), lambda _: None)
-    return dict.fromkeys(STATEMENTS, ()) | {"not following": broken}
+    gait = fit_gait(*series, float(recorded.t_s[-1]), lambda _: None)
+    chains = []
+    for plane in dict.fromkeys(recorded.planes):
+        commanded = tuple(
+            name for name, own in zip(recorded.names, recorded.planes, strict=True) if own == plane
+        )
+        names = tuple(name for name in commanded if name in gait.answered and name not in broken)
+        response = gait.response.select([gait.answered.index(name) for name in names])
+        chains.append(Chain(plane, 0, commanded, names, response))
+    findings = examine(chains)
+    outside = tuple(dict.fromkeys(each.joint for each in findings.stand_out))
+    shapes = tuple(dict.fromkeys(each.kind for each in findings.shape))
+    return dict(zip(STATEMENTS, (broken, outside, shapes), strict=True))
 
 
 def identical(sessions, seed=1):

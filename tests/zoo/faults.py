@@ -405,7 +405,7 @@ def _(robot, rng, j):
         return np.where(side * (read - at) > 0, read - side * 2 * np.pi, read)
 
     kinds = frozenset({"wrapped_sensor"})
-    return (Change(j, reading=wrapped),), Truth((JointTruth(j, kinds, kinds, checked=False),))
+    return (Change(j, reading=wrapped),), Truth((JointTruth(j, kinds, kinds),))
 
 
 def _slip(robot, rng, j):
@@ -461,7 +461,7 @@ def _(robot, rng, j):
     if not robot.channels.second:
         kinds |= PAUSED
     return (Change(j, reading=lambda read: read + noise),), Truth(
-        (JointTruth(j, frozenset({"noisy_sensor"}), kinds, checked=False),)
+        (JointTruth(j, frozenset({"noisy_sensor"}), kinds),)
     )
 
 
@@ -585,29 +585,143 @@ def _(robot, rng, j):
     return (Change(j, position=position),), _responds(j, RESPONSE)
 
 
+def _grown(robot, j, rng, make):
+    """The position that an operator makes, its size grown until the response shows it.
+
+    Flat tops at the reversals change the fundamental by little: a size that is large as a share
+    of the motion may leave gain and lag within the margins.
+    """
+    half = robot.half(j)[0]
+    size = rng.uniform(0.08, 0.3)
+    while size < 1.0:
+        position = make(size * robot.swing(j))
+        ratio = _fundamental(robot, j, position) / _fundamental(robot, j, robot.moved(j))
+        if (
+            abs(abs(ratio) - 1) > max(3 * half, MARGIN_GAIN + 2 * half)
+            or abs(np.angle(ratio)) > max(3 * half, MARGIN_RAD + 2 * half)
+        ):  # fmt: skip
+            break
+        size *= 1.2
+    return position
+
+
+def _fundamental(robot, j, values):
+    """Complex amplitude at the gait frequency, by least squares."""
+    angle = robot.omega * robot.t_s[:, j]
+    model = np.stack([np.cos(angle), np.sin(angle), np.ones(angle.size)], axis=1)
+    (cosine, sine, _), *_ = np.linalg.lstsq(model, values)
+    return complex(cosine, -sine)
+
+
 @fault("backlash")
 def _(robot, rng, j):
     """Flat for a moment at both reversals, then in step again."""
-    half = max(rng.uniform(0.08, 0.3), _relative(robot, j, rng, 0.1)) * robot.swing(j)
     moved = robot.moved(j)
-    position = moved.copy()
-    for k in range(1, len(moved)):
-        position[k] = np.clip(position[k - 1], moved[k] - half, moved[k] + half)
-    return (Change(j, position=position),), _responds(j, RESPONSE)
+
+    def play(half):
+        position = moved.copy()
+        for k in range(1, len(moved)):
+            position[k] = np.clip(position[k - 1], moved[k] - half, moved[k] + half)
+        return position
+
+    return (Change(j, position=_grown(robot, j, rng, play)),), _responds(j, RESPONSE)
 
 
 @fault("sticks at both reversals")
 def _(robot, rng, j):
     """Flat for a moment at both reversals, then a jump."""
-    band = max(rng.uniform(0.1, 0.35), _relative(robot, j, rng, 0.1)) * robot.swing(j)
     moved = robot.moved(j)
-    position, moves = moved.copy(), True
-    for k in range(1, len(moved)):
-        if moves and k > 1 and (moved[k] - moved[k - 1]) * (moved[k - 1] - moved[k - 2]) < 0:
-            moves = False
-        moves = moves or abs(moved[k] - position[k - 1]) > band
-        position[k] = moved[k] if moves else position[k - 1]
-    return (Change(j, position=position),), _responds(j, RESPONSE)
+
+    def stuck(band):
+        position, moves = moved.copy(), True
+        for k in range(2, len(moved)):
+            if moves and (moved[k] - moved[k - 1]) * (moved[k - 1] - moved[k - 2]) < 0:
+                moves = False
+            moves = moves or abs(moved[k] - position[k - 1]) > band
+            position[k] = moved[k] if moves else position[k - 1]
+        return position
+
+    return (Change(j, position=_grown(robot, j, rng, stuck)),), _responds(j, RESPONSE)
+
+
+@fault("lag grows")
+def _(robot, rng, j):
+    """The position becomes later from cycle to cycle."""
+    size = 2 * _relative(robot, j, rng, 0.3)
+    position = robot.moved(j, more_lag=size * robot.t_s[:, j] / robot.duration_s)
+    return (Change(j, position=position),), _responds(j, LAG)
+
+
+@fault("weak to one side")
+def _(robot, rng, j):
+    """The position is smaller on one side of its middle."""
+    size = min(2 * _relative(robot, j, rng, 0.25), 0.7)
+    moved, about = robot.moved(j), robot.bias[j] + robot.zero[j]
+    side = rng.choice([-1, 1]) * (moved - about) > 0
+    position = np.where(side, about + (1 - size) * (moved - about), moved)
+    return (Change(j, position=position),), _responds(j, GAIN | OFFSET)
+
+
+# -- faults that nobody foresaw ------------------------------------------------------------------
+
+
+@fault("jam that comes loose again")
+def _(robot, rng, j):
+    """The position stands still for a third of the time, then follows again."""
+    start = float(rng.uniform(0.2, 0.4)) * robot.duration_s
+    t = robot.t_s[:, j]
+    acts = (t >= start) & (t < start + rng.uniform(0.25, 0.4) * robot.duration_s)
+    change = Change(j, position=_hold(robot.moved(j), acts))
+    kinds = standing(robot.channels, "pushing") | PAUSED
+    names = frozenset({"jammed", "stalled", "intermittent"})
+    return (change,), Truth((JointTruth(j, names, kinds, since_s=start),))
+
+
+@fault("single samples read zero")
+def _(robot, rng, j):
+    """Samples of the position are zero at random."""
+    lost = rng.random(len(robot.t_s)) < rng.uniform(0.02, 0.1)
+    kinds = frozenset({"noisy_sensor", "lost_samples"})
+    return (Change(j, reading=lambda read: np.where(lost, 0.0, read)),), Truth(
+        (JointTruth(j, kinds, kinds | {"wrapped_sensor"}, compared=False),)
+    )
+
+
+@fault("sensor clipped at the end of its range")
+def _(robot, rng, j):
+    """The position has flat tops at one end; all else goes on."""
+    side, about = rng.choice([-1, 1]), robot.bias[j]
+    level = rng.uniform(0.1, 0.6) * robot.swing(j)
+    kinds = _clipped(robot) | {"clipped_sensor"}
+    if not robot.channels.second:
+        kinds |= STOPPED | PAUSED
+    return (
+        Change(j, reading=lambda read: about + side * np.minimum(side * (read - about), level)),
+    ), Truth((JointTruth(j, frozenset({"clipped_sensor"}), kinds, GAIN | OFFSET, checked=False),))
+
+
+@fault("follows its neighbour's command")
+def _(robot, rng, j):
+    """The position is in step with the joint beside it."""
+    other = j + 1 if j + 1 < robot.m else j - 1
+    change = Change(j, position=robot.moved(j, of=other), wanted=robot.wanted(other, at=j))
+    kinds = frozenset({"swapped"})
+    apart = np.angle(np.exp(1j * (robot.phase[other] - robot.phase[j])))
+    if abs(apart) > np.radians(120):  # as good as inverted
+        kinds |= either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
+    return (change,), Truth((JointTruth(j, kinds, kinds, RESPONSE | OFFSET, checked=False),))
+
+
+@fault("off by a whole turn from the beginning")
+def _(robot, rng, j):
+    """The position is off by a whole turn of the counter."""
+    turn = rng.choice([-1, 1]) * 2 * np.pi
+    kinds = frozenset({"wrapped_sensor"})
+    if not robot.channels.second:
+        kinds |= {"slipped"}
+    return (Change(j, reading=lambda read: read + turn),), Truth(
+        (JointTruth(j, kinds, kinds | {"slipped_sensor"}, OFFSET, checked=False),)
+    )
 
 
 # -- several, few, none --------------------------------------------------------------------------
@@ -629,6 +743,8 @@ for _pair in (
     ("dead from the beginning", "inverted"),
     ("sensor frozen half-way", "gain less"),
     ("gain less", "lag more"),
+    ("gain less", "gain less"),
+    ("stale samples", "encoder slips"),
 ):
     fault(f"two at once: {_pair[0]}; {_pair[1]}", joints=(7, 40))(_both(*_pair))
 

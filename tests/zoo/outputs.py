@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
-from typing import Any
 
-from analysis.analyse import measure_session
+from analysis.analyse import analyse_session
 from analysis.compare.compare import Choices, compare_sessions
-from analysis.cycles import cycle_maps
 from analysis.report import render
+from analysis.results.answer import Answer
 from analysis.stretch import Options
 from capture import Session
 from capture.errors import UndulogError
@@ -95,47 +94,33 @@ def statements(
 def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[str, Statement]:
     found: dict[str, Statement] = {}
     with Session.open(path) as session:
-        measured = measure_session(session, options)
-        analysis = measured.analysis
-        # One source: the object that the JSON prints as `answer`.
-        told: Any = analysis.answer
+        analysis = analyse_session(session, options)
         if "answer" in outputs:
-            found["answer"] = structured(told)
+            found["answer"] = structured(analysis.answer)
         if "page" in outputs:
-            page = render(analysis, session, cycle_maps(measured))
-            found["page"] = Statement(_plain(_heading(page)))
+            # Without signals and maps, whose drawing takes half of the time.
+            found["page"] = Statement(_plain(_heading(render(analysis))))
         if "rerun" in outputs:
             text = markdown(session, analysis, notes=(), colors="", content=EMPTY, has_cycles=False)
             found["rerun"] = Statement(text.split("\n\n")[0])
     return found
 
 
-def structured(told: Any) -> Statement:
-    """The answer with its lists, where it has them.
+def structured(answer: Answer) -> Statement:
+    """The answer with its lists.
 
     Args:
-        told: An answer, or its JSON object.
+        answer: An answer.
     """
-
-    def of(item: Any, key: str) -> Any:
-        return item.get(key) if isinstance(item, dict) else getattr(item, key, None)
-
-    verdict, listed, outside = (of(told, k) for k in ("verdict", "not_following", "stand_out"))
     quantities: dict[str, frozenset[str]] = {}
-    for one in outside or ():
-        name = of(one, "joint")
-        quantities[name] = quantities.get(name, frozenset()) | {str(of(one, "quantity"))}
+    for one in answer.stand_out:
+        quantities[one.joint] = quantities.get(one.joint, frozenset()) | {one.quantity}
     return Statement(
-        str(of(told, "sentence")),
-        None
-        if listed is None
-        else {
-            of(one, "joint"): Named(frozenset(map(str, of(one, "kinds"))), of(one, "since_s"))
-            for one in listed
-        },
-        None if outside is None else quantities,
-        None if listed is None else of(told, "undecided") is not None,
-        str(verdict) == "alike",
+        answer.sentence,
+        {one.joint: Named(frozenset(one.kinds), one.since_s) for one in answer.not_following},
+        quantities,
+        answer.undecided is not None,
+        bool(answer.alike),
     )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.stats import norm
 
 STIFFNESS = 8.0
@@ -79,7 +80,14 @@ class Robot:
         omega: Gait frequency [rad/s].
         gain: Of the joints, shape (m,).
         lag: Of the joints [rad], shape (m,).
-        sigma: White noise of the position sensors [rad].
+        sigma: Standard deviation of the noise of the position sensors [rad].
+        color: Coefficient of its autoregression; 0 is white.
+        shared: Share of its variance that all joints have in common.
+        scatter: Standard deviation from joint to joint of a sound robot's log gain, of its lag
+            [rad] and of its zero [rad].
+        zero: Of the joints against their commands [rad], shape (m,).
+        second: Share of the second harmonic in the commands.
+        start_s: The command's amplitude grows for so long [s].
         step: Step of the position sensors [rad]; 0: none.
         duration_s: Length of the session [s].
         sent_s: Times of the commands [s], shape (k,).
@@ -97,6 +105,12 @@ class Robot:
     gain: np.ndarray
     lag: np.ndarray
     sigma: float
+    color: float
+    shared: float
+    scatter: tuple[float, float, float]
+    zero: np.ndarray
+    second: float
+    start_s: float
     step: float
     duration_s: float
     sent_s: np.ndarray
@@ -111,12 +125,14 @@ class Robot:
 
     def sent(self) -> np.ndarray:
         """Commands as the controller sends them [rad], shape (k, m)."""
-        return self.bias + self.amplitude * np.sin(self.omega * self.sent_s[:, None] + self.phase)
+        t = self.sent_s[:, None]
+        return self.bias + self.amplitude * self._wave(t, self.omega * t + self.phase)
 
     def wanted(self, joint: int, at: int | None = None) -> np.ndarray:
         """Command of a joint at the sampling times of ``at`` (itself if None) [rad], shape (n,)."""
         t = self.t_s[:, joint if at is None else at]
-        return self.bias[joint] + self.amplitude[joint] * np.sin(self.omega * t + self.phase[joint])
+        wave = self._wave(t, self.omega * t + self.phase[joint])
+        return self.bias[joint] + self.amplitude[joint] * wave
 
     def moved(
         self, joint: int, gain: float | np.ndarray = 1.0, more_lag: float = 0.0, of: int = -1
@@ -130,8 +146,15 @@ class Robot:
             of: Joint whose command it follows; -1: its own.
         """
         k = joint if of < 0 else of
-        angle = self.omega * self.t_s[:, joint] + self.phase[k] - self.lag[joint] - more_lag
-        return self.bias[k] + gain * self.gain[joint] * self.amplitude[k] * np.sin(angle)
+        t = self.t_s[:, joint]
+        wave = self._wave(t, self.omega * t + self.phase[k] - self.lag[joint] - more_lag)
+        size = gain * self.gain[joint] * self.amplitude[k]
+        return self.bias[k] + self.zero[joint] + size * wave
+
+    def _wave(self, t: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        """A delay shifts the second harmonic by twice the angle."""
+        grows = np.clip(t / self.start_s, 0.0, 1.0) if self.start_s > 0 else 1.0
+        return grows * (np.sin(angle) + self.second * np.sin(2 * angle + 0.7))
 
     def swing(self, joint: int) -> float:
         """Amplitude of the motion of a joint [rad]."""
@@ -151,9 +174,21 @@ class Robot:
             Of gain (relative) and lag [rad], which are the same number, and of the offset [rad].
         """
         n = len(self.t_s) if count is None else count
-        noise = float(np.hypot(self.sigma, self.step / 12**0.5))
+        noise = float(np.hypot(self.sigma * self._near(self.omega), self.step / 12**0.5))
+        slow = float(np.hypot(self.sigma * self._near(0.0), self.step / 12**0.5))
         factor = float(norm.ppf(1 - 0.025 / (3 * self.m))) * (1 + leverage(self.m, joint)) ** 0.5
-        return factor * noise * (2 / n) ** 0.5 / self.swing(joint), factor * noise / n**0.5
+        # A joint is also compared with how the sound ones scatter.
+        response, zero = (3.5 * max(pair) for pair in (self.scatter[:2], self.scatter[2:]))
+        return (
+            float(np.hypot(factor * noise * (2 / n) ** 0.5 / self.swing(joint), response)),
+            float(np.hypot(factor * slow / n**0.5, zero)),
+        )
+
+    def _near(self, omega: float) -> float:
+        """Amplitude density of the noise at a frequency, that of white noise being 1."""
+        step_s = self.duration_s / len(self.t_s)
+        power = (1 - self.color**2) / abs(1 - self.color * np.exp(-1j * omega * step_s)) ** 2
+        return float(power**0.5)
 
 
 def leverage(m: int, joint: int) -> float:
@@ -208,11 +243,14 @@ def draw(
         gain = gain * (1 + rng.uniform(-0.03, 0.03) * ends + rng.uniform(-0.03, 0.03) * trend)
         lag = lag + np.radians(rng.uniform(-3, 3) * ends + rng.uniform(-3, 3) * trend)
     n = round(duration * rate)
-    jitter = rng.choice([0.0, 0.05, 0.15]) / rate
+    jitter = rng.choice([0.0, 0.05, 0.1]) / rate  # no interval may look like a lost sample
     clock = np.arange(n) / rate + np.clip(rng.normal(0.0, 1.0, n), -2, 2) * jitter
     clock = clock - clock[0]
     skew = rng.uniform(0.0, 0.5 / rate, m) if per_servo else np.zeros(m)
     sent_rate = rate if rng.random() < 0.5 else rng.uniform(50.0, 100.0)
+    scatter = (0.003, np.radians(0.2), np.radians(0.3)) if rng.random() < 0.4 else (0.0, 0.0, 0.0)
+    gain = gain * np.exp(scatter[0] * rng.normal(size=m))
+    lag = lag + scatter[1] * rng.normal(size=m)
     naming = NAMINGS[rng.integers(len(NAMINGS))]
     drawn = CHANNELS[rng.integers(len(CHANNELS))]
     return Robot(
@@ -225,6 +263,12 @@ def draw(
         gain=gain,
         lag=lag,
         sigma=float(np.exp(rng.uniform(*np.log([1e-3, 5e-3])))),
+        color=float(rng.choice([0.0, 0.0, 0.0, 0.9])),
+        shared=float(rng.choice([0.0, 0.0, 0.0, 0.8])),
+        scatter=scatter,
+        zero=scatter[2] * rng.normal(size=m),
+        second=float(rng.choice([0.0, 0.0, 0.0, 1.0]) * rng.uniform(0.0, 0.2)),
+        start_s=float(rng.choice([0.0, 0.0, 0.0, 1.0]) * rng.uniform(0.5, 2.0)),
         step=float(rng.choice([0.0, 0.0, 0.0, 2 * np.pi / 4096])),
         duration_s=duration,
         sent_s=np.arange(round(duration * sent_rate)) / sent_rate,
@@ -293,6 +337,7 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
     """
     rng = np.random.default_rng([seed, 2])
     n, m = robot.t_s.shape
+    noise, other_noise = (_noise(robot, rng) for _ in range(2))
     by_joint = {change.joint: change for change in changes}
     position, velocity, effort, second = (np.empty((n, m)) for _ in range(4))
     for j in range(m):
@@ -301,8 +346,8 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
         where = robot.moved(j) if change.position is None else change.position
         wanted = robot.wanted(j) if change.wanted is None else change.wanted
         noisy = np.ones(n) if change.exact is None else np.where(change.exact, 0.0, 1.0)
-        read = where + robot.sigma * noisy * rng.normal(size=n)
-        other = where + robot.sigma * noisy * rng.normal(size=n)
+        read = where + noisy * noise[:, j]
+        other = where + noisy * other_noise[:, j]
         if robot.step > 0:
             read, other = (np.round(one / robot.step) * robot.step for one in (read, other))
         rate = np.gradient(where, t) + 0.01 * robot.omega * swing * noisy * rng.normal(size=n)
@@ -330,6 +375,15 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
         effort if logged.effort else None,
         second if logged.second else None,
     )
+
+
+def _noise(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+    """Noise of the joints' sensors [rad], shape (n, m)."""
+    n, m = robot.t_s.shape
+    drawn = (1 - robot.shared) ** 0.5 * rng.normal(size=(n + 100, m))
+    drawn += robot.shared**0.5 * rng.normal(size=(n + 100, 1))
+    color = robot.color
+    return robot.sigma * lfilter([(1 - color**2) ** 0.5], [1.0, -color], drawn, axis=0)[100:]
 
 
 def with_channels(robot: Robot, channels: Channels) -> Robot:

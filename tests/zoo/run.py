@@ -173,6 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cases.append(case)
         if sys.stderr.isatty():
             print(f"\r{len(cases)} of {len(names) * len(seeds)}", end="", file=sys.stderr)
+    print(f"fault zoo, seeds {chosen.first} to {chosen.first + chosen.seeds - 1}")
     if not chosen.quiet:
         print("\n".join(failures(cases)))
     lines = table(cases, outputs)
