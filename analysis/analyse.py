@@ -42,7 +42,7 @@ from .results.analysis import (
     Window,
 )
 from .results.artefact import flags_by_joint
-from .segments.session import commanded_joints, compare_joints, faults_of, not_following
+from .segments.session import commanded_joints, compare_joints, following, not_following
 from .stretch import Options, choose_stretch, recorded
 from .text.answer import Facts, compose
 from .text.artefacts import warn_flags, within
@@ -163,7 +163,8 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     del commands
     session.forget()
     span = _span(stretch, origin_ns, gait)
-    faulty = not_following(faults_of(session, columns, whole), held, columns.names)
+    follows = following(session, columns, whole)
+    faulty = not_following(follows.faults, held, columns.names)
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)
@@ -188,7 +189,14 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     body = body_motion(session, sound, gait, span, warn)
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     commanded = commanded_joints(columns)
-    findings = compare_joints(session.robot, gait, joints, faulty, commanded)
+    findings = compare_joints(
+        session.robot,
+        gait,
+        joints,
+        faulty=faulty,
+        commanded=commanded,
+        offsets=follows.offsets,
+    )
     analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,

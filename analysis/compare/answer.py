@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 
-from ..results.analysis import Estimate
+from ..results.analysis import Estimate, leaves_out_zero
 from ..text import formats
 from .decisions import SIGNIFICANT, Decided
-from .result import BODY, Difference
+from .result import BODY, BrokenJoint, Difference
+
+MOST = 4
+"""Broken joints that the sentence lists at most."""
 
 WORDS = {
     "gain": "gain",
@@ -19,17 +24,26 @@ WORDS = {
 """What people call the quantities."""
 
 
-def answer_of(decided: Decided, partial: bool) -> tuple[str, str]:
+def answer_of(
+    decided: Decided, partial: bool, broken: Sequence[BrokenJoint] = ()
+) -> tuple[str, str]:
     """Verdict and answer.
 
     Args:
         decided: The decisions.
         partial: Whether something could not be compared.
+        broken: Joints that do not follow their command on one side only: the first difference.
 
     Returns:
         ``different``, ``same``, ``small`` or ``open``, and one sentence without its full stop.
     """
-    beyond_doubt = [one for one in decided.differences if one.p_holm < SIGNIFICANT]
+    if broken:
+        rest = answer_of(_without(decided, broken), partial)[1]
+        listed = "; ".join(each.text for each in broken[:MOST])
+        more = len(broken) - MOST
+        listed += f"; and {more} more joints" if more > 0 else ""
+        return "different", f"{listed}; of the others: {rest}"
+    beyond_doubt = _beyond_doubt(decided)
     tests = {one.quantity: one for one in decided.equivalence}
     same = all(tests[quantity].p < SIGNIFICANT for quantity in ("gain", "lag"))
     margins = (
@@ -45,6 +59,25 @@ def answer_of(decided: Decided, partial: bool) -> tuple[str, str]:
     if same:
         return "small", f"{alike}; beyond doubt, if small: {_largest(decided)}{whole}"
     return "different", f"B differs from A: {_largest(decided)}{whole}"
+
+
+def _beyond_doubt(decided: Decided) -> list[Difference]:
+    """Differences that are significant and whose interval leaves out zero."""
+    return [
+        one
+        for one in decided.differences
+        if one.p_holm < SIGNIFICANT and leaves_out_zero(one.difference.ci95)
+    ]
+
+
+def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
+    """The decisions without the broken joints."""
+    names = {each.name for each in broken}
+    return dataclasses.replace(
+        decided,
+        differences=tuple(one for one in decided.differences if one.place not in names),
+        named=tuple(one for one in decided.named if one.name not in names),
+    )
 
 
 def told(one: Difference) -> str:
@@ -93,8 +126,9 @@ def signed(quantity: Estimate, unit: str) -> str:
 
 def _largest(decided: Decided) -> str:
     """The joint that differs most, with all that is beyond doubt of it; else energy or body."""
-    beyond_doubt = [one for one in decided.differences if one.p_holm < SIGNIFICANT]
-    if decided.named:
+    beyond_doubt = _beyond_doubt(decided)
+    joints = {one.place for one in beyond_doubt if one.quantity in ("gain", "lag")}
+    if decided.named and decided.named[0].name in joints:
         name = decided.named[0].name
         own = [one for one in beyond_doubt if one.place == name and one.quantity != "energy_abs"]
         parts = ", ".join(told(one) for one in sorted(own, key=lambda one: one.quantity))

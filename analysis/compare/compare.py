@@ -18,6 +18,7 @@ from ..results.analysis import Estimate, Provenance
 from ..stretch import Options
 from .alignment import Alignment, align
 from .answer import answer_of
+from .broken import broken_joints
 from .changes import changes
 from .decisions import Margins, decide, differ, estimates_of, family
 from .differences import Quantities, independent
@@ -116,13 +117,15 @@ def compare_seen(
     decided = decide(keys, first, second, found, choices.margins)
     partial = _partial(aligned)
     _warn(a, b, design, said.append)
-    verdict, sentence = answer_of(decided, partial is not None)
+    broken = broken_joints([one.analysis.answer for one in a], [one.analysis.answer for one in b])
+    verdict, sentence = answer_of(decided, partial is not None, broken)
     return Comparison(
         answer=sentence,
         verdict=verdict,
         design=design,
         a=tuple(one.analysis.session for one in a),
         b=tuple(one.analysis.session for one in b),
+        broken=broken,
         partial=partial,
         changed=changes([one.facts for one in a], [one.facts for one in b]),
         named=decided.named,

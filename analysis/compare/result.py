@@ -74,6 +74,23 @@ class NamedJoint:
 
 
 @dataclass(frozen=True)
+class BrokenJoint:
+    """A joint that does not follow its command, or stands off it, on one side only.
+
+    Attributes:
+        name: The joint.
+        side: ``A`` or ``B``.
+        kinds: Kinds of fault that fit; empty for a joint that stands off its command.
+        text: What it does, as a clause.
+    """
+
+    name: str
+    side: str
+    kinds: tuple[str, ...]
+    text: str
+
+
+@dataclass(frozen=True)
 class Equivalence:
     """Two one-sided tests that all of one quantity are the same within a margin.
 
@@ -132,6 +149,7 @@ class Comparison(Shown):
         b: Sessions of side B.
         partial: What the comparison leaves out or takes in its stride; None for nothing.
         changed: What the sessions themselves say was changed.
+        broken: Joints that do not follow their command on one side only: the first differences.
         named: Joints that answer differently, the largest difference first.
         differences: All decisions: those beyond doubt first, by size, then the others by p.
         equivalence: Of gain, lag, energy and motion, each over all joints.
@@ -155,3 +173,4 @@ class Comparison(Shown):
     waveforms: tuple[Waveform, ...]
     warnings: tuple[str, ...]
     provenance: Provenance
+    broken: tuple[BrokenJoint, ...] = ()

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+
+from capture.arrays import FloatArray
 
 from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response import Response
 from ..results.answer import Shape, StandOut
-from .family import LEVEL, critical_value, scatter_of
+from .family import LEVEL, Scatter, critical_value, scatter_of
 from .profile import (
     MIN_JOINTS,
     Contrast,
@@ -23,6 +25,10 @@ from .profile import (
 )
 
 _MARGINS = {"gain": EQUIVALENT_GAIN, "lag": EQUIVALENT_LAG_RAD}
+OFFSET_RAD = EQUIVALENT_LAG_RAD
+"""Offsets below this are of no interest [rad]."""
+
+_MIN_CYCLES = 4
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class Chain:
         commanded: Names of all commanded joints of it, head to tail.
         names: Those of them that are compared, in the same order, m of them.
         response: Of these, shape (m,), with errors.
+        offsets: Mean of the position less that of the command, cycle by cycle [rad], by name.
     """
 
     plane: str
@@ -42,6 +49,7 @@ class Chain:
     commanded: tuple[str, ...]
     names: tuple[str, ...]
     response: Response
+    offsets: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,8 @@ def examine(chains: Iterable[Chain]) -> Findings:
         for each in standing_out(profile, critical):
             excluded[id(chain)].add(each.joint)
             out.append(_stand_out(chain, quantity, each, critical))
+    for chain in some:
+        out += _offset(chain, critical)
     for chain, quantity, profile in profiles:
         active = np.ones(len(chain.names), dtype=np.bool_)
         active[list(excluded[id(chain)])] = False
@@ -99,7 +109,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
             continue
         shapes += [_shape(chain, quantity, each, critical) for each in found]
     alike = bool(some) and all(_alike(chain, excluded[id(chain)]) for chain in some)
-    out.sort(key=lambda each: -abs(each.deviation) / _MARGINS[each.quantity])
+    out.sort(key=lambda each: -abs(each.deviation) / _MARGINS.get(each.quantity, OFFSET_RAD))
     return Findings(
         stand_out=_ranked(out),
         shape=tuple(sorted(shapes, key=lambda each: -abs(each.value) / _MARGINS[each.quantity])),
@@ -137,6 +147,42 @@ def profile_of(chain: Chain, quantity: str) -> Profile:
         scatter = lags
     margin = math.log1p(_MARGINS["gain"]) if quantity == "gain" else _MARGINS["lag"]
     return Profile(place, len(chain.commanded), values, scatter, margin)
+
+
+def _offset(chain: Chain, critical: float) -> list[StandOut]:
+    """Joints whose mean stands off their command's as no other joint's does.
+
+    Their errors come from the scatter between cycles, so they are outside the family of gain and
+    lag; the margin is many times what noise makes of a mean.
+    """
+    index = [
+        k
+        for k, name in enumerate(chain.names)
+        if chain.offsets.get(name, _NONE).size >= _MIN_CYCLES
+    ]
+    if len(index) < MIN_JOINTS:
+        return []
+    cycles = min(chain.offsets[chain.names[k]].size for k in index)
+    rows = np.stack([chain.offsets[chain.names[k]][:cycles] for k in index])
+    values = np.median(rows, axis=1)
+    columns = (rows - rows.mean(axis=1, keepdims=True)) / (cycles - 1) ** 0.5
+    nothing = np.zeros(len(index))
+    place = np.array([chain.commanded.index(chain.names[k]) for k in index], dtype=np.float64)
+    scatter = Scatter(columns, nothing, nothing)
+    profile = Profile(place, len(chain.commanded), values, scatter, OFFSET_RAD)
+    found = standing_out(profile, critical)
+    return [
+        StandOut(
+            chain.names[index[each.joint]],
+            chain.plane,
+            chain.group,
+            0,
+            "offset",
+            each.value,
+            (each.value - critical * each.error, each.value + critical * each.error),
+        )
+        for each in found
+    ]
 
 
 def _alike(chain: Chain, excluded: set[int]) -> bool:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from capture import Session
+from capture.arrays import FloatArray
 from capture.following import Fault, JointMotion, joints_not_following
-from capture.following.motion import Samples
+from capture.following.motion import BLOCKS, Samples, cycle_s, windowed_response
 from capture.following.session import samples_of
 from capture.log.signals import Signal
 from capture.robot import Robot
@@ -57,8 +59,21 @@ def commanded_joints(columns: Columns) -> tuple[str, ...]:
     return tuple(name for name in columns.names if swing.get(name, 0.0) > least)
 
 
-def faults_of(session: Session, columns: Columns, window: Stretch) -> tuple[Fault, ...]:
-    """Joints that do not follow their command in a window.
+@dataclass(frozen=True)
+class Following:
+    """How the joints follow their commands.
+
+    Attributes:
+        faults: Joints that do not, times from the session's start, in chain order.
+        offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
+    """
+
+    faults: tuple[Fault, ...]
+    offsets: Mapping[str, FloatArray]
+
+
+def following(session: Session, columns: Columns, window: Stretch) -> Following:
+    """Find how the joints follow their commands in a window.
 
     Args:
         session: An open session.
@@ -66,7 +81,7 @@ def faults_of(session: Session, columns: Columns, window: Stretch) -> tuple[Faul
         window: What is looked at.
 
     Returns:
-        The faults, times from the session's start, in chain order.
+        The joints that do not follow, and the offsets of all.
     """
     robot = session.robot
     limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
@@ -97,7 +112,16 @@ def faults_of(session: Session, columns: Columns, window: Stretch) -> tuple[Faul
                 limits=limits.get(name),
             )
         )
-    return joints_not_following(motions)
+    return Following(
+        joints_not_following(motions),
+        {each.name: _offsets(each) for each in motions if each.position.t_s.size > 1},
+    )
+
+
+def _offsets(motion: JointMotion) -> FloatArray:
+    """Offset of each whole cycle that is judged [rad]."""
+    response = windowed_response(motion.command, motion.position, cycle_s(motion.command))
+    return response.offset[::BLOCKS][response.valid[::BLOCKS]]
 
 
 def not_following(
@@ -138,8 +162,10 @@ def compare_joints(
     robot: Robot | None,
     gait: GaitFit | None,
     joints: Iterable[JointResult],
+    *,
     faulty: Iterable[NotFollowing],
     commanded: tuple[str, ...],
+    offsets: Mapping[str, FloatArray],
 ) -> Findings:
     """Compare the sound joints with each other.
 
@@ -149,6 +175,7 @@ def compare_joints(
         joints: The joints' results.
         faulty: Joints that do not follow.
         commanded: Joints whose command moves.
+        offsets: Of each joint, cycle by cycle [rad].
 
     Returns:
         The findings; none without a gait.
@@ -170,5 +197,6 @@ def compare_joints(
         for plane, names in by_plane(robot, members).items():
             own = [name for name in names if name in sound and name in group.answered]
             response = group.response.select([group.answered.index(name) for name in own])
-            chains.append(Chain(plane, index, tuple(names), tuple(own), response))
+            means = {name: offsets[name] for name in own if name in offsets}
+            chains.append(Chain(plane, index, tuple(names), tuple(own), response, means))
     return examine(chains)

@@ -174,7 +174,7 @@ def _named(facts: Facts) -> str:
     for each in facts.findings.stand_out:
         by_joint.setdefault(each.joint, []).append(each)
     for joint, several in list(by_joint.items())[:NAMED]:
-        sizes = " and ".join(_deviation(each) for each in several)
+        sizes = " and ".join(deviation_in_words(each) for each in several)
         clauses.append(f"{formats.plain(joint)} responds differently from the others, {sizes}")
     if len(by_joint) > NAMED:
         names = [formats.plain(joint) for joint in list(by_joint)[NAMED:]]
@@ -192,8 +192,15 @@ def _undecided(findings: Findings, facts: Facts) -> str:
     return f"the {word} differ, but with fewer than 4 sound ones it can't be decided which one"
 
 
-def _deviation(each: StandOut) -> str:
-    """One deviation with its interval; the word carries the sign."""
+def deviation_in_words(each: StandOut) -> str:
+    """One deviation with its interval; the word carries the sign.
+
+    Args:
+        each: The deviation.
+
+    Returns:
+        For example ``gain 20.1 % [18.9, 21.2] less``.
+    """
     sign = -1.0 if each.deviation < 0 else 1.0
     low, high = sorted(sign * end for end in each.ci95)
     size = Estimate(sign * each.deviation, (low, high))

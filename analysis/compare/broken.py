@@ -1,0 +1,52 @@
+"""Joints that are broken on one side of a comparison: the first thing that differs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+from ..results.answer import Answer, NotFollowing, StandOut
+from ..text import formats
+from ..text.answer import deviation_in_words, fault_in_words
+from .result import BrokenJoint
+
+
+def broken_joints(a: Sequence[Answer], b: Sequence[Answer]) -> tuple[BrokenJoint, ...]:
+    """Find the joints that do not follow, or stand off their command, on one side only.
+
+    Args:
+        a: Answers of the sessions of side A.
+        b: Those of side B.
+
+    Returns:
+        The joints in the order of the answers, those that do not follow first.
+    """
+    found: list[BrokenJoint] = []
+    for side, own, other in (("B", b, a), ("A", a, b)):
+        elsewhere = {each.joint for answer in other for each in answer.not_following}
+        for fault in _first([each for answer in own for each in answer.not_following]):
+            if fault.joint not in elsewhere:
+                text = f"in {side} {fault_in_words(fault)}"
+                found.append(BrokenJoint(fault.joint, side, fault.kinds, text))
+        off = {each.joint for answer in other for each in _off(answer)}
+        known = {each.name for each in found}
+        for each in _first([each for answer in own for each in _off(answer)]):
+            if each.joint not in off | known | elsewhere:
+                text = f"in {side} {formats.plain(each.joint)} has {deviation_in_words(each)}"
+                found.append(BrokenJoint(each.joint, side, (), text))
+    return tuple(sorted(found, key=lambda each: not each.kinds))
+
+
+def _off(answer: Answer) -> list[StandOut]:
+    return [each for each in answer.stand_out if each.quantity == "offset"]
+
+
+_Entry = TypeVar("_Entry", NotFollowing, StandOut)
+
+
+def _first(several: Sequence[_Entry]) -> list[_Entry]:
+    """The first entry of each joint."""
+    found: dict[str, _Entry] = {}
+    for each in several:
+        found.setdefault(each.joint, each)
+    return list(found.values())
