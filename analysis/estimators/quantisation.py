@@ -1,6 +1,6 @@
 """Error of a fitted amplitude from the steps of an encoder or of a command.
 
-Rounding to steps of q is taken for white noise of variance q^2/12 (Widrow & Kollar, Quantization
+Rounding to steps of q is taken for white noise of variance q^2/12 (Widrow & Kollár, Quantization
 Noise, 2008), and so it is where noise or the sampling moves each sample to another place between
 two steps. It is not where the sampling is commensurate with the gait: 0.5 Hz at 50 Hz has 100
 phases a cycle, the same in each, so a thousand cycles hold no more than 100 different errors.
