@@ -1,5 +1,6 @@
 """Results built by hand: a snake with weak servos, one joint, and a session without a gait."""
 
+import dataclasses
 import math
 
 from analysis.results.analysis import (
@@ -15,6 +16,17 @@ from analysis.results.analysis import (
     SessionFacts,
     Window,
 )
+from analysis.results.answer import Shape
+from analysis.segments.examine import Findings
+from analysis.text.answer import Facts, compose
+
+
+def answered(analysis, shape=()):
+    """The result with the answer that its numbers give."""
+    known = tuple(j.name for j in analysis.joints if j.gain.value is not None)
+    findings = Findings(shape=tuple(shape), compared=known)
+    facts = Facts(analysis.gait, analysis.joints, known, (), findings, analysis.warnings)
+    return dataclasses.replace(analysis, answer=compose(facts))
 
 
 def around(value, half):
@@ -109,35 +121,38 @@ def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
         ),
         "energy_gini": Index(0.44, None, None, "1", "Gini coefficient of E_abs"),
     }
-    return Analysis(
-        session=SessionFacts(
-            id=name(session_id),
-            path=path,
-            robot=name("snake25"),
-            start_ns=1_767_225_600_000_000_000,
-            duration_s=16.0,
-            verdict="good",
+    return answered(
+        Analysis(
+            session=SessionFacts(
+                id=name(session_id),
+                path=path,
+                robot=name("snake25"),
+                start_ns=1_767_225_600_000_000_000,
+                duration_s=16.0,
+                verdict="good",
+            ),
+            gait=GaitFacts(
+                frequency_hz=around(0.5, 0.0002),
+                windows=(Window(8.0, 16.0, 4.0),),
+                wave="head-to-tail",
+                lag_per_joint_rad={"horizontal": math.pi / 3},
+            ),
+            joints=tuple(joints),
+            body=body,
+            heterogeneity=indices,
+            coupling=Coupling(
+                identifiable=False,
+                why="one gait gives 13 numbers for 169 unknowns",
+                record="kicks of the phase and amplitude of one joint at a time: "
+                "undulog plan phase-kicks -o DIR",
+            ),
+            warnings=(
+                "Boundary and modules can't be told apart by one direction; record the reverse.",
+                name("E_el of joint02 is null: the session has no /joint_current of it."),
+            ),
+            provenance=provenance(path),
         ),
-        gait=GaitFacts(
-            frequency_hz=around(0.5, 0.0002),
-            windows=(Window(8.0, 16.0, 4.0),),
-            wave="head-to-tail",
-            lag_per_joint_rad={"horizontal": math.pi / 3},
-        ),
-        joints=tuple(joints),
-        body=body,
-        heterogeneity=indices,
-        coupling=Coupling(
-            identifiable=False,
-            why="one gait gives 13 numbers for 169 unknowns",
-            record="kicks of the phase and amplitude of one joint at a time: "
-            "undulog plan phase-kicks -o DIR",
-        ),
-        warnings=(
-            "Boundary and modules can't be told apart by one direction; record the reverse.",
-            name("E_el of joint02 is null: the session has no /joint_current of it."),
-        ),
-        provenance=provenance(path),
+        [Shape("ends", "lag", "horizontal", 0, -0.1082, (-0.1134, -0.1030))],
     )
 
 
@@ -147,26 +162,32 @@ def make_still():
         JointResult(f"j{i}", None, None, nothing, nothing, None, None, None, None, None, 0.0, 0)
         for i in range(4)
     )
-    return Analysis(
-        session=SessionFacts("ramp", "ramp.mcap", None, 1_767_225_600_000_000_000, 3.0, None),
-        gait=GaitFacts(nothing),
-        joints=joints,
-        body=None,
-        heterogeneity={"gain_cv": Index(None, None, None, "1", "coefficient of variation of gain")},
-        coupling=Coupling(False, "no gait was found", "a periodic gait of at least 5 cycles"),
-        warnings=("No gait: the commands are a ramp, no line stands out of their spectrum.",),
-        provenance=provenance("ramp.mcap"),
+    return answered(
+        Analysis(
+            session=SessionFacts("ramp", "ramp.mcap", None, 1_767_225_600_000_000_000, 3.0, None),
+            gait=GaitFacts(nothing),
+            joints=joints,
+            body=None,
+            heterogeneity={
+                "gain_cv": Index(None, None, None, "1", "coefficient of variation of gain")
+            },
+            coupling=Coupling(False, "no gait was found", "a periodic gait of at least 5 cycles"),
+            warnings=("No gait: the commands are a ramp, no line stands out of their spectrum.",),
+            provenance=provenance("ramp.mcap"),
+        )
     )
 
 
 def make_single():
-    return Analysis(
-        session=SessionFacts("bench", "servo.mcap", "bench1", 0, 21.0, "degraded"),
-        gait=GaitFacts(around(1.25, 0.001), (Window(1.0, 21.0, 25.0),)),
-        joints=(driven_joint("servo", 0.5, plane=None),),
-        body=None,
-        heterogeneity={},
-        coupling=Coupling(False, "one joint has nobody to be coupled to"),
-        warnings=(),
-        provenance=provenance("servo.mcap"),
+    return answered(
+        Analysis(
+            session=SessionFacts("bench", "servo.mcap", "bench1", 0, 21.0, "degraded"),
+            gait=GaitFacts(around(1.25, 0.001), (Window(1.0, 21.0, 25.0),)),
+            joints=(driven_joint("servo", 0.5, plane=None),),
+            body=None,
+            heterogeneity={},
+            coupling=Coupling(False, "one joint has nobody to be coupled to"),
+            warnings=(),
+            provenance=provenance("servo.mcap"),
+        )
     )

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from analysis.text.answer import answer
 from capture import Session, SessionWriter
 from capture.errors import DataError, LogWriteError
 from capture.palette import joint_colors
@@ -128,7 +127,7 @@ def test_mode_and_events_are_as_logged(recording):
 
 def test_the_facts_begin_with_the_answer(recording, analysis):
     text = recording[1].static("/session", "TextDocument:text")[0]
-    assert text.startswith(f"**{answer(analysis).sentence}**")
+    assert text.startswith(f"**{analysis.answer.sentence}**")
     for fact in ("made-for-tests", "snake25, 25 joints", "2025-01-01", "head-to-tail", "good"):
         assert fact in text
 

@@ -7,13 +7,12 @@ import re
 
 import pytest
 
-from analysis.text.answer import answer
 from analysis.text.table import render
 
 
 def test_the_answer_stands_first_and_the_method_last(snake):
     lines = render(snake).splitlines()
-    assert lines[0] == f"weak.mcap: {answer(snake).sentence}"
+    assert lines[0] == f"weak.mcap: {snake.answer.sentence}"
     assert lines[-1].startswith("Method: ")
 
 
@@ -34,7 +33,7 @@ def test_every_joint_that_was_driven_has_its_numbers(snake):
 def test_nothing_is_wider_than_the_terminal(snake, width):
     lines = render(snake, width=width).splitlines()
     assert max(map(len, lines)) <= width
-    assert " ".join(lines).startswith(f"weak.mcap: {answer(snake).sentence}")
+    assert " ".join(lines).startswith(f"weak.mcap: {snake.answer.sentence}")
     left_out = [line for line in lines if line.startswith("Without ")]
     assert bool(left_out) == (width < 120)
     heading = next(line for line in lines if line.startswith("joint "))
