@@ -183,9 +183,11 @@ def _of_scale(
 
 def _stalled(joint: _Joint) -> tuple[Span, ...]:
     limits, position = joint.limits, joint.series["position"]
-    if limits is None or not limits.known:
-        return ()
-    for quantity, most in (("effort", limits.torque), ("current", limits.current)):
+    known = limits is not None and limits.known
+    for quantity, most in (
+        ("effort", limits.torque if limits is not None and known else None),
+        ("current", limits.current if limits is not None and known else None),
+    ):
         if quantity in joint.series:
             asked = joint.series.get("command", position)
             return stalled(joint.series[quantity], position, most, asked)

@@ -16,6 +16,7 @@ from capture.robot import Joint, Servo
 
 from ..estimators.series import Series
 from ..results.artefact import Span
+from .scales import turns
 from .spans import spans_of
 
 AT_LIMIT_RAD = 1e-4
@@ -31,6 +32,12 @@ STALL_SHARE = 0.9
 """Part of the stall torque that a stalled joint gives at least."""
 
 STALL_S = 0.2
+DWELL = 3.0
+"""Times the turning point of a sine that a joint of unknown stall torque stands still."""
+
+CONSTANT = 0.05
+"""Standard deviation over mean below which an effort is constant."""
+
 STANDING = 0.05
 """Standing still: slower than this part of what the joint does at most."""
 
@@ -126,20 +133,27 @@ def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Sp
     return spans_of(one.t_s, at, join=2)
 
 
-def stalled(effort: Series, position: Series, most: float, asked: Series) -> tuple[Span, ...]:
+def stalled(
+    effort: Series, position: Series, most: float | None, asked: Series
+) -> tuple[Span, ...]:
     """Stretches in which a joint pushes with all it has, and stands still.
+
+    Without a known stall torque, a joint has stalled where its effort stays constant at its
+    largest value for far longer than a sine at its turning point stands still.
 
     Args:
         effort: Torque, or motor current.
         position: Measured positions.
-        most: Torque or current at standstill and full voltage.
+        most: Torque or current at standstill and full voltage; None where it is not known.
         asked: Its command, or else its position: what it does at most, 95 % of the time less,
             tells what standing still is.
 
     Returns:
         Stretches of ``STALL_S`` or more.
     """
-    pushing = np.abs(effort.values) >= STALL_SHARE * most
+    largest = float(np.percentile(np.abs(effort.values), 99.5)) if effort.count else 0.0
+    pushing = np.abs(effort.values) >= STALL_SHARE * (largest if most is None else most)
+    pushing &= largest > 0
     if position.count < 2 or asked.count < 2 or not np.any(pushing):
         return ()
     usual_rate = float(np.percentile(np.abs(np.diff(asked.values)) / np.diff(asked.t_s), 95))
@@ -150,7 +164,23 @@ def stalled(effort: Series, position: Series, most: float, asked: Series) -> tup
     rate = _moved(position, effort.t_s, half) / (2 * half)
     marked = pushing & (np.abs(rate) < STANDING * usual_rate)
     found = spans_of(effort.t_s, marked, join=2)
-    return tuple(span for span in found if span[1] - span[0] >= STALL_S)
+    long = STALL_S
+    if most is None:
+        edges = turns(asked)
+        if edges.size < 2:
+            return ()
+        # A sine is slower than the share s of its peak speed for 2 arcsin(s) / omega.
+        omega = 2 * np.pi / float(np.median(np.diff(edges)))
+        long = max(STALL_S, DWELL * 2 * float(np.arcsin(STANDING)) / omega)
+        found = tuple(span for span in found if _constant(effort, span))
+    return tuple(span for span in found if span[1] - span[0] >= long)
+
+
+def _constant(effort: Series, span: Span) -> bool:
+    """Whether an effort keeps one value over a span."""
+    i, j = np.searchsorted(effort.t_s, span)
+    inside = effort.values[i : j + 1]
+    return bool(np.std(inside) < CONSTANT * abs(float(np.mean(inside))))
 
 
 def _moved(position: Series, t_s: FloatArray, half: float) -> FloatArray:

@@ -17,6 +17,7 @@ MOST_SPANS = 4
 
 WHAT = {
     "sensor": "the sensor, not mechanics",
+    "sensor or joint": "the sensor or the joint itself",
     "limit": "a limit of the robot",
     "record": "the record, not mechanics",
 }

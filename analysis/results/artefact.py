@@ -9,12 +9,12 @@ Span = tuple[float, float]
 """Start and end [s]."""
 
 KINDS = {
-    "frozen": ("sensor", "stay exactly the same while the joint is commanded to move"),
+    "frozen": ("sensor or joint", "stay exactly the same while the joint is commanded to move"),
     "stale": ("sensor", "repeat old samples at new times"),
     "wrapped": ("sensor", "are off by whole turns of a counter that wraps around"),
     "jump": ("sensor", "make steps that no joint can make"),
     "clipped": ("sensor", "have flat tops at the end of the sensor's range"),
-    "wrong_sign": ("sensor", "have the opposite sign"),
+    "wrong_sign": ("sensor or joint", "have the opposite sign"),
     "wrong_unit": ("sensor", "are larger or smaller by 180/pi: degrees for radians"),
     "scale_mismatch": ("sensor", "differ in scale from another measure of the same motion"),
     "gaps": ("record", "have gaps"),
@@ -26,7 +26,9 @@ KINDS = {
 }
 """Name to what it is about and to what the values then do."""
 
-FALSIFYING = frozenset(name for name, (about, _) in KINDS.items() if about == "sensor") - {"stale"}
+FALSIFYING = frozenset(
+    name for name, (about, _) in KINDS.items() if about.startswith("sensor") and name != "stale"
+)
 """After these a position says nothing about its joint; a stale one is late by half a hold."""
 
 
@@ -54,7 +56,7 @@ class Artefact:
 
     @property
     def about(self) -> str:
-        """``sensor``, ``record`` or ``limit``."""
+        """``sensor``, ``sensor or joint`` (positions alone can't tell), ``record`` or ``limit``."""
         return KINDS[self.flag][0]
 
     def falsifies(self, *quantities: str) -> bool:

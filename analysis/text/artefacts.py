@@ -57,6 +57,8 @@ def warn_flags(
         meaning = {
             "sensor": "an artefact of the sensor, not mechanics"
             + ("; gain and lag are null" if same[0].falsifies("position") else ""),
+            "sensor or joint": "the sensor or the joint itself, see the answer"
+            + ("; gain and lag are null" if same[0].falsifies("position") else ""),
             "record": "an artefact of the record, not mechanics",
             "limit": "a limit of the robot, not a fault of the sensor",
         }[about]

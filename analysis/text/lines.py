@@ -11,6 +11,7 @@ from . import formats
 
 _ABOUT = {
     "sensor": "Artefact of the sensor",
+    "sensor or joint": "Sensor or joint",
     "record": "Artefact of the record",
     "limit": "At a limit",
 }
