@@ -152,7 +152,7 @@ def main():
         ends = " | ".join(f"{100 * one[k]:.1f} %" for k in ("nonlinear", "rows"))
         print(f"| {m} | {what} | {shares} | {one['half']:.3f} | {ends} |", flush=True)
     print(
-        "\n| joints | scatter | coupling shown without any | with it (0.05 to 0.1) |"
+        "\n| joints | scatter | coupling shown without any | with it (0.03 to 0.06) |"
         "\n|---|---|---|---|"
     )
     for m, scatter in ((5, 0.0), (5, 0.03), (5, 0.1), (5, 0.3), (13, 0.1)):

@@ -194,9 +194,9 @@ def method(experiment: Experiment) -> str:
 def _kick_method(coupling: LocalCoupling) -> str:
     return (
         f"local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
-        "kick: central differences of each joint's phase and log amplitude, intervals one by one "
-        "at 95 % from the responses' noise (Student's t), those of indices at least 95 %; all four "
-        "matrices with --json."
+        "kick: central differences of each joint's phase and log amplitude, intervals at 95 % from "
+        "the noise within runs and the scatter between them (Student's t), that of the largest "
+        "coupling of all together, those of indices at least 95 %; all four matrices with --json."
     )
 
 

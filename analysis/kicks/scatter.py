@@ -7,7 +7,8 @@ combinations of runs whose mean is known whatever the coupling is, y = psi or ln
 * runs of the same commands, against their mean;
 * the mean of a kick up and of the same kick down, against the mean of all those pairs: the coupling
   cancels. What is left of second order is that of a linear chain, ln(1 + L (e^z - 1)) - L z with
-  L = P - j R or G + j S (taken off), and that of the others (left in: the estimate is too large
+  L = P - j R or G + j S (taken off), that of a servo to its own kick (left out: one that saturates
+  bends far more than its neighbours), and that of the others (left in: the estimate is too large
   where kicks are too large);
 * the sum of all kicks of phase, up minus down: 1 for P and 0 for R, by time shift.
 
@@ -39,22 +40,19 @@ class RunErrors:
     Columns are psi of m joints [rad], then ln|a| of m joints.
 
     Attributes:
-        draws: Independent draws of a run's errors, shape (k, 2 m).
+        draws: Draws of a run's errors, shape (k, 2 m).
         within: Variance expected of them from the noise within runs alone, shape (2 m,).
+        dof: Degrees of freedom of each column: k less what its joint's own kicks would have told.
     """
 
     draws: FloatArray
     within: FloatArray
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom, k."""
-        return len(self.draws)
+    dof: int
 
     @property
     def variance(self) -> FloatArray:
         """Of a run, noise and scatter together, shape (2 m,)."""
-        return np.mean(np.square(self.draws), axis=0)
+        return np.sum(np.square(self.draws), axis=0) / self.dof
 
     @property
     def between(self) -> FloatArray:
@@ -63,10 +61,17 @@ class RunErrors:
 
     @property
     def correlation(self) -> FloatArray:
-        """Of a run's errors, shape (2 m, 2 m), of rank k at most."""
+        """Of a run's errors, shape (2 m, 2 m).
+
+        Of two joints, each joint's own kicks are lacking: fewer products than squares.
+        """
         size = np.sqrt(np.sum(np.square(self.draws), axis=0))
         unit = np.divide(self.draws, size, out=np.zeros_like(self.draws), where=size > 0)
-        found = unit.T @ unit
+        m = unit.shape[1] // 2
+        lacking = len(self.draws) - self.dof
+        more = self.dof / max(self.dof - lacking, 1)
+        same = np.tile(np.eye(m, dtype=bool), (2, 2))
+        found = np.clip((unit.T @ unit) * np.where(same, 1.0, more), -1.0, 1.0)
         np.fill_diagonal(found, 1.0)
         return found
 
@@ -96,9 +101,12 @@ def run_errors(
     values = np.hstack([log.imag, log.real])
     foreseen = _foreseen(kicks, log.shape[1], derivatives)
     even = _orthonormal(_repeats(kicks, values) + (_pairs(kicks) if pairs else []), len(kicks))
-    draws = even @ (values - np.hstack([foreseen.imag, foreseen.real]))
+    left_out = sum(bool(sides(kicks, kind)) for kind in Kind) if pairs else 0
+    level = values - np.hstack([foreseen.imag, foreseen.real])
+    draws = even @ (_without_own(kicks, level) if pairs else level)
     if not rows:
-        return RunErrors(draws, np.mean(np.square(even) @ variance, axis=0))
+        share = np.mean(np.square(even) @ variance, axis=0)
+        return RunErrors(draws, share, len(draws) - left_out)
     weights = _row_weights(kicks)
     left = weights @ values - np.repeat((1.0, 0.0), log.shape[1])
     # Kicks that are repeated unequally make the sum depend on the pairs.
@@ -107,7 +115,30 @@ def run_errors(
     length = float(np.linalg.norm(alone))
     own = (left - along @ draws) / length
     whole = np.vstack([even, alone / length])
-    return RunErrors(np.vstack([draws, own]), np.mean(np.square(whole) @ variance, axis=0))
+    share = np.mean(np.square(whole) @ variance, axis=0)
+    return RunErrors(np.vstack([draws, own]), share, len(whole) - left_out)
+
+
+def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray:
+    """Values in which a joint's own kicks, up and down together, are at the mean of the others'.
+
+    So they add nothing to the squares about that mean, and its joint has a degree of freedom less.
+    """
+    m = values.shape[1] // 2
+    found = values.copy()
+    for kind in Kind:
+        pairs = sides(kicks, kind)
+        middle = np.array(
+            [(values[up].mean(axis=0) + values[down].mean(axis=0)) / 2 for up, down in pairs]
+        )
+        for k, (up, down) in enumerate(pairs):
+            kick = kicks[up[0]]
+            if kick is None or len(pairs) < 2:
+                continue
+            own = [kick.joint, m + kick.joint]
+            others = np.delete(middle[:, own], k, axis=0).mean(axis=0)
+            found[np.ix_(up + down, own)] += others - middle[k, own]
+    return found
 
 
 def _row_weights(kicks: Sequence[Kick | None]) -> FloatArray:

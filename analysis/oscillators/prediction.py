@@ -205,11 +205,12 @@ def _answer(modes: tuple[LoopMode, ...], eps: float) -> str:
     grows = sum(one.rate.ci95 is not None and one.rate.ci95[1] < 0 for one in modes)
     relaxes = sum(one.rate.ci95 is not None and one.rate.ci95[0] > 0 for one in modes)
     opened = len(modes) - grows - relaxes
-    parts = [
-        f"{count} {words}"
-        for count, words in ((relaxes, "relax"), (grows, "grow"), (opened, "are open"))
-        if count
-    ]
+    counts = (
+        (relaxes, "relaxes", "relax"),
+        (grows, "grows", "grow"),
+        (opened, "may do either", "may do either"),
+    )
+    parts = [f"{count} {one if count == 1 else more}" for count, one, more in counts if count]
     return (
         f"with feedback of {eps:g} 1/s and the body as the only coupling, of {len(modes)} patterns "
         f"of the phases {', '.join(parts)}; the slowest has the rate "
