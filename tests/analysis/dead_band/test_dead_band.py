@@ -14,7 +14,7 @@ from analysis.dead_band.operator import fundamental_change, rested
 
 shared = runpy.run_path(str(Path(__file__).with_name("resting.py")))
 Joint, found_in, play, STEP = (shared[name] for name in ("Joint", "found_in", "play", "STEP"))
-JOINTS = 10
+JOINTS = 6
 
 
 def measured(kind, steps, seed=0, joints=JOINTS, **how):
@@ -42,7 +42,9 @@ def test_it_changes_the_fundamental_as_its_describing_function_has_it(share):
     # Gelb and Vander Velde 1968, backlash b over amplitude A: x = 1 - b / A.
     t = np.arange(20_000) / 1000.0
     command = np.sin(2 * np.pi * t)
-    got = fundamental_change(t, command, rested(command, 2 * share, 0.0, 0.0), 2 * np.pi)
+    followed = rested(command, 2 * share, 0.0, 0.0)
+    later = slice(1000, None)  # the first way up starts in the middle of the band
+    got = fundamental_change(t[later], command[later], followed[later], 2 * np.pi)
     x = 1 - 2 * share
     real = 0.5 + (math.asin(x) + x * math.sqrt(1 - x * x)) / math.pi
     assert got == pytest.approx(complex(real, -(1 - x * x) / math.pi), abs=2e-3)
@@ -68,7 +70,7 @@ def test_its_width_is_found_within_a_tenth_and_the_interval_covers(kind, steps):
 @pytest.mark.parametrize("kind", ["play", "play behind a lag", "stick"])
 def test_also_in_step_with_the_gait_in_noise_and_sampled_fast(kind, how):
     within, covers = [], []
-    for steps in (6, 12):
+    for steps in (6,):
         _, found, _ = measured(kind, steps, seed=steps, **how)
         assert len(found) == JOINTS
         for one in found.values():
@@ -132,7 +134,7 @@ def test_a_clipped_sensor_has_none():
 )
 def test_effort_or_a_second_sensor_tell_stick_from_play(witness, kind):
     rng = np.random.default_rng(2)
-    made = [Joint(rng, "play", 20 * STEP, lag_s=0.0) for _ in range(2)]
+    made = [Joint(rng, "play", 20 * STEP, lag_s=0.02) for _ in range(2)]
     seen = {}
     for one in made:
         pull = np.clip((one.command - one.ideal) / (10 * STEP), -1, 1)
@@ -144,7 +146,8 @@ def test_effort_or_a_second_sensor_tell_stick_from_play(witness, kind):
             "constant": np.full_like(pull, 0.3),
         }.get(witness)
         if effort is not None:
-            seen.setdefault("effort", []).append(effort + rng.normal(0, 0.01, pull.size))
+            noisy = effort + rng.normal(0, 0.01, pull.size)
+            seen.setdefault("effort", []).append(np.abs(noisy) if witness == "load" else noisy)
         if witness == "second":
             seen.setdefault("second", []).append(one.command + rng.normal(0, 1e-4, pull.size))
     found, _ = found_in(made, **seen)
