@@ -40,6 +40,9 @@ _NEEDED = (6.0, 12.0)
 """The same that a step at the onset needs to be taken, and that one of another size at either end
 needs."""
 
+_AHEAD = -0.25
+"""Delay, in sampling intervals, below which a joint would be ahead of its command."""
+
 _TIES = (
     np.eye(PARAMETERS)[:, :3],
     np.vstack((np.eye(4), np.eye(4)[3:])),
@@ -147,7 +150,7 @@ def _chosen(cycles: Cycles, joint: int, found: _Candidates, scales: _Scales) -> 
     for k, needed in zip((1, 2), _NEEDED, strict=True):
         gained = independent * np.log(lefts[taken].cost[0] / lefts[k].cost[0])
         # Ahead of its command no joint is: it would speed up by its inertia, which isn't a step.
-        if gained > needed and found.fits[k].parameters[DELAY] >= 0:
+        if gained > needed and found.fits[k].parameters[DELAY] >= _AHEAD * cycles.period_s:
             wider = _errors(cycles, joint, found.fits[k], scales, lefts[k])
             if np.any(found.fits[k].parameters[[TOP, BOTTOM]] > wider[2:]):
                 taken, error = k, wider
@@ -335,7 +338,7 @@ def _errors(
     inner = spread[: free.size, : free.size] * np.outer(unit[free], unit[free])
     into = tie[:, free]
     covariance += into @ inner @ into.T
-    covariance[WIDTH, WIDTH] += repeated * (scales.resolution[joint] / max(gain, 0.1)) ** 2 / 12
+    covariance[WIDTH, WIDTH] += (scales.resolution[joint] / max(gain, 0.1)) ** 2 / 12
     wanted = np.zeros((4, PARAMETERS))
     wanted[:2, WIDTH] = 1.0
     wanted[[0, 2], TOP] = wanted[[1, 3], BOTTOM] = 1.0

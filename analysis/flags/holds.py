@@ -40,7 +40,7 @@ _REST_SHARE = 0.5
 _LIKE_RESTS = 1.5
 """A hold of so many usual rests is no longer one of them."""
 
-_GENTLE = 0.75
+_GENTLE = 0.5
 """A joint that comes to rest is slower than this part of its usual fastest steps (95 %)."""
 
 _TURNS = 1.05

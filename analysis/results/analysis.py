@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from ..notebook.shown import Shown
 from .answer import Answer
 from .artefact import Artefact
+from .dead_band import DeadBand
 
 if TYPE_CHECKING:
     from ..oscillators.result import ChainCoupling
-    from .dead_band import DeadBand
     from .energy import EnergyResult
     from .over_time import ResponseOverTime
 
