@@ -17,6 +17,7 @@ from capture.log.signals import Signal
 
 from .body.motion import body_motion
 from .coupling import one_gait_coupling
+from .dead_band import dead_bands
 from .demodulation_session import response_over_time
 from .energy.cycles import energy_result
 from .energy.ledger import check_ledger
@@ -158,6 +159,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
+    dead = dead_bands(columns, commands, sound, gait, origin_ns)
     del commands
     session.forget()
     span = _span(stretch, origin_ns, gait)
@@ -172,6 +174,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         gait=gait,
         energies=energies,
         flags=flags_by_joint(held),
+        dead=dead,
         span=span,
     )
     warn_flags(held, joints, gait, warn)

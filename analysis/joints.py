@@ -20,6 +20,7 @@ from .reading import Columns, Warn, planes_of
 from .response import gain_estimate, lag_estimate
 from .results.analysis import Estimate, JointResult
 from .results.artefact import Artefact
+from .results.dead_band import DeadBand
 
 GAP_SHARE = 0.01
 """More of the window without samples is worth a flag, or of power a warning."""
@@ -141,6 +142,7 @@ def joint_results(
     gait: GaitFit | None,
     energies: Mapping[str, Energies],
     flags: Mapping[str, Sequence[str]],
+    dead: Mapping[str, DeadBand],
     span: Span,
 ) -> tuple[JointResult, ...]:
     """The joints' lines, head to tail.
@@ -152,6 +154,7 @@ def joint_results(
         gait: The fitted gait, or None.
         energies: By joint name.
         flags: Artefacts of each joint on the analysed stretch, by name.
+        dead: Dead bands, by name.
         span: The window of energies and coverage.
 
     Returns:
@@ -188,6 +191,7 @@ def joint_results(
                 flags=tuple(own),
                 group=index,
                 frequency_hz=None if group is None else group.fit.frequency_hz,
+                dead_band=dead.get(name),
             )
         )
     return tuple(results)

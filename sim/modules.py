@@ -17,7 +17,10 @@ from capture.strict_table import Table
 Fields: TypeAlias = Mapping[str, float]
 """Parameter name to value."""
 
-_MAY_BE_ZERO = ("viscous_friction", "coulomb_friction", "gear_damping", "backlash")
+_MAY_BE_ZERO = (
+    *("viscous_friction", "coulomb_friction", "static_friction"),
+    *("gear_damping", "backlash"),
+)
 
 MASS_FACTOR = "mass_factor"
 """Multiplies a link's mass and its moments of inertia, as a denser material of that shape would."""
@@ -86,11 +89,26 @@ def read_modules(top: Table, robot: Robot | None) -> Modules:
     link_of = {link.name: _link_fields(links.table(link.name)) for link in robot.links}
     servos.close()
     links.close()
-    return Modules(
+    modules = Modules(
         servo,
         {name: given for name, given in servo_of.items() if given},
         {name: given for name, given in link_of.items() if given},
     )
+    _check_rest(top, modules.fitted(robot))
+    return modules
+
+
+def _check_rest(top: Table, robot: Robot) -> None:
+    """A rotor at rest withstands no less than a moving one: add a fault where it would."""
+    for joint in robot.joints:
+        servo = joint.servo
+        if 0 < servo.static_friction < servo.coulomb_friction:
+            top.fault(
+                "servo.static_friction",
+                f"0, or at least coulomb_friction = {servo.coulomb_friction:g} of {joint.name}",
+                f"{servo.static_friction:g}",
+            )
+            return
 
 
 def _servo_fields(table: Table) -> dict[str, float]:

@@ -202,7 +202,8 @@ def _servo_parts(scenario: Scenario, servos: Servos) -> Iterator[_Part]:
     yield _Part("servo.gear_damping", 2 * dt * servos.gear_damping, twist)
     motor = servos.viscous + servos.torque_constant**2 / servos.resistance
     yield _Part("servo.rotor_inertia", 2 * dt * motor, rotor)
-    yield _Part("servo.coulomb_friction", 2 * dt * servos.coulomb / COULOMB_SPEED, rotor)
+    smooth = np.where(servos.static > 0, 0.0, servos.coulomb)  # with rest it is stepped implicitly
+    yield _Part("servo.coulomb_friction", 2 * dt * smooth / COULOMB_SPEED, rotor)
 
 
 def _ground_parts(

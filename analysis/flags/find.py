@@ -103,7 +103,12 @@ def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
 
 def _of_sensors(joint: _Joint) -> _Found:
     levels = () if joint.limits is None else joint.limits.values
-    tops = {key: clipped(one, levels) for key, one in joint.series.items() if key != "command"}
+    command = joint.series.get("command") if joint.driven else None
+    tops = {
+        key: clipped(one, levels, command if key == "position" else None)
+        for key, one in joint.series.items()
+        if key != "command"
+    }
     if "position" not in joint.series:
         yield "position", "not_recorded", (), ""
     else:

@@ -1,7 +1,8 @@
 """Values that repeat where the joint must have moved on: frozen, stale and clipped samples.
 
 An exact repeat is cheap to see, and by itself says nothing: a coarse encoder repeats at every
-turning point, a joint at rest all the time. What makes it an artefact is evidence of motion.
+turning point, a joint at rest all the time, and one with stick or play at every reversal of its
+command. What makes it an artefact is evidence of motion.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import Series
 from ..results.artefact import Span
+from .scales import turns
 from .spans import runs, spans_of
 
 FROZEN_TRAVEL = 0.29
@@ -27,6 +29,26 @@ whose noise is twice its step repeats by chance at 0.14."""
 
 CLIPPED_SHARE = 0.01
 """Part of the range that is missing above a flat top."""
+
+_REST_TRAVEL = 0.02
+"""Travel of the command during a hold at its reversal, as a share of its range, that counts as a
+rest of the joint: a sine goes so far in a tenth of its cycle."""
+
+_REST_SHARE = 0.5
+"""Part of the reversals at both ends at which a joint with stick or play rests."""
+
+_LIKE_RESTS = 1.5
+"""A hold of so many usual rests is no longer one of them."""
+
+_GENTLE = 0.75
+"""A joint that comes to rest is slower than this part of its usual fastest steps (95 %)."""
+
+_TURNS = 1.05
+"""A motion that goes so many times as far as it gets has turned."""
+
+_CENTRED = 0.42
+"""Where a clipped top has the command's extremum, as a share of its duration: in its middle. A
+joint that stick or play holds arrives there and stays: W / 4 A of its cycle after the extremum."""
 
 _SAME_RATE = 1e-6
 _BOX = 101
@@ -47,7 +69,8 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
         Holds during which ``motion`` travels by ``FROZEN_TRAVEL`` of its range or more, and the
         joint by ``RESOLVED`` steps of the sensor: if it goes along with ``motion``, and by its
         velocity, unless that stays the same, too. A command may travel far by a tone that the
-        joint ignores.
+        joint ignores. Rests at both reversals of the motion, cycle after cycle, are mechanics, and
+        so is one at a single reversal that the joint comes to, and leaves, without a jump.
     """
     asked = float(np.ptp(motion.values)) if motion.count else 0.0
     if position.count < 3 or asked == 0:
@@ -59,6 +82,9 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
     scale = seen / asked if seen > 0 else 1.0
     travel, least = end - begin, RESOLVED * _resolution(position.values)
     marked = (travel >= FROZEN_TRAVEL * asked) & (scale * np.minimum(travel, asked) > least)
+    if np.any(marked):
+        marked &= ~_at_reversals(position, motion, first, travel, asked)
+        marked &= ~_gentle(position, motion, first, stop)
     spans = _span_each(position.t_s, first[marked], stop[marked])
     if way is None:
         return spans
@@ -97,7 +123,43 @@ def stale(position: Series) -> tuple[Span, ...]:
     return spans_of(position.t_s, marked)
 
 
-def clipped(series: Series, limits: tuple[float, ...] = ()) -> tuple[Span, ...]:
+def _at_reversals(
+    position: Series, motion: Series, first: IntArray, travel: FloatArray, asked: float
+) -> BoolArray:
+    """Which holds are rests of a joint with stick or play: usual ones at both reversals."""
+    cycles = max(turns(motion).size - 1, 0)
+    high = position.values[first] > (position.values.max() + position.values.min()) / 2
+    found = np.zeros(first.size, dtype=np.bool_)
+    usual: list[float] = []
+    for side in (high, ~high):
+        rests = side & (travel > _REST_TRAVEL * asked)
+        if cycles < _TOPS or np.count_nonzero(rests) < _REST_SHARE * cycles:
+            return found
+        usual.append(float(np.median(np.sort(travel[rests])[-cycles:])))
+    for side, most in zip((high, ~high), usual, strict=True):
+        found |= side & (travel <= _LIKE_RESTS * most)
+    return found
+
+
+def _gentle(position: Series, motion: Series, first: IntArray, stop: IntArray) -> BoolArray:
+    """Which holds begin slowly, end without a jump, and have a reversal of the motion inside."""
+    value, t_s = position.values, position.t_s
+    found = np.zeros(first.size, dtype=np.bool_)
+    usual = float(np.percentile(np.abs(np.diff(value)), 95))
+    for k, (i, j) in enumerate(zip(first.tolist(), stop.tolist(), strict=True)):
+        if i < _ENTRY or j > value.size - _ENTRY:
+            continue
+        came = float(abs(value[i] - value[i - _ENTRY])) / _ENTRY
+        jumped = float(abs(value[j] - value[j - 1]))
+        inside = motion.at(t_s[i:j])
+        net = float(abs(inside[-1] - inside[0]))
+        found[k] = max(came, jumped) <= _GENTLE * usual and float(np.ptp(inside)) > _TURNS * net
+    return found
+
+
+def clipped(
+    series: Series, limits: tuple[float, ...] = (), command: Series | None = None
+) -> tuple[Span, ...]:
     """Flat tops: the same extreme value again and again, run into at full speed.
 
     A smooth top of duration T that is entered at slope s is s T / 4 high (a parabola); a flat one
@@ -106,10 +168,12 @@ def clipped(series: Series, limits: tuple[float, ...] = ()) -> tuple[Span, ...]:
     Args:
         series: Any quantity.
         limits: Values at which it may stay by itself, e.g. a joint limit or the supply voltage.
+        command: Of a driven joint whose position this is.
 
     Returns:
         The flat tops, if there are two or more at one end of the range that have each lost more
-        than ``CLIPPED_SHARE`` of it and twice ``RESOLVED`` steps of the sensor.
+        than ``CLIPPED_SHARE`` of it and twice ``RESOLVED`` steps of the sensor. With a command, its
+        own extremum must lie in their middle: a joint that rests after each reversal isn't clipped.
     """
     value, t_s = series.values, series.t_s
     top, bottom = (float(value.max()), float(value.min())) if value.size > 8 else (0.0, 0.0)
@@ -129,9 +193,37 @@ def clipped(series: Series, limits: tuple[float, ...] = ()) -> tuple[Span, ...]:
         left = sign * (level - value[j + _ENTRY - 1]) / (t_s[j + _ENTRY - 1] - t_s[j - 1])
         height = np.minimum(entered, left) * (t_s[j - 1] - t_s[i]) / 4
         lost = (height > CLIPPED_SHARE * span) & (height > 2 * RESOLVED * _resolution(value))
+        if command is not None and np.any(lost):
+            lost &= _centred(series, command, i, j, sign)
         if np.count_nonzero(lost) >= _TOPS:
             found += _span_each(t_s, i[lost], j[lost])
     return tuple(sorted(found))
+
+
+def _centred(
+    series: Series, command: Series, first: IntArray, stop: IntArray, sign: float
+) -> BoolArray:
+    """Whether flat tops have their command's extremum in their middle, shape (k,).
+
+    The joint's delay is that of its swings through the middle, over their medians.
+    """
+    edges, late = turns(command), turns(series)
+    if edges.size < _TOPS or late.size < _TOPS:
+        return np.ones(first.size, dtype=np.bool_)
+    cycle = float(np.median(np.diff(edges)))
+    lags = (late - edges[np.clip(np.searchsorted(edges, late) - 1, 0, None)]) % cycle
+    delay = float(np.median(lags))
+    start_s, stop_s = series.t_s[first], series.t_s[stop - 1]
+    marked = np.zeros(first.size, dtype=np.bool_)
+    for k, (begin, end) in enumerate(zip(start_s, stop_s, strict=True)):
+        reach = max((cycle / 2 - (end - begin)) / 2, 0.0)
+        low, up = np.searchsorted(command.t_s, (begin - delay - reach, end - delay + reach))
+        near = sign * command.values[low:up]
+        if near.size:
+            at = np.flatnonzero(near >= near.max() - 1e-9 * np.ptp(command.values))
+            extremum = float(command.t_s[low:up][at].mean()) + delay
+            marked[k] = extremum - begin > _CENTRED * (end - begin)
+    return marked
 
 
 def _holds(value: FloatArray) -> tuple[IntArray, IntArray]:

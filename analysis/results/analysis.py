@@ -17,6 +17,7 @@ from .artefact import Artefact
 
 if TYPE_CHECKING:
     from ..oscillators.result import ChainCoupling
+    from .dead_band import DeadBand
     from .energy import EnergyResult
     from .over_time import ResponseOverTime
 
@@ -149,6 +150,7 @@ class JointResult:
         group: Index of the joint's group in :attr:`GaitFacts.groups`, 0 is the largest; None
             where the gait does not drive it.
         frequency_hz: Frequency of that group, at which gain and lag are given; or None.
+        dead_band: Stick or play at the reversals, or None where none can be measured.
     """
 
     name: str
@@ -166,6 +168,7 @@ class JointResult:
     flags: tuple[str, ...] = ()
     group: int | None = None
     frequency_hz: float | None = None
+    dead_band: DeadBand | None = None
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def _servos(data: SweepData, names: Sequence[str]) -> tuple[list[Servo] | None, 
     if any(name not in joints for name in names):
         return None, f"{robot.name} has other joints"
     servos = [joints[name] for name in names]
-    if any(one.coulomb_friction > 0 or one.backlash > 0 for one in servos):
+    if any(max(one.coulomb_friction, one.static_friction, one.backlash) > 0 for one in servos):
         return None, "the servos have Coulomb friction or play, and are not linear"
     return servos, ""
 

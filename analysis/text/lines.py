@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from ..results.analysis import Analysis, Estimate
@@ -30,6 +31,7 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
     if analysis.energy is not None:
         yield from _energy(analysis.energy)
     yield from _over_time(analysis)
+    yield from _dead_bands(analysis)
     for one in analysis.artefacts:
         spans = [f"{start:.2f} to {stop:.2f} s" for start, stop in one.spans_s[:_SPANS]]
         more = len(one.spans_s) - _SPANS
@@ -38,6 +40,28 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
         where = f"{one.quantity} on {one.topic}" if one.topic else one.quantity
         about = f"{formats.plain(one.joint)}, {where}: {one.flag}{note}"
         yield f"{_ABOUT[one.about]}: {about}{': ' if times else ''}{times}"
+
+
+def _dead_bands(analysis: Analysis) -> Iterator[str]:
+    """A line for each joint with stick or play: how far its command travels in vain."""
+    for joint in analysis.joints:
+        band = joint.dead_band
+        if band is None:
+            continue
+        ends = [
+            (Estimate(one.travel_rad, one.travel_ci95), Estimate(one.step_rad, one.step_ci95))
+            for one in (band.top, band.bottom)
+        ]
+        ends = ends[:1] if ends[0] == ends[1] else ends
+        widths = ", ".join(formats.estimate(formats.degrees(one), "°", most=2) for one, _ in ends)
+        steps = ", ".join(formats.estimate(formats.degrees(one), "°", most=2) for _, one in ends)
+        where = "both reversals" if len(ends) == 1 else "its upper and lower reversal"
+        lag = math.degrees(band.lag_change_rad)
+        yield (
+            f"Dead band: {formats.plain(joint.name)}, {band.kind} ({band.evidence}): at {where} "
+            f"the command travels {widths} before the joint moves and catches up by {steps}; "
+            f"of gain and lag the dead band alone makes {band.gain_change:.3f} and {lag:.1f}°"
+        )
 
 
 def _energy(energy: EnergyResult) -> Iterator[str]:

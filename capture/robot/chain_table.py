@@ -97,7 +97,13 @@ def _servo(table: Table) -> Servo:
         gear_stiffness=table.number("gear_stiffness", default=Servo.gear_stiffness, above=0),
         gear_damping=table.number("gear_damping", default=Servo.gear_damping, at_least=0),
         backlash=table.number("backlash", default=Servo.backlash, at_least=0),
+        static_friction=table.number("static_friction", default=Servo.static_friction, at_least=0),
+        stribeck_speed=table.number("stribeck_speed", default=Servo.stribeck_speed, above=0),
     )
+    if 0 < servo.static_friction < servo.coulomb_friction:
+        table.fault(
+            "static_friction", f"0, or at least coulomb_friction = {servo.coulomb_friction:g}"
+        )
     table.close()
     return servo
 

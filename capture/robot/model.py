@@ -58,6 +58,9 @@ class Servo:
         gear_stiffness: k_g [N m/rad].
         gear_damping: c_g [N m s/rad].
         backlash: B, the gear's play between its flanks [rad]; 0: none.
+        static_friction: t_s, torque that a rotor at rest withstands [N m], at least t_c; 0: the
+            rotor never rests, its Coulomb friction is smooth about zero speed.
+        stribeck_speed: v_s, rotor speed over which friction falls from t_s to t_c [rad/s].
     """
 
     supply_v: float = 6.0
@@ -70,6 +73,8 @@ class Servo:
     gear_stiffness: float = 40.0
     gear_damping: float = 0.05
     backlash: float = 0.0
+    static_friction: float = 0.0
+    stribeck_speed: float = 0.05
 
     @property
     def resistance_ohm(self) -> float:

@@ -68,6 +68,10 @@ def joint_flows(steps: Steps, servos: Servos, dt: float) -> FloatArray:
     np.multiply(acting - rate_at[:-1], speed - rate, out=power[8])
     flows = dt * power.sum(axis=1)
     flows[5:] *= servos.losses
+    if servos.resting.size:
+        step = steps.stacked
+        friction = servos.friction(step.rotors, step.drive, dt)[:-1, servos.resting]
+        flows[7, servos.resting] = dt * (friction * speed[:, servos.resting]).sum(axis=0)
     return flows
 
 

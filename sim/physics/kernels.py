@@ -121,6 +121,30 @@ def drive_joints(
 
 
 @njit(cache=True)
+def rotor_friction(
+    servos: FloatArray, j: int, speed: float, torque: float, dt: float
+) -> tuple[float, bool]:
+    """Friction of one rotor [N m], and whether it is at rest after the step.
+
+    Args:
+        servos: :attr:`sim.physics.servo.Servos.table`.
+        j: The joint.
+        speed: Rotor speed om at the step's start [rad/s].
+        torque: Kt i - b om - t_g, all else that acts on the rotor [N m].
+        dt: Step [s].
+
+    Returns:
+        As :meth:`sim.physics.servo.Servos.friction`.
+    """
+    static, kinetic = servos[10, j], servos[6, j]
+    if static == 0.0:
+        return kinetic * math.tanh(speed / COULOMB_SPEED), False
+    most = kinetic + (static - kinetic) * math.exp(-((speed / servos[11, j]) ** 2))
+    stopping = servos[4, j] * speed / dt + torque
+    return min(max(stopping, -most), most), abs(stopping) <= most
+
+
+@njit(cache=True)
 def advance_rotors(
     before: FloatArray, here: FloatArray, n: int, m: int, servos: FloatArray, dt: float
 ) -> None:
@@ -138,9 +162,10 @@ def advance_rotors(
     for j in range(m):
         speed = before[start + m + j]
         current, torque = before[start + 3 * m + j], before[start + 4 * m + j]
-        drag = servos[6, j] * math.tanh(speed / COULOMB_SPEED)
-        total = servos[2, j] * current - servos[5, j] * speed - (drag + torque)
-        after = speed + dt * total / servos[4, j]
+        motor = servos[2, j] * current - servos[5, j] * speed
+        drag, held = rotor_friction(servos, j, speed, motor - torque, dt)
+        total = motor - (drag + torque)
+        after = 0.0 if held else speed + dt * total / servos[4, j]
         here[start + j] = before[start + j] + dt * after
         here[start + m + j] = after
 

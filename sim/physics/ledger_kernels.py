@@ -8,6 +8,7 @@ from numba import njit
 
 from capture.arrays import FloatArray
 
+from .kernels import rotor_friction
 from .servo import COULOMB_SPEED
 
 
@@ -43,7 +44,12 @@ def add_joint_flows(
             flows[4, j] += dt * max(electrical, 0.0)
             flows[5, j] += dt * servos[1, j] * current * current
             flows[6, j] += dt * servos[5, j] * acting * speed
-            flows[7, j] += dt * servos[6, j] * math.tanh(acting / COULOMB_SPEED) * speed
+            if servos[10, j] == 0.0:
+                flows[7, j] += dt * servos[6, j] * math.tanh(acting / COULOMB_SPEED) * speed
+            else:
+                motor = servos[2, j] * drive[3 * m + j] - servos[5, j] * acting
+                friction, _ = rotor_friction(servos, j, acting, motor - torque, dt)
+                flows[7, j] += dt * friction * speed
             flows[8, j] += dt * servos[8, j] * (acting - rates[j]) * (speed - rate)
 
 

@@ -11,6 +11,16 @@ the chain. Equations, per joint (rotor angle th and speed om referred to the joi
 
 D(x) = x - clip(x, -B/2, B/2) is the dead zone of a gear with the play B between its flanks (Nordin
 and Gutman, Automatica 38, 2002): there the spring is slack and only the damper acts, the grease.
+
+The smooth friction t_c tanh(om / 0.05) creeps: it has no rest. With a static friction t_s a rotor
+does rest, its speed exactly zero, until t_s is overcome; moving, its friction falls with speed
+(Stribeck 1902; Bo and Pavelescu, Wear 82, 1982)::
+
+    t_m = t_c + (t_s - t_c) exp(-(om / v_s)^2)
+    t_f = clip(Jm om / dt + Kt i - b om - t_g, -t_m, t_m)
+
+in place of t_c tanh(om / 0.05). Within its bound t_f is what stops the rotor in this very step:
+Coulomb's law in its time-stepping form (Moreau 1988), which neither creeps nor chatters.
 """
 
 from __future__ import annotations
@@ -58,9 +68,10 @@ class Servos:
 
     Attributes:
         table: All parameters of :class:`capture.robot.Servo`, SI, in the order of the attributes
-            below, shape (10, m).
+            below, shape (12, m).
         supply, resistance, torque_constant, gain, inertia, viscous, coulomb, gear_stiffness,
-            gear_damping, play: Its rows, each of shape (m,).
+            gear_damping, play, static, stribeck: Its rows, each of shape (m,).
+        resting: Indices of the servos that have static friction, shape (r,).
         losses: Coefficients of the losses in winding, bearing, Coulomb friction and gear's damper:
             resistance, viscous, coulomb and gear_damping again, shape (4, m).
     """
@@ -76,17 +87,20 @@ class Servos:
                 *(one.supply_v, one.resistance_ohm, one.torque_constant, one.proportional_gain),
                 *(one.rotor_inertia, one.viscous_friction, one.coulomb_friction),
                 *(one.gear_stiffness, one.gear_damping, one.backlash),
+                *(one.static_friction, one.stribeck_speed),
             )
             for one in servos
         ]
-        self.table = frozen(np.array(parameters, dtype=np.float64).reshape(-1, 10).T.copy())
+        self.table = frozen(np.array(parameters, dtype=np.float64).reshape(-1, 12).T.copy())
         self.supply, self.resistance, self.torque_constant, self.gain = self.table[:4]
         self.inertia, self.viscous, self.coulomb = self.table[4:7]
-        self.gear_stiffness, self.gear_damping, self.play = self.table[7:]
+        self.gear_stiffness, self.gear_damping, self.play = self.table[7:10]
+        self.static, self.stribeck = self.table[10:]
         self.losses = frozen(
             np.array([self.resistance, self.viscous, self.coulomb, self.gear_damping])
         )
         self._tight = not self.play.any()
+        self.resting = frozen(np.flatnonzero(self.static))
         self._slope = self.supply * self.gain  # of the voltage over the error, before it saturates
 
     def current(
@@ -147,16 +161,36 @@ class Servos:
             return between
         return between - _clip(between, 0.5 * self.play)
 
-    def friction(self, speed: FloatArray) -> FloatArray:
-        """Coulomb friction of the rotors, t_c tanh(om / 0.05).
+    def friction(self, rotors: Rotors, drive: Drive, dt: float) -> FloatArray:
+        """Coulomb friction of the rotors during a step, or what holds them at rest.
 
         Args:
-            speed: om [rad/s], shape (..., m).
+            rotors: Their state at the step's start, each field of shape (..., m).
+            drive: What the servos do during the step, each field of shape (..., m).
+            dt: Step [s].
 
         Returns:
             Torque against the motion [N m], shape (..., m).
         """
-        return self.coulomb * np.tanh(speed / COULOMB_SPEED)
+        torque = self.coulomb * np.tanh(rotors.speed / COULOMB_SPEED)
+        if self.resting.size:
+            some = self.resting
+            most = self._breakaway(rotors.speed[..., some])
+            torque[..., some] = _clip(self._stopping(rotors, drive, dt), most)
+        return torque
+
+    def _breakaway(self, speed: FloatArray) -> FloatArray:
+        """Most friction that resting servos have, t_m at their speeds, shape (..., r)."""
+        some = self.resting
+        above = self.static[some] - self.coulomb[some]
+        return self.coulomb[some] + above * np.exp(-((speed / self.stribeck[some]) ** 2))
+
+    def _stopping(self, rotors: Rotors, drive: Drive, dt: float) -> FloatArray:
+        """Torque that stops the rotors of the resting servos in one step, shape (..., r)."""
+        some = self.resting
+        speed = rotors.speed[..., some]
+        torque = self.torque_constant[some] * drive.current[..., some] - self.viscous[some] * speed
+        return self.inertia[some] * speed / dt + (torque - drive.torque[..., some])
 
     def advance(self, rotors: Rotors, drive: Drive, dt: float, out: Rotors | None = None) -> Rotors:
         """The rotors one step later, by the semi-implicit Euler rule that the body follows too.
@@ -172,8 +206,15 @@ class Servos:
         """
         into_angle, into_speed = out or (None, None)
         torque = self.torque_constant * drive.current - self.viscous * rotors.speed
-        torque -= self.friction(rotors.speed) + drive.torque
+        friction = self.friction(rotors, drive, dt)
+        torque -= friction + drive.torque
         speed = np.add(rotors.speed, dt * torque / self.inertia, out=into_speed)
+        if self.resting.size:
+            # Exactly zero, which rounding would miss.
+            held = np.abs(self._stopping(rotors, drive, dt)) <= self._breakaway(
+                rotors.speed[self.resting]
+            )
+            speed[self.resting[held]] = 0.0
         return Rotors(np.add(rotors.angle, dt * speed, out=into_angle), speed)
 
 

@@ -37,7 +37,11 @@ def uneven(make_robot):
         dataclasses.replace(
             joint,
             servo=dataclasses.replace(
-                joint.servo, stall_torque=0.2 + 0.1 * i, backlash=0.02 * (i % 2), supply_v=6 + i
+                joint.servo,
+                stall_torque=0.2 + 0.1 * i,
+                backlash=0.02 * (i % 2),
+                supply_v=6 + i,
+                static_friction=0.05 * (i % 3 == 0),
             ),
         )
         for i, joint in enumerate(robot.joints)

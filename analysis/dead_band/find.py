@@ -1,0 +1,240 @@
+"""Which joints have a dead band, how wide, and of which kind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from capture.arrays import ComplexArray, FloatArray
+from capture.log.signals import Signal
+
+from ..estimators.series import Series, clean, shared_times
+from ..fitting import GaitFit
+from ..flags.spans import runs
+from ..reading import Columns
+from ..results.dead_band import DeadBand, Reversal
+from .fit import Fitted, fit_dead_bands
+from .kind import Witness, decide
+from .model import BOTTOM, DELAY, TOP, WIDTH, Cycles, whole_cycles
+from .operator import fundamental_change, rested
+
+MOST_CYCLES = 12
+"""Cycles that are fitted, evenly spread over the stretch: an hour costs no more than a minute."""
+
+RESOLVED = 4.0
+"""A dead band of fewer steps of the encoder isn't claimed."""
+
+_FOLLOWS = 0.1
+"""Least gain of a joint that follows its command."""
+
+_HINT = 0.15
+"""Least width that a loop must hint at, as a share of ``RESOLVED`` steps, for a closer look."""
+
+_CLEAR = 20.0
+"""Gain in log likelihood, times two, over a joint without a dead band."""
+
+_CREEP = 0.1
+"""A joint at rest moves by less than this share of what its command would have it move by."""
+
+_SETTLING = 0.25
+"""Part of each plateau that is left out at its start: the joint may still arrive."""
+
+_SHORTEST, _LONG = 3, 8
+"""Samples that a plateau has at least, and so many that three parts of it are compared."""
+
+
+def dead_bands(
+    columns: Columns,
+    commands: Mapping[str, Series],
+    responses: Mapping[str, Series],
+    gait: GaitFit | None,
+    origin_ns: int,
+) -> dict[str, DeadBand]:
+    """Measure the dead bands of a gait's joints.
+
+    Args:
+        columns: The session's columns, for efforts, currents and second sensors.
+        commands: By joint name, on the analysed stretch.
+        responses: The same.
+        gait: The fitted gait, or None.
+        origin_ns: Unix time of the series' origin [ns].
+
+    Returns:
+        By joint name; joints that rest at no reversal, or for less than can be resolved, have none.
+    """
+    if gait is None:
+        return {}
+    names = [name for name in gait.answered if name in commands and name in responses]
+    measured = [responses[name] for name in names]
+    found: dict[str, DeadBand] = {}
+    for group in shared_times(measured):
+        own = [names[i] for i in group]
+        cycles = whole_cycles(
+            [commands[name] for name in own],
+            [responses[name] for name in own],
+            gait.fit.omega,
+            MOST_CYCLES,
+        )
+        if cycles is not None:
+            found |= _of_group(own, cycles, gait.fit.omega, columns, origin_ns)
+    return found
+
+
+def _of_group(
+    names: Sequence[str], cycles: Cycles, omega: float, columns: Columns, origin_ns: int
+) -> dict[str, DeadBand]:
+    wave, ratio = _fundamentals(cycles, omega)
+    amplitude, lag = np.abs(wave), -np.angle(ratio) % (2 * np.pi)
+    resolution = np.array([_resolution(one) for one in cycles.measured])
+    linear = np.array([_without(cycles, j, float(lag[j])) for j in range(len(names))])
+    hinted = (
+        (np.abs(ratio) > _FOLLOWS)
+        & (amplitude * np.abs(ratio) > RESOLVED * resolution)
+        & (linear[:, 1] > _HINT * RESOLVED * resolution)
+    )
+    chosen = np.flatnonzero(hinted)
+    if chosen.size == 0:
+        return {}
+    part = Cycles(
+        tuple(cycles.commands[j] for j in chosen),
+        cycles.t_s,
+        cycles.first,
+        cycles.measured[chosen],
+    )
+    fits = fit_dead_bands(part, omega, amplitude[chosen], lag[chosen], resolution[chosen])
+    found: dict[str, DeadBand] = {}
+    for k, (j, one) in enumerate(zip(chosen.tolist(), fits, strict=True)):
+        least = RESOLVED * resolution[j] / abs(one.gain) if one.gain else np.inf
+        clearer = one.independent * np.log(linear[j, 0] / one.cost)
+        if one.gain <= 0 or clearer < _CLEAR or np.any(one.travel[:, 0] < least):
+            continue
+        if np.any(one.travel[:, 1] <= 0):
+            continue
+        rest_s = _rests(part, k, one, float(resolution[j]))
+        if rest_s is not None:
+            witness = Witness.of(columns, names[j], lambda s: _series(s, origin_ns))
+            kind = decide(part, k, one, witness)
+            found[names[j]] = _result(
+                one, part.commands[k], rest_s, omega, kind=kind, count=len(part.t_s)
+            )
+    return found
+
+
+def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexArray]:
+    """Amplitudes of the commands, and of the positions over them."""
+    back = np.exp(1j * omega * cycles.t_s[:, cycles.first :])
+    waves: list[complex] = []
+    ratios: list[complex] = []
+    for j in range(len(cycles.measured)):
+        measured: FloatArray = cycles.measured[j, :, cycles.first :]
+        command = cycles.commanded(j)[:, cycles.first :]
+        wave = complex(2 * np.vdot(back, command - np.mean(command)) / back.size)
+        answer = complex(2 * np.vdot(back, measured - np.mean(measured)) / back.size)
+        waves.append(wave)
+        ratios.append(answer / wave if wave else 0j)
+    return np.array(waves), np.array(ratios)
+
+
+def _without(cycles: Cycles, joint: int, lag: float) -> tuple[float, float]:
+    """Misfit without a dead band [rad^2], and the width that the loop hints at [rad].
+
+    Position = offset + gain c + damping c' is exact for a linear joint and a sine; a dead band adds
+    a square wave that changes sign with the joint.
+    """
+    times = cycles.t_s[:, cycles.first :].ravel()
+    command = cycles.commands[joint]
+    span_s = float(cycles.t_s[0, -1] - cycles.t_s[0, cycles.first])
+    near_s = max(cycles.period_s, span_s / 200)
+
+    def rate(t_s: FloatArray) -> FloatArray:
+        return (command.at(t_s + near_s) - command.at(t_s - near_s)) / (2 * near_s)
+
+    late_s = lag / (2 * np.pi) * span_s
+    moves = rate(times)
+    plain = np.column_stack((np.ones_like(times), command.at(times), moves))
+    square = np.sign(rate(times - late_s))
+    measured = cycles.measured[joint, :, cycles.first :].ravel()
+    alone = np.linalg.lstsq(plain, measured, rcond=None)[0]
+    both = np.linalg.lstsq(np.column_stack((plain, square)), measured, rcond=None)[0]
+    return float(np.square(measured - plain @ alone).sum()), 2 * abs(float(both[-1]))
+
+
+def _resolution(measured: FloatArray) -> float:
+    """The smallest step that a sensor shows; 0 where it shows none."""
+    step = np.abs(np.diff(measured, axis=1))
+    moved = step[step > 0]
+    return float(moved.min()) if moved.size else 0.0
+
+
+def _rests(
+    cycles: Cycles, joint: int, one: Fitted, resolution: float
+) -> tuple[float, float] | None:
+    """For how long the joint rests after top and bottom [s]; None unless it does at both."""
+    begin = cycles.first // 2  # by then the model has its state
+    command = cycles.commanded(joint, float(one.parameters[DELAY]))[:, begin:]
+    middle = float(one.follower.mean())
+    found: tuple[list[float], list[float]] = ([], [])
+    crept: tuple[list[float], list[float]] = ([], [])
+    led: tuple[list[float], list[float]] = ([], [])
+    for rests, z, c, seen in zip(
+        one.rests[:, begin:],
+        one.follower[:, begin:],
+        command,
+        cycles.measured[joint, :, begin:],
+        strict=True,
+    ):
+        for i, k in zip(*runs(rests), strict=True):
+            if i == 0 or k == rests.size or k - i < _SHORTEST:
+                continue  # begins before the stretch or ends after it
+            side = int(z[i] < middle)
+            found[side].append(float(k - i) * cycles.period_s)
+            settled = slice(i + round(_SETTLING * (k - i)), k)
+            parts = np.array_split(seen[settled], 3 if k - i >= _LONG else 2)
+            means = [float(part.mean()) for part in parts]
+            crept[side].append(max(means) - min(means))
+            led[side].append(abs(one.gain) * float(np.ptp(c[settled])))
+    for side in (0, 1):
+        if not found[side]:
+            return None
+        allowed = max(resolution, _CREEP * float(np.median(led[side])))
+        if float(np.median(crept[side])) > allowed:
+            return None
+    return float(np.median(found[0])), float(np.median(found[1]))
+
+
+def _series(signal: Signal, origin_ns: int) -> Series:
+    return clean(signal.name, signal.t_ns, signal.values, origin_ns)
+
+
+def _result(
+    one: Fitted,
+    command: Series,
+    rest_s: tuple[float, float],
+    omega: float,
+    *,
+    kind: tuple[str, str],
+    count: int,
+) -> DeadBand:
+    width, top, bottom = one.parameters[[WIDTH, TOP, BOTTOM]].tolist()
+    followed = rested(command.values, width, top, bottom)
+    change = fundamental_change(command.t_s, command.values, followed, omega)
+    sides = [
+        Reversal(
+            travel_rad=float(travel[0]),
+            travel_ci95=(float(travel[1]), float(travel[2])),
+            step_rad=one.gain * float(step[0]),
+            step_ci95=(one.gain * float(step[1]), one.gain * float(step[2])),
+            rest_s=lasts,
+        )
+        for travel, step, lasts in zip(one.travel, one.step, rest_s, strict=True)
+    ]
+    return DeadBand(
+        kind=kind[0],
+        evidence=kind[1],
+        top=sides[0],
+        bottom=sides[1],
+        gain_change=abs(change),
+        lag_change_rad=-float(np.angle(change)),
+        cycles=count,
+    )
