@@ -155,11 +155,8 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
     Their errors come from the scatter between cycles, so they are outside the family of gain and
     lag; the margin is many times what noise makes of a mean.
     """
-    index = [
-        k
-        for k, name in enumerate(chain.names)
-        if chain.offsets.get(name, _NONE).size >= _MIN_CYCLES
-    ]
+    known = {name for name, each in chain.offsets.items() if each.size >= _MIN_CYCLES}
+    index = [k for k, name in enumerate(chain.names) if name in known]
     if len(index) < MIN_JOINTS:
         return []
     cycles = min(chain.offsets[chain.names[k]].size for k in index)

@@ -182,7 +182,8 @@ def _named(facts: Facts) -> str:
     undecided = _undecided(facts.findings, facts)
     if undecided:
         clauses.append(undecided)
-    return f"{formats.capital('; '.join(clauses))}." if clauses else ""
+    # A joint's name keeps its letters at the beginning, too: a reader searches for it.
+    return f"{'; '.join(clauses)}." if clauses else ""
 
 
 def _undecided(findings: Findings, facts: Facts) -> str:
@@ -345,7 +346,7 @@ def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
             for j in (first, last)
         )
     evidence = [
-        f" {formats.capital(f'{formats.plain(each.joint)} {each.evidence}')}."
+        f" {formats.plain(each.joint)} {each.evidence}."
         for each in facts.not_following[:NAMED]
         if each.kinds != ("lost_samples",)
     ]
