@@ -22,14 +22,8 @@ from .gait import (
     driven,
     find_rhythm,
 )
-from .groups import (
-    RESOLUTION,
-    Groups,
-    MixedTone,
-    find_groups,
-    group_model,
-    mixed_tones,
-)
+from .groups import Groups, find_groups
+from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
 from .reading import Warn
 from .response import Response, respond
 from .text.deciding import distinct, percent_below
@@ -203,17 +197,27 @@ def _select(
 def _fit_groups(
     channels: Sequence[_Channels], omegas: Sequence[float], duration_s: float
 ) -> list[HarmonicFit]:
-    """Fit each group with the harmonics of all; several in turn until no frequency moves.
+    """Fit each group with the tones of all; several in turn until no frequency moves.
 
     The parameters of all groups are then at the common least-squares optimum, since each group's
     normal equations, given the others' frequencies, contain the others' amplitudes.
     """
     omegas = list(omegas)
     fits: list[HarmonicFit] = []
+    mixed: list[tuple[float, ...]] = []
+    for k, group in enumerate(channels):
+        model = group_model(group.series, omegas, k, duration_s)
+        responses = group.series[len(group.driven) :]
+        if len(channels) > 1 and responses:
+            wider = with_mixed_lines(responses, omegas, k, model, duration_s)
+            mixed.append(wider.lines[len(model.lines) :])
+        else:
+            mixed.append(())
     for _ in range(_ROUNDS):
         fits = []
         for k, group in enumerate(channels):
             model = group_model(group.series, omegas, k, duration_s)
+            model = replace(model, lines=(*model.lines, *mixed[k]))
             fits.append(fit_shared(group.series, omegas[k], model))
         moved = [abs(fit.omega - omega) for fit, omega in zip(fits, omegas, strict=True)]
         omegas = [fit.omega for fit in fits]
