@@ -26,7 +26,7 @@ from .groups import Groups, find_groups
 from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
 from .reading import Warn
 from .response import Response, respond
-from .text.deciding import distinct, percent_below
+from .text.deciding import distinct, percent
 
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""
@@ -237,7 +237,7 @@ def _group_fit(
     responded = np.arange(len(moved), len(channels))
     explained = 1 - float(fit.rss[: len(moved)].sum() / fit.total[: len(moved)].sum())
     if explained < _CLEAR:
-        share = percent_below(explained, _CLEAR)
+        share = percent(explained, _CLEAR)
         warn(
             f"one steady rhythm explains {share} of the commands' variance: gain "
             "and lag are averages over what changes"
@@ -347,7 +347,7 @@ def _no_gait(known: list[Series], found: Groups | None, kind: str, duration_s: f
     one = len(found.rhythms) == 1
     return (
         f"no gait: the best rhythm{'' if one else 's'} ({frequencies}) explain{'s' if one else ''} "
-        f"{percent_below(max(found.explained, 0.0), MIN_EXPLAINED)} of the {kind}' variance, a "
+        f"{percent(max(found.explained, 0.0), MIN_EXPLAINED)} of the {kind}' variance, a "
         f"gait at least {100 * MIN_EXPLAINED:.0f} %; {nulls} (if only part of the session is a "
         "gait, choose it with --start and --stop)"
     )
