@@ -22,17 +22,11 @@ from .gait import (
     driven,
     find_rhythm,
 )
-from .groups import (
-    RESOLUTION,
-    Groups,
-    MixedTone,
-    find_groups,
-    group_model,
-    mixed_tones,
-)
+from .groups import Groups, find_groups
+from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
 from .reading import Warn
 from .response import Response, respond
-from .text.deciding import distinct, percent_below
+from .text.deciding import distinct, percent
 
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""
@@ -203,17 +197,27 @@ def _select(
 def _fit_groups(
     channels: Sequence[_Channels], omegas: Sequence[float], duration_s: float
 ) -> list[HarmonicFit]:
-    """Fit each group with the harmonics of all; several in turn until no frequency moves.
+    """Fit each group with the tones of all; several in turn until no frequency moves.
 
     The parameters of all groups are then at the common least-squares optimum, since each group's
     normal equations, given the others' frequencies, contain the others' amplitudes.
     """
     omegas = list(omegas)
     fits: list[HarmonicFit] = []
+    mixed: list[tuple[float, ...]] = []
+    for k, group in enumerate(channels):
+        model = group_model(group.series, omegas, k, duration_s)
+        responses = group.series[len(group.driven) :]
+        if len(channels) > 1 and responses:
+            wider = with_mixed_lines(responses, omegas, k, model, duration_s)
+            mixed.append(wider.lines[len(model.lines) :])
+        else:
+            mixed.append(())
     for _ in range(_ROUNDS):
         fits = []
         for k, group in enumerate(channels):
             model = group_model(group.series, omegas, k, duration_s)
+            model = replace(model, lines=(*model.lines, *mixed[k]))
             fits.append(fit_shared(group.series, omegas[k], model))
         moved = [abs(fit.omega - omega) for fit, omega in zip(fits, omegas, strict=True)]
         omegas = [fit.omega for fit in fits]
@@ -233,7 +237,7 @@ def _group_fit(
     responded = np.arange(len(moved), len(channels))
     explained = 1 - float(fit.rss[: len(moved)].sum() / fit.total[: len(moved)].sum())
     if explained < _CLEAR:
-        share = percent_below(explained, _CLEAR)
+        share = percent(explained, _CLEAR)
         warn(
             f"one steady rhythm explains {share} of the commands' variance: gain "
             "and lag are averages over what changes"
@@ -344,7 +348,7 @@ def _no_gait(known: list[Series], found: Groups | None, kind: str, duration_s: f
     one = len(found.rhythms) == 1
     return (
         f"no gait: the best rhythm{'' if one else 's'} ({frequencies}) explain{'s' if one else ''} "
-        f"{percent_below(max(found.explained, 0.0), MIN_EXPLAINED)} of the {kind}' variance, a "
+        f"{percent(max(found.explained, 0.0), MIN_EXPLAINED)} of the {kind}' variance, a "
         f"gait at least {100 * MIN_EXPLAINED:.0f} %; {nulls} (if only part of the session is a "
         "gait, choose it with --start and --stop)"
     )

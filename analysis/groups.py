@@ -4,54 +4,22 @@ The gait of a snake robot may have a frequency for each plane (omega_h and omega
 of Meister et al., 2011) or for any other part of its joints. Each channel's own frequency is
 estimated, and channels whose frequencies the record's length T can't resolve are one group: two
 tones closer than about 1.5/T can't be told apart in a response that holds both.
-
-Through the body each response also holds the other groups' tones. So the model of every channel has
-the harmonics of all groups (:func:`further_lines`), and coincident ones, as 2 omega_1 and 3 omega_2
-at 3:2, only once. A nonlinear body makes tones at m omega_1 + n omega_2, too; one that falls on a
-group's own tone can't be separated from its response (:func:`mixed_tones`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from capture.arrays import BoolArray, FloatArray
 
 from .estimators.harmonic import HarmonicFit, fit_at
-from .estimators.harmonic_moments import HarmonicModel
 from .estimators.series import Series
-from .gait import (
-    DRIVEN_SHARE,
-    HARMONICS,
-    MIN_EXPLAINED,
-    NYQUIST_SHARE,
-    Rhythm,
-    allowed_model,
-    find_rhythm,
-    refine,
-)
-
-RESOLUTION = 1.5
-"""Frequencies closer than this many cycles over the record are not resolved."""
-
-COINCIDENT = 0.5
-"""Harmonics of two groups closer than this many cycles over the record are one column."""
-
-MIXING_ORDER = 6
-"""Highest |m| + |n| of a tone m f1 + n f2 that is looked for at a group's tone."""
-
-MODELLED_ORDER = 4
-"""Highest |m| + |n| of a mixed tone that is fitted beside a group's own."""
-
-_MOST_LINES = 24
-"""Lines beside a group's harmonics, at most; lower orders come first."""
-
-_SAMPLES_PER_LINE = 8
-"""Samples that a channel needs for each of these lines."""
+from .gait import DRIVEN_SHARE, MIN_EXPLAINED, Rhythm, find_rhythm, refine
+from .mixing import COINCIDENT, RESOLUTION, group_model
 
 _CLEAR = 0.98
 """A command explained to less than this may have a frequency of its own: a tenth of a cycle over
@@ -100,20 +68,6 @@ class Groups:
     explained: float
     unresolved: tuple[Unresolved, ...] = ()
     astray: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class MixedTone:
-    """A harmonic of a group, or a tone of two groups together, that falls on a group's own tone.
-
-    Attributes:
-        group: Index of the group on whose frequency it falls.
-        factors: Whole factor of each group's frequency in it, by index; none of them is 0, and
-            the sum is above 0.
-    """
-
-    group: int
-    factors: Mapping[int, int]
 
 
 @dataclass(frozen=True)
@@ -177,102 +131,6 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     grouped = {name for rhythm in rhythms for name in rhythm.names}
     astray = tuple(one.name for one in active if one.name not in grouped | left)
     return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
-
-
-def group_model(
-    series: Sequence[Series], omegas: Sequence[float], group: int, duration_s: float
-) -> HarmonicModel:
-    """The basis of a group's channels: own harmonics, and the tones of the other groups.
-
-    Args:
-        series: Channels of the group.
-        omegas: Angular frequencies of all groups [rad/s].
-        group: Index of the group.
-        duration_s: Length of the record [s].
-
-    Returns:
-        As many lines as the slowest channel's sampling rate and samples allow.
-    """
-    model = allowed_model(series, omegas[group])
-    highest = NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
-    most = min(_MOST_LINES, min(one.count for one in series) // _SAMPLES_PER_LINE)
-    lines = further_lines(omegas, group, model.harmonics, highest, duration_s)
-    return replace(model, lines=lines[:most])
-
-
-def further_lines(
-    omegas: Sequence[float], group: int, harmonics: int, highest: float, duration_s: float
-) -> tuple[float, ...]:
-    """Frequencies of the other groups' tones, for the model of one group's channels.
-
-    They are the harmonics of the other groups and the mixed tones m omega_1 + n omega_2 with
-    |m| + |n| up to ``MODELLED_ORDER``, which would count as noise otherwise.
-
-    Args:
-        omegas: Angular frequencies of all groups [rad/s].
-        group: Index of the group.
-        harmonics: How many harmonics of its own its model has.
-        highest: Highest frequency that the sampling rate allows [rad/s].
-        duration_s: Length of the record [s].
-
-    Returns:
-        Angular frequencies [rad/s] without those that coincide with an own harmonic, with zero or
-        with each other; mixed tones only where they are resolved from all of these.
-    """
-    near = COINCIDENT * 2 * np.pi / duration_s
-    taken = [0.0, *(order * omegas[group] for order in range(1, harmonics + 1))]
-    lines: list[float] = []
-    for order in range(1, HARMONICS + 1):
-        for k, omega in enumerate(omegas):
-            line = order * omega
-            apart = min(abs(line - other) for other in (*taken, *lines))
-            if k != group and line <= highest and apart > near:
-                lines.append(line)
-    # Mixed tones may only be absent from the noise beside the tone, so none is worth an error bar.
-    near *= RESOLUTION / COINCIDENT
-    for factors in _combinations(len(omegas)):
-        line = abs(sum(factor * omegas[k] for k, factor in factors.items()))
-        order = sum(abs(factor) for factor in factors.values())
-        if order > MODELLED_ORDER:
-            break
-        apart = min(abs(line - other) for other in (*taken, *lines))
-        if len(factors) > 1 and line <= highest and apart > near:
-            lines.append(line)
-    return tuple(lines)
-
-
-def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
-    """Find the tones of other groups, or of several together, that fall on a group's own tone.
-
-    Args:
-        omegas: Angular frequencies of the groups [rad/s].
-        duration_s: Length of the record [s].
-
-    Returns:
-        For each group the tone of lowest order |m| + |n|, up to ``MIXING_ORDER``, that the record
-        does not resolve from it.
-    """
-    near = RESOLUTION * 2 * np.pi / duration_s
-    found: list[MixedTone] = []
-    for group, omega in enumerate(omegas):
-        for factors in _combinations(len(omegas)):
-            tone = sum(factor * omegas[k] for k, factor in factors.items())
-            if factors != {group: 1} and abs(abs(tone) - omega) < near:
-                sign = 1 if tone > 0 else -1
-                found.append(MixedTone(group, {k: sign * one for k, one in factors.items()}))
-                break
-    return found
-
-
-def _combinations(count: int) -> Iterator[dict[int, int]]:
-    """Whole factors of one or two frequencies, of rising order, each tone with one sign."""
-    for order in range(1, MIXING_ORDER + 1):
-        for k in range(count):
-            yield {k: order}
-        for a, b in combinations(range(count), 2):
-            for first in range(1, order):
-                yield {a: first, b: order - first}
-                yield {a: first, b: first - order}
 
 
 def _lively(fit: HarmonicFit) -> BoolArray:

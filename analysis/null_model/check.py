@@ -19,6 +19,7 @@ from ..fitting import GaitFit
 from ..response import Response, t_factor
 from ..results.analysis import Analysis, Estimate, Provenance
 from ..stretch import Options
+from ..text.deciding import beyond, distinct
 from .deviation import DRAWS, NullTest, null_test
 from .result import (
     ModelledAnalysis,
@@ -101,16 +102,18 @@ def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
         return f"it drives {', '.join(gait.driven)}, the model {', '.join(model.joints)}"
     frequency, own = model.frequency_hz, gait.fit.frequency_hz
     if abs(own - frequency) > SAME_FREQUENCY * frequency:
-        return f"its gait has {own:.4g} Hz, the model's {frequency:.4g} Hz"
+        texts = distinct(own, frequency)
+        return f"its gait has {texts[0]} Hz, the model's {texts[1]} Hz"
     command = gait.fit.fundamental[: len(gait.driven)]
     change = command / model.command
     off = np.abs(change * np.exp(-1j * np.angle(np.sum(change))) - 1)
     worst = int(np.argmax(off))
     if off[worst] <= SAME_COMMAND:
         return None
+    size = beyond(100 * float(off[worst]), 100 * SAME_COMMAND)
     return (
-        f"its command at {model.joints[worst]} is {100 * off[worst]:.2g} % off the model's: "
-        "another amplitude, lag or direction"
+        f"its command at {model.joints[worst]} is {size} % off the model's, more than "
+        f"{100 * SAME_COMMAND:g} %: another amplitude, lag or direction"
     )
 
 

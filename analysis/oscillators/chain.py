@@ -12,6 +12,7 @@ from capture.arrays import BoolArray, FloatArray
 
 from ..response import CONFIDENCE, around, t_factor
 from ..results.analysis import Estimate
+from ..text.deciding import beyond, percent
 from .pieces import between_kicks
 from .result import ChainCoupling, Link, Rate
 from .weak_form import OscillatorFit, fit_oscillator, window_length
@@ -77,15 +78,16 @@ def chain_coupling(
     finite = condition if np.isfinite(condition) else None
     if condition > MOST_CONDITION:
         return refused(
-            f"the phases are locked: condition number {condition:.2g}, at most {MOST_CONDITION:g} "
-            "is taken",
+            f"the phases are locked: condition number {beyond(condition, MOST_CONDITION)}, at "
+            f"most {MOST_CONDITION:g} is taken",
             finite,
         )
     share = _noise_share(fits)
     if share > MOST_NOISE:
         return refused(
             f"the phases are all but locked (condition number {condition:.2g}): standard errors "
-            f"are {100 * share:.0f} % of the couplings, at most {100 * MOST_NOISE:.0f} % is taken",
+            f"are {percent(share, MOST_NOISE)} of the couplings, at most {100 * MOST_NOISE:.0f} % "
+            "is taken",
             finite,
         )
     return ChainCoupling(

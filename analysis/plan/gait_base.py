@@ -12,6 +12,7 @@ from capture.errors import UsageError
 
 from ..analyse import examine_session
 from ..reading import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
+from ..text.deciding import percent
 
 PURE = 0.01
 """Harmonics of a command above this share of its fundamental are no sine any more."""
@@ -62,9 +63,10 @@ def base_gait(session: Session) -> BaseGait:
     overtones = np.abs(harmonics[:, 1:]).max(initial=0.0, axis=1) / np.abs(harmonics[:, 0])
     if overtones.max() > PURE:
         worst = gait.driven[int(np.argmax(overtones))]
+        share = percent(float(overtones.max()), PURE)
         raise UsageError(
-            f"{session.path}: the command of {worst} is no sine (a harmonic has "
-            f"{100 * overtones.max():.0f} % of its amplitude); name a session of a steady sine gait"
+            f"{session.path}: the command of {worst} is no sine (a harmonic has {share} of its "
+            f"amplitude, more than {100 * PURE:g} %); name a session of a steady sine gait"
         )
 
     def silent(_: str) -> None:

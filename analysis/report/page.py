@@ -27,6 +27,7 @@ from ..results.analysis import (
 )
 from ..results.experiment import Experiment
 from ..text import formats
+from ..text.deciding import beyond
 from .comparison_view import comparison_view
 from .driven import is_driven
 from .experiment_view import experiment_view
@@ -67,8 +68,9 @@ def render(
     if size > LARGEST_BYTES:
         count = _sessions(result)
         whose = f"{count} sessions" if count > 1 else "one session"
+        megabytes = beyond(size / 1e6, LARGEST_BYTES / 1e6, 3)
         raise UsageError(
-            f"the page on {whose} would be {size / 1e6:.1f} MB, more than {LARGEST_BYTES / 1e6:g} "
+            f"the page on {whose} would be {megabytes} MB, more than {LARGEST_BYTES / 1e6:g} "
             "MB: put fewer sessions on it, or less of one with --start and --stop"
         )
     return page

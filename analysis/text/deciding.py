@@ -6,21 +6,43 @@ _MOST = 12
 """Digits after which two numbers are taken for equal."""
 
 
-def percent_below(share: float, limit: float) -> str:
-    """Print a share that is below a limit so that it reads as below it.
+def percent(share: float, limit: float) -> str:
+    """Print a share so that it reads as on the side of a limit that it is on.
 
     Args:
-        share: From 0 to 1.
-        limit: What it was compared with, above ``share``.
+        share: Any share.
+        limit: What it was compared with.
 
     Returns:
-        In percent, e.g. ``79.97 %`` for a limit of 0.8; no digits more than needed.
+        In percent with no digits more than needed, e.g. ``79.97 %`` for a limit of 0.8.
     """
     for decimals in range(_MOST):
         text = f"{100 * share:.{decimals}f}"
-        if share >= limit or float(text) < 100 * limit:
+        if _same_side(float(text) / 100, share, limit):
             return f"{text} %"
     return f"{100 * share!r} %"
+
+
+def beyond(value: float, limit: float, digits: int = 2) -> str:
+    """Print a value so that it reads as on the side of a limit that it is on.
+
+    Args:
+        value: Any value.
+        limit: What it was compared with.
+        digits: Significant digits, at least.
+
+    Returns:
+        The value, e.g. ``101`` for a limit of 100, where two digits would be 1e+02.
+    """
+    for count in range(digits, _MOST):
+        text = f"{value:.{count}g}"
+        if _same_side(float(text), value, limit):
+            return text
+    return repr(value)
+
+
+def _same_side(printed: float, value: float, limit: float) -> bool:
+    return value == limit or (printed != limit and (printed > limit) == (value > limit))
 
 
 def distinct(first: float, second: float, digits: int = 4) -> tuple[str, str]:
