@@ -22,6 +22,7 @@ from .gait import (
     find_rhythm,
 )
 from .reading import Warn
+from .remarks import Lacking, Note
 from .response import Response, respond
 
 _CLEAR = 0.95
@@ -80,7 +81,7 @@ def fit_gait(
     kind = "commands" if commands else "responses"
     rhythm = find_rhythm(known, duration_s)
     if rhythm is None or rhythm.explained < MIN_EXPLAINED:
-        warn(_no_gait(known, rhythm, kind, duration_s))
+        warn(Lacking(_no_gait(known, rhythm, kind, duration_s)))
         return None
     if not commands:
         return _responses_only(responses, rhythm)
@@ -169,7 +170,8 @@ def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], w
     for joints, why in reasons:
         if joints:
             count = f"{len(joints)} joints are" if len(joints) > 1 else "1 joint is"
-            warn(f"{count} {why}, gain and lag are null: {', '.join(joints)}")
+            told = f"{count} {why}, gain and lag are null: {', '.join(joints)}"
+            warn(Note(told) if joints is held else told)
 
 
 def _no_gait(known: list[Series], rhythm: Rhythm | None, kind: str, duration_s: float) -> str:

@@ -13,6 +13,7 @@ from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
 
 from .body.null import DRAG_RATIO
+from .remarks import Lacking, Note
 
 COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"
@@ -140,10 +141,11 @@ def read_columns(
             option = "--command-topic" if key == "command" else "--response-topic"
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
-            warn(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}")
+            told = f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"
+            warn(Lacking(told))
     if "velocity" not in found or "effort" not in found:
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
-        warn(f"{response_topic} carries no {lacking}: mechanical energies are null")
+        warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
     _check_voltage(session, found, warn)
     names = session.robot.joint_names if session.robot is not None else ()
     seen = dict.fromkeys(names)
@@ -257,11 +259,13 @@ def _check_voltage(session: Session, found: dict[str, JointSignals], warn: Warn)
         if key not in found
     ]
     if lacking:
-        warn(f"no {' and no '.join(lacking)}: electrical energies are null")
+        warn(Note(f"no {' and no '.join(lacking)}: electrical energies are null"))
         found.pop("current", None)
         return
     if "scenario" not in session.metadata.get("undulog", {}):
         warn(
-            f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, E_el is "
-            "too large"
+            Note(
+                f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, "
+                "E_el is too large"
+            )
         )
