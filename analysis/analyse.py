@@ -32,6 +32,7 @@ from .indices import heterogeneity_indices
 from .joints import Energies, Span, joint_energies, joint_results
 from .oscillators.session import session_couplings
 from .reading import Warn, drag_ratio, read_columns, settle_time_s
+from .remarks import Note, Remarks
 from .response import CONFIDENCE
 from .results.analysis import (
     Analysis,
@@ -49,6 +50,8 @@ from .text.artefacts import warn_flags, within
 from .windows import Stretch, whole_cycles
 
 _NS = 1e9
+_FEW = 1e-3
+"""Up to one sample in a thousand left out is a note: no loss for a fit."""
 
 
 @dataclass(frozen=True)
@@ -132,12 +135,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         UsageError: If the options leave nothing of the session.
     """
     options = options or Options()
-    warnings: list[str] = []
-
-    def warn(sentence: str) -> None:
-        if sentence not in warnings:
-            warnings.append(sentence)
-
+    warn = Remarks()
     columns = read_columns(
         session,
         options.command_topic,
@@ -211,12 +209,13 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         body=body,
         heterogeneity=heterogeneity,
         coupling=one_gait_coupling(0 if gait is None else len(gait.all_answered)),
-        warnings=(*session.warnings, *warnings),
+        warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
         over_time=over_time,
         energy=energy,
         oscillators=session_couplings(session, options.start_s, options.stop_s),
+        notes=warn.notes,
     )
     answer = compose(Facts(analysis.gait, joints, commanded, faulty, findings, analysis.warnings))
     analysis = dataclasses.replace(analysis, answer=answer)
@@ -247,10 +246,12 @@ def _warn_dropped(
         if lost:
             nan = sum(one.dropped_nan for one in lost)
             double = sum(one.dropped_duplicates for one in lost)
-            warn(
+            told = (
                 f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
                 f"time that was there already ({', '.join(one.name for one in lost)})"
             )
+            few = nan + double <= _FEW * sum(one.count for one in series.values())
+            warn(Note(told) if few else told)
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:

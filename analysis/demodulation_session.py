@@ -22,6 +22,7 @@ from .estimators.demodulation import (
 from .estimators.series import GAP_FACTOR, Series, clean
 from .estimators.threads import in_threads
 from .reading import Columns, Warn, planes_of, settle_time_s
+from .remarks import Note
 from .response import t_factor
 from .results.artefact import Artefact, Span
 from .results.over_time import (
@@ -157,7 +158,8 @@ def response_over_time(
     found = in_threads(of_joint, columns.names, samples, session.forget)
     joints = [one for one in found if one is not None]
     if not any(any(g is not None for g in one.gain) for one in joints):
-        warn("gain and lag over time are null: no whole cycle of the logged phase drives a joint")
+        why = "no whole cycle of the logged phase drives a joint"
+        warn(Note(f"gain and lag over time are null: {why}"))
         return None
     ends = logged.t_s
     return ResponseOverTime(
@@ -183,7 +185,7 @@ def _logged(session: Session, warn: Warn) -> LoggedGait | None:
                 known |= {k: np.unwrap(v) for k, v in known.items() if k.endswith(".phase")}
                 return LoggedGait(t_s[finite], known)
             why = f"{GAIT_TOPIC} logs no phase"
-    warn(f"gain and lag over time are null: {why}")
+    warn(Note(f"gain and lag over time are null: {why}"))
     return None
 
 

@@ -25,6 +25,7 @@ from .gait import (
 from .groups import Groups, find_groups
 from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
 from .reading import Warn
+from .remarks import Lacking, Note
 from .response import Response, respond
 from .text.deciding import distinct, percent
 
@@ -125,7 +126,7 @@ def fit_gait(
     kind = "commands" if commands else "responses"
     found = find_groups(known, duration_s) if commands else _common_rhythm(known, duration_s)
     if found is None or found.explained < MIN_EXPLAINED:
-        warn(_no_gait(known, found, kind, duration_s))
+        warn(Lacking(_no_gait(known, found, kind, duration_s)))
         return None
     if not commands:
         return _responses_only(responses, found.rhythms[0])
@@ -294,7 +295,8 @@ def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], w
     for joints, why in reasons:
         if joints:
             count = f"{len(joints)} joints are" if len(joints) > 1 else "1 joint is"
-            warn(f"{count} {why}, gain and lag are null: {', '.join(joints)}")
+            told = f"{count} {why}, gain and lag are null: {', '.join(joints)}"
+            warn(Note(told) if joints is held else told)
 
 
 def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, warn: Warn) -> None:

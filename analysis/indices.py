@@ -12,6 +12,7 @@ from .fitting import GaitFit
 from .heterogeneity import ENDS, KINDS, MIDDLE, energy_indices, index, response_indices
 from .joints import Energies
 from .reading import Warn, by_plane
+from .remarks import Note
 from .results.analysis import Index, JointResult
 
 
@@ -38,7 +39,7 @@ def heterogeneity_indices(
     """
     unknown = {name: index(name) for name in KINDS}
     if gait is None or all(group.response is None for group in gait.groups):
-        warn("no joint's gain and lag are known: the heterogeneity indices are null")
+        warn(Note("no joint's gain and lag are known: the heterogeneity indices are null"))
         return unknown
     known = {joint.name for joint in joints if joint.lag_rad.value is not None}
     old = {joint.name for joint in joints if joint.name in known and "stale" in joint.flags}
@@ -62,8 +63,10 @@ def heterogeneity_indices(
         suffix += f"_group{k}" if several else ""
         result |= {f"{name}{suffix}": one for name, one in found.items()}
     warn(
-        "boundary or module: not separable from a wave in one direction (module_share is null); "
-        "record the reverse"
+        Note(
+            "boundary or module: not separable from a wave in one direction (module_share is "
+            "null); record the reverse"
+        )
     )
     return result
 
@@ -73,13 +76,19 @@ def _of_plane(
 ) -> dict[str, Index]:
     """Indices of gain and lag of one plane; its contrasts need every joint of it."""
     if gait.response is None or len(sound) < 2:
-        warn(f"fewer than two {plane} joints have a response: its heterogeneity indices are null")
+        warn(
+            Note(
+                f"fewer than two {plane} joints have a response: its heterogeneity indices are null"
+            )
+        )
         return {}
     found = response_indices(gait.response.select([gait.answered.index(name) for name in sound]))
     if len(names) < MIDDLE + ENDS:
         warn(
-            f"{len(names)} driven {plane} joints are too few for a contrast of the ends with the "
-            f"middle {MIDDLE}: the boundary contrasts are null"
+            Note(
+                f"{len(names)} driven {plane} joints are too few for a contrast of the ends with "
+                f"the middle {MIDDLE}: the boundary contrasts are null"
+            )
         )
     elif len(sound) < len(names):
         warn(

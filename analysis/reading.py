@@ -14,6 +14,7 @@ from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
 
 from .body.null import DRAG_RATIO
+from .remarks import Lacking, Note
 
 COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"
@@ -145,11 +146,12 @@ def read_columns(
             option = "--command-topic" if key == "command" else "--response-topic"
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
-            warn(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}")
+            told = f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"
+            warn(Lacking(told))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
-        warn(f"{response_topic} carries no {lacking}: mechanical energies are null")
+        warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
     _check_voltage(session, found, warn)
     names = session.robot.joint_names if session.robot is not None else ()
     seen = dict.fromkeys(names)
@@ -266,11 +268,13 @@ def _check_voltage(session: Session, found: dict[str, JointSignals], warn: Warn)
     accumulated = PowerTopic.ELECTRICAL in found and PowerTopic.ELECTRICAL_PLUS in found
     if lacking:
         if not accumulated:
-            warn(f"no {' and no '.join(lacking)}: electrical energies are null")
+            warn(Note(f"no {' and no '.join(lacking)}: electrical energies are null"))
         found.pop("current", None)
         return
     if not accumulated and "scenario" not in session.metadata.get("undulog", {}):
         warn(
-            f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, E_el is "
-            "too large"
+            Note(
+                f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, "
+                "E_el is too large"
+            )
         )

@@ -15,6 +15,7 @@ from ..estimators.series import Series
 from ..fitting import GaitFit
 from ..joints import Span
 from ..reading import Warn, by_plane, drag_ratio
+from ..remarks import Note
 from ..results.analysis import BodyResult
 from .places import observed, perfect_tracking, track
 
@@ -64,7 +65,7 @@ def body_motion(
             ),
         )
     except (DataError, LogError) as error:
-        warn(f"no body motion (head, middle, tail): {error}")
+        warn(Note(f"no body motion (head, middle, tail): {error}"))
         return None
     bent = [
         name
@@ -72,7 +73,8 @@ def body_motion(
         if name not in fitted.driven and abs(float(responses[name].values.mean())) > _BENT_RAD
     ]
     if bent:
-        warn(f"{', '.join(bent)} are bent though not driven: the body's null takes them straight")
+        told = f"{', '.join(bent)} are bent though not driven: the body's null takes them straight"
+        warn(Note(told))
     return result
 
 

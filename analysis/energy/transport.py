@@ -14,6 +14,7 @@ from ..compare.motion import GRAVITY, body_steps
 from ..estimators.series import Series
 from ..joints import Energies, Span
 from ..reading import Warn
+from ..remarks import Note
 from ..response import around, t_factor
 from ..results.analysis import Estimate
 from ..results.energy import Transport
@@ -56,7 +57,7 @@ def transport(
         reasons += _goes_nowhere(steps.forward_m, distance, session.robot)
     if steps is None or reasons:
         why = "; ".join(reasons)
-        warn(f"cost of transport is not applicable: {why}")
+        warn(Note(f"cost of transport is not applicable: {why}"))
         return Transport(distance, mass, *[nothing] * 5, why=why)
     weighed = steps.mass_kg * GRAVITY * steps.forward_m
     kinds = {
@@ -74,7 +75,7 @@ def transport(
             value = _ratio(sums[name], weighed) if name in sums else nothing
             cost[f"{kind} {name}"] = value
     if lacking:
-        warn(f"cost of transport is partly null: {' and '.join(lacking)}")
+        warn(Note(f"cost of transport is partly null: {' and '.join(lacking)}"))
     return Transport(
         distance,
         mass,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,15 +64,16 @@ def render_experiment(
     prose.print()
     put(prose, wide, _run_table(experiment), [("wave",), ("Hz",)])
     prose.print()
-    for warning in experiment.warnings:
+    own = [f"{warning} ({names})" for warning, names in by_warning(experiment)]
+    for warning in (*experiment.warnings, *own):
         prose.print(f"Warning: {warning}", markup=False)
-    for warning, names in by_warning(experiment):
-        prose.print(f"Warning: {warning} ({names})", markup=False)
     coupling = experiment.coupling
     if not coupling.identifiable:
         record = f" To identify it, record {coupling.record}." if coupling.record else ""
         prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
     prose.print(f"Method: {method(experiment)}", style="dim", markup=False)
+    for note, names in by_note(experiment):
+        prose.print(f"Note: {note} ({names})", style="dim", markup=False)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
 
 
@@ -151,7 +152,7 @@ def _run_table(experiment: Experiment) -> Table:
 
 
 def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
-    """The sessions' own warnings, each once; what the experiment itself answers is left out.
+    """Return the sessions' own warnings, each once, without what the experiment itself answers.
 
     Args:
         experiment: The result.
@@ -159,18 +160,36 @@ def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
     Returns:
         Warning, and the names of the files that have it, or ``all sessions``.
     """
+    return _by_sentence(experiment, [one.warnings for one in experiment.sessions])
+
+
+def by_note(experiment: Experiment) -> list[tuple[str, str]]:
+    """Return the sessions' own notes, each once, without what the experiment itself answers.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Note, and the names of the files that have it, or ``all sessions``.
+    """
+    return _by_sentence(experiment, [one.notes for one in experiment.sessions])
+
+
+def _by_sentence(
+    experiment: Experiment, sentences: Sequence[Sequence[str]]
+) -> list[tuple[str, str]]:
     expected = ["boundary or module:"]
     if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
         expected += _MANY_TONES
-    said: dict[str, list[str]] = {}
-    for session in experiment.sessions:
-        for warning in session.warnings:
-            if not warning.startswith(tuple(expected)):
-                said.setdefault(warning, []).append(Path(session.session.path).name)
+    files: dict[str, list[str]] = {}
+    for session, own in zip(experiment.sessions, sentences, strict=True):
+        for sentence in own:
+            if not sentence.startswith(tuple(expected)):
+                files.setdefault(sentence, []).append(Path(session.session.path).name)
     everyone = len(experiment.sessions)
     return [
-        (warning, "all sessions" if len(names) == everyone else ", ".join(names))
-        for warning, names in said.items()
+        (sentence, "all sessions" if len(names) == everyone else ", ".join(names))
+        for sentence, names in files.items()
     ]
 
 

@@ -146,10 +146,12 @@ def html_of(result: Any) -> str:
     shown = clean.to_html(float_format="{:.4g}".format, index=False, na_rep="–")
     left = len(frame) - MOST_ROWS
     more = f", {left} more rows in frames()[{name!r}]" if left > 0 else ""
-    warnings = "".join(
-        f"<li>{escape(formats.plain(text))}</li>" for text in getattr(result, "warnings", ())
-    )
-    said = f"<details><summary>warnings</summary><ul>{warnings}</ul></details>" if warnings else ""
+    said = ""
+    for kind in ("warnings", "notes"):
+        items = "".join(
+            f"<li>{escape(formats.plain(text))}</li>" for text in getattr(result, kind, ())
+        )
+        said += f"<details><summary>{kind}</summary><ul>{items}</ul></details>" if items else ""
     return f"<p><strong>{told}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{said}"
 
 

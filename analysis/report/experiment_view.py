@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from ..experiment.table import by_warning, method, reversal_detail
+from ..experiment.table import by_note, by_warning, method, reversal_detail
 from ..kicks.answer import kick_checks
 from ..results.analysis import (
     Analysis,
@@ -70,6 +70,7 @@ class ExperimentView:
         trials: Tests with their verdicts.
         indices: Whether any heterogeneity index has a value.
         shared: Warnings of single sessions, alike ones once, with the files that have them.
+        notes: Notes of single sessions, likewise.
         flagged: Flag of a joint, with the files that have it.
         names: Joints that any run has a gain of.
         tables: Gain and lag of them in every run.
@@ -93,6 +94,7 @@ class ExperimentView:
     trials: tuple[Trial, ...]
     indices: bool
     shared: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...]
     flagged: tuple[tuple[str, str], ...]
     names: tuple[str, ...]
     tables: tuple[RunsTable, ...]
@@ -135,6 +137,7 @@ def experiment_view(experiment: Experiment) -> ExperimentView:
         + (tuple(sweep_trials(coupling)) if isinstance(coupling, LinearCoupling) else ()),
         indices=any(one.value is not None for one in experiment.heterogeneity.values()),
         shared=tuple(_alike(by_warning(experiment))),
+        notes=tuple(f"{note} ({files})" for note, files in _alike(by_note(experiment))),
         flagged=tuple(_flagged(experiment)),
         names=names,
         tables=_tables(experiment, names),

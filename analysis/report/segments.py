@@ -159,7 +159,7 @@ def _energies(
     if drawn:
         axes.axhline(0.0, color=MUTED, linewidth=0.6, zorder=1)
     else:
-        _empty(axes, "no energy: see the warnings")
+        _empty(axes, "no energy: see the notes")
 
 
 def _tooltip(joint: JointResult, values: str) -> str:

@@ -140,7 +140,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
     if joints:
         least = min(joints, key=lambda j: j.coverage)
         where = formats.plain(least.name) if least.coverage < 0.9995 else "every joint"
-        facts.append(Fact("Lowest coverage", _percent(least.coverage), where))
+        facts.append(Fact("Lowest coverage", formats.coverage(least.coverage), where))
     points = analysis.body.observed if analysis.body is not None else ()
     sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
     facts.append(
@@ -161,10 +161,6 @@ def _range(name: str, values: Sequence[tuple[float, str]], decimals: int, unit: 
         return Fact(name, formats.number(low, decimals) + unit, formats.plain(first))
     text = f"{formats.number(low, decimals)}{unit} to {formats.number(high, decimals)}{unit}"
     return Fact(name, text, formats.plain(f"{first}, {last}"))
-
-
-def _percent(fraction: float) -> str:
-    return f"{formats.number(100.0 * fraction, 1)} %"
 
 
 def _analysed(analysis: Analysis) -> str:

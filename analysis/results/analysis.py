@@ -1,7 +1,8 @@
 """What an analysis says: frozen values at the border between estimators and readers of results.
 
 ``Analysis.to_dict`` is the object that ``undulog analyse --json`` prints and that a result file
-holds. A value that could not be computed is None (null), and ``Analysis.warnings`` says why.
+holds. A value that could not be computed is None (null), and ``Analysis.warnings`` or
+``Analysis.notes`` says why.
 Angles are in rad, energies in J over the analysed windows, times in s from the session's start.
 """
 
@@ -267,17 +268,19 @@ class Analysis(Shown):
         session: Which session.
         gait: The rhythm.
         joints: In chain order, head to tail.
-        body: Head, middle and tail; None with a warning where it can't be told.
+        body: Head, middle and tail; None with a note where it can't be told.
         heterogeneity: Index name to index.
         coupling: Identifiable or not.
-        warnings: One sentence each: what is missing or doubtful and why.
+        warnings: One sentence each, worst first: what is missing or doubtful, and changes what a
+            reader does.
         provenance: How it was made.
         artefacts: What is wrong with samples or at a limit, anywhere in the session, and when.
-        over_time: Gain and lag cycle by cycle, by the logged phase; None with a warning.
+        over_time: Gain and lag cycle by cycle, by the logged phase; None with a note.
         energy: Energies cycle by cycle, cost of transport, closure.
         oscillators: Couplings of the oscillators that drove it, one a plane; none where no
             oscillator's phase was logged.
         answer: Which joints do not follow or stand out, and the shape of the rest, in words.
+        notes: One sentence each: what was not recorded, does not apply or was assumed.
     """
 
     session: SessionFacts
@@ -293,6 +296,7 @@ class Analysis(Shown):
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
     answer: Answer = field(default_factory=Answer)
+    notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -328,6 +332,7 @@ class Analysis(Shown):
             "oscillators": [dataclasses.asdict(one) for one in self.oscillators],
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
             "provenance": dataclasses.asdict(self.provenance),
         }
 

@@ -18,6 +18,12 @@ MISSING = "\N{EN DASH}"
 
 MINUS = "\N{MINUS SIGN}"
 
+LEVEL = 0.05
+"""Below it a p-value decides; what is printed stays on the side where the p-value is."""
+
+_MORE_DIGITS = 6
+"""Digits that a sentence may add so that what decides is seen."""
+
 
 def number(value: float | None, decimals: int) -> str:
     """A number with fixed decimals, or an en dash.
@@ -62,11 +68,14 @@ def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
         most: Digits after the point at most; as many as the interval deserves.
 
     Returns:
-        For example ``6.2° [5.9, 6.5]``; an en dash where the value is missing.
+        For example ``6.2° [5.9, 6.5]``; an en dash where the value is missing. An interval that
+        excludes zero is never printed with an end at zero: it has as many digits as that takes.
     """
     if quantity.value is None:
         return MISSING
     digits = decimals_for([quantity], most=most)
+    if quantity.ci95 is not None:
+        digits = _beside_zero(quantity.ci95, digits)
     text = number(quantity.value, digits) + unit
     return text if quantity.ci95 is None else f"{text} {interval(quantity.ci95, digits)}"
 
@@ -89,6 +98,16 @@ def gait_frequency(gait: GaitFacts) -> str:
         for group in gait.groups
     ]
     return f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def _beside_zero(ci95: Interval, digits: int) -> int:
+    """Digits that show that an interval excludes zero; those given where it doesn't."""
+    low, high = ci95
+    end = min(abs(low), abs(high))
+    if not (low * high > 0 and math.isfinite(end)):
+        return digits
+    needed = math.floor(-math.log10(2 * end)) + 1  # beyond half a unit of the last digit
+    return max(digits, min(needed, digits + _MORE_DIGITS))
 
 
 def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) -> int:
@@ -180,6 +199,21 @@ def percent(share: Estimate) -> str:
     return estimate(scaled(share, 100.0), " %", most=1)
 
 
+def coverage(share: float) -> str:
+    """Return a covered share of time, rounded down: only what is whole is ``100 %``.
+
+    Args:
+        share: 0 to 1.
+
+    Returns:
+        For example ``98 %`` or ``99.9 %``.
+    """
+    percents = 100.0 * share
+    if percents > 99.0:
+        return f"{math.floor(10 * percents + 1e-6) / 10:g} %"
+    return f"{math.floor(percents + 1e-6):d} %"
+
+
 def relative(log_gain: Estimate) -> Estimate:
     """A ratio of gains, less one, in percent.
 
@@ -197,17 +231,23 @@ def relative(log_gain: Estimate) -> Estimate:
 
 
 def p_value(p: float | None) -> str:
-    """A p-value: three decimals, never a bare zero.
+    """Return a p-value: three decimals, never a bare zero, on its own side of 5 %.
 
     Args:
         p: 0 to 1, or None.
 
     Returns:
-        For example ``0.013`` or ``< 0.001``.
+        For example ``0.013`` or ``< 0.001``; more decimals where three would move it to the other
+        side of :data:`LEVEL`, e.g. ``0.0498``.
     """
     if p is None or not math.isfinite(p):
         return MISSING
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+    if p < 0.001:
+        return "< 0.001"
+    digits = 3
+    while (round(p, digits) < LEVEL) != (p < LEVEL):
+        digits += 1
+    return f"{p:.{digits}f}"
 
 
 def told_p(p: float | None) -> str:

@@ -132,6 +132,8 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     for warning in analysis.warnings:
         prose.print(f"Warning: {warning}", markup=False)
     prose.print(_method(analysis), style="dim", markup=False)
+    for note in analysis.notes:
+        prose.print(f"Note: {note}", style="dim", markup=False)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
 
 
@@ -176,7 +178,7 @@ def _joint_table(analysis: Analysis) -> Table:
             _estimate(joint.gain, gain_digits),
             _estimate(joint.lag_rad, lag_digits, math.degrees(1)),
             *(formats.number(values[k], energy_digits[name]) for name, values in shown),
-            f"{100 * joint.coverage:.0f} %",
+            formats.coverage(joint.coverage),
             " ".join(joint.flags),
         )
     return table

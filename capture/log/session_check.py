@@ -12,15 +12,18 @@ from typing import Any, cast
 import numpy as np
 
 from ..errors import DataError, LogError, RobotFileError
+from ..following.session import faults_in_session
 from ..robot import Robot
 from ..robot.description import robot_in_session
 from .chunk import Block
 from .container_check import Container, check_chunk, check_container
-from .health import judge_file
+from .health import judge_file, judge_following
+from .joined import Finding
 from .mcap_file import McapFile
 from .measures import FileHealth
 from .message_heads import read_heads
 from .part_files import check_chain
+from .session import Session
 from .session_scan import SessionMeasures, SessionScan
 from .storage import LogFile
 from .topics import Topics
@@ -84,7 +87,8 @@ class _Check:
     def run(self, on_part: Callable[[float], None]) -> SessionHealth:
         """Read, then judge."""
         file = self._against_summary(self._read(on_part))
-        found = self._scan.result(*self._file.limits, judge_file(file))
+        before = [*judge_file(file), *self._judge_following(file)]
+        found = self._scan.result(*self._file.limits, before)
         stored = self._file.metadata.get("undulog.health", {})
         return SessionHealth(
             **{each.name: getattr(found, each.name) for each in fields(found)},
@@ -95,6 +99,13 @@ class _Check:
             stored_reasons=_reasons(stored.get("reasons", "[]")),
             file=file,
         )
+
+    def _judge_following(self, file: FileHealth) -> list[Finding]:
+        """Joints that do not follow their command; none of a file with damage."""
+        if file.damage:
+            return []
+        with Session(self._file.path) as session:
+            return [judge_following(fault) for fault in faults_in_session(session)]
 
     # -- reading ---------------------------------------------------------------------------
 

@@ -71,7 +71,7 @@ def test_naming_the_topics_is_enough(bag, capsys):
     assert result["energy"]["electrical"] is None
     assert result["energy"]["closure"] is None
     assert result["energy"]["transport"]["abs"] is None
-    said = " ".join(result["warnings"])
+    said = " ".join(result["notes"])
     assert "/snake/encoders carries no effort and velocity: mechanical energies are null" in said
     assert "no /joint_current and no /joint_voltage: electrical energies are null" in said
     assert "cost of transport is not applicable: " in said

@@ -125,7 +125,7 @@ def test_energies_of_sinusoidal_torque_and_velocity(bag, epoch_ns):
         assert joint.energy_abs_j == pytest.approx(a, rel=1e-4)
         assert joint.energy_plus_j == pytest.approx((a + n) / 2, rel=1e-4)
         assert joint.energy_el_j is None
-    assert any("electrical energies are null" in text for text in result.warnings)
+    assert any("electrical energies are null" in text for text in result.notes)
 
 
 def test_a_ramp_has_no_gait(bag, epoch_ns):
@@ -209,7 +209,7 @@ def test_joints_that_are_held_have_no_gain_and_are_named_once(bag, wave):
     result = analysed(one.path)
     assert [joint.gain.value is None for joint in result.joints] == [False, True] * 3
     assert all(joint.command_amplitude_rad == 0.0 for joint in result.joints[1::2])
-    named = [text for text in result.warnings if "joint02" in text]
+    named = [text for text in (*result.warnings, *result.notes) if "joint02" in text]
     assert len(named) == 1
     assert "3 joints are held still" in named[0]
     np.testing.assert_allclose(gains(result)[::2].astype(float), truth.gain[::2], atol=1e-7)

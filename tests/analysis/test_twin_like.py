@@ -161,7 +161,7 @@ def test_perfect_joints_show_no_heterogeneity(twin):
     assert indices["lag_sd"].value < 1e-4
     assert indices["equivalence_gain"].p < 1e-6
     assert indices["module_share"].value is None
-    assert any("record the reverse" in text for text in result.warnings)
+    assert any("record the reverse" in text for text in result.notes)
     assert result.coupling.identifiable is False
 
 
@@ -178,7 +178,7 @@ def test_weaker_middle_joints_show(tmp_path):
     assert result.heterogeneity["common_response"].p < 1e-6
     assert len(robot.joints) == len(result.joints)
     assert result.body is None
-    assert any("no head pose on /odom" in text for text in result.warnings)
+    assert any("no head pose on /odom" in text for text in result.notes)
 
 
 def test_the_twins_own_ledger_is_the_judge(tmp_path):
@@ -233,7 +233,7 @@ def test_two_driven_planes(tmp_path):
     assert {"gain_cv_horizontal", "gain_cv_vertical"} <= set(result.heterogeneity)
     assert set(result.gait.lag_per_joint_rad) == {"horizontal", "vertical"}
     assert result.body is None
-    assert any("both planes are driven" in text for text in result.warnings)
+    assert any("both planes are driven" in text for text in result.notes)
 
 
 def test_the_json_object(twin, capsys):

@@ -236,8 +236,9 @@ def test_the_first_line_is_the_answer(weak, alike, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "12 sessions: the modules differ: joint07 is weak (p = 0.002)."
     assert any("blind to what is alike at both joints of a mirror pair" in line for line in lines)
-    assert lines[-1].startswith("Method: reversal, 6 + 6 runs")
-    assert "all 924" in lines[-1]
+    method = next(line for line in lines if line.startswith("Method: reversal, 6 + 6 runs"))
+    assert "all 924" in method
+    assert all(line.startswith("Note: ") for line in lines[lines.index(method) + 1 :])
     text = render_experiment(experiment(alike[::2]), width=80)
     assert text.startswith(
         "6 sessions: boundary or module is open: one direction only; record the reverse.\n"

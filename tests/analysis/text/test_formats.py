@@ -41,6 +41,32 @@ def test_an_estimate_prints_value_unit_and_interval():
     assert formats.estimate(Estimate(), "°") == "–"
 
 
+@given(st.floats(0.001, 1.0))
+def test_a_printed_p_value_decides_as_the_p_value_does(p):
+    assert (float(formats.p_value(p)) < formats.LEVEL) == (p < formats.LEVEL)
+
+
+@given(st.floats(1e-4, 10.0), st.floats(1.1, 1e3), st.booleans())
+def test_an_interval_that_excludes_zero_is_printed_so(end, ratio, negative):
+    low, high = (-ratio * end, -end) if negative else (end, ratio * end)
+    text = formats.estimate(Estimate((low + high) / 2, (low, high)), most=1)
+    ends = text.replace(formats.MINUS, "-").partition("[")[2].rstrip("]").split(", ")
+    assert all(float(one) != 0 for one in ends)
+
+
+def test_an_interval_that_holds_zero_keeps_its_digits():
+    assert formats.estimate(Estimate(1.0, (-0.01, 2.0)), most=1) == "1.0 [0.0, 2.0]"
+    assert formats.estimate(Estimate(1.0, (0.01, 2.0)), most=1) == "1.00 [0.01, 2.00]"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(1.0, "100 %"), (0.9996, "99.9 %"), (0.98999, "98 %"), (0.5, "50 %"), (0.0, "0 %")],
+)
+def test_only_what_is_whole_is_covered_whole(share, text):
+    assert formats.coverage(share) == text
+
+
 def test_degrees_turn_value_and_interval():
     turned = formats.degrees(Estimate(0.1, (-0.1, 0.2)))
     assert turned.value == pytest.approx(5.729577951308232)
@@ -48,7 +74,17 @@ def test_degrees_turn_value_and_interval():
 
 
 @pytest.mark.parametrize(
-    ("p", "text"), [(None, "–"), (0.04951, "0.050"), (1e-9, "< 0.001"), (1.0, "1.000")]
+    ("p", "text"),
+    [
+        (None, "–"),
+        (0.0491, "0.049"),
+        (0.04951, "0.0495"),  # decides, and 0.050 doesn't
+        (0.049996, "0.049996"),
+        (0.05, "0.050"),
+        (0.0503, "0.050"),
+        (1e-9, "< 0.001"),
+        (1.0, "1.000"),
+    ],
 )
 def test_p_value(p, text):
     assert formats.p_value(p) == text

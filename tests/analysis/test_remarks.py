@@ -1,0 +1,74 @@
+"""Warnings are what changes what a reader does, worst first; facts are notes."""
+
+import json
+
+import numpy as np
+import pytest
+
+import undulog
+from analysis import analyse_session
+from analysis.remarks import Lacking, Note, Remarks
+from capture import Session, SessionWriter
+
+NAMES = tuple(f"j{k}" for k in range(8))
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def write(path, *, moving=True, extra=()):
+    """20 s of eight joints that follow 0.5 Hz: positions only, and topics of ``extra``."""
+    noise = np.random.default_rng(1).normal(0, 1e-3, (2000, len(NAMES)))
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad")
+        more = [writer.joint_state(topic, NAMES, unit=unit) for topic, unit in extra]
+        for k in range(2000):
+            t_ns, phase = EPOCH_NS + k * 10_000_000, np.pi * 0.01 * k - np.arange(len(NAMES))
+            commands.write(t_ns, 0.4 * np.sin(phase) if moving else np.zeros(len(NAMES)))
+            states.write(t_ns, 0.38 * np.sin(phase - 0.1) + noise[k])
+            for channel in more:
+                channel.write(t_ns, np.full(len(NAMES), 1.0) + 0.1 * np.sin(phase))
+    return path
+
+
+def test_worst_first_and_each_once():
+    remarks = Remarks()
+    for one in ("late", Note("no topic"), Lacking("no gait"), "late", Note("no topic")):
+        remarks(one)
+    assert remarks.warnings(["cut short"]) == ("no gait", "cut short", "late")
+    assert remarks.notes == ("no topic",)
+    assert json.dumps([*remarks.warnings(), *remarks.notes]) == '["no gait", "late", "no topic"]'
+    assert {type(one) for one in (*remarks.warnings(), *remarks.notes)} == {str}
+
+
+def test_topics_that_were_not_recorded_are_no_warnings(tmp_path):
+    with Session.open(write(tmp_path / "s.mcap")) as session:
+        found = analyse_session(session)
+    assert found.warnings == ()
+    for lacking in ("effort and velocity", "/joint_current and no /joint_voltage", "/gait"):
+        assert any(lacking in note for note in found.notes), lacking
+    told = found.to_dict()
+    assert (told["warnings"], told["notes"]) == ([], list(found.notes))
+
+
+@pytest.mark.parametrize("kind", ["text", "page"])
+def test_notes_stand_after_the_method_or_under_details(kind, tmp_path, capsys):
+    path = write(tmp_path / "s.mcap")
+    if kind == "text":
+        assert undulog.run(["analyse", str(path)]) == 0
+        text = capsys.readouterr().out
+        assert "Warning:" not in text
+        assert text.index("Method:") < text.index("Note: no /joint_current and no /joint_voltage")
+        return
+    assert undulog.run(["report", str(path), "-o", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert '<div class="notice">' not in page
+    assert "<p>No warnings.</p>" in page
+    details = page[page.index("notes: what was not recorded") :]
+    assert "/joint_current" in details[: details.index("</details>")]
+
+
+def test_that_there_is_no_gait_comes_first(tmp_path):
+    with Session.open(write(tmp_path / "s.mcap", moving=False)) as session:
+        found = analyse_session(session)
+    assert found.warnings[0].startswith("no gait: the commands never move")
+    assert any(note.startswith("no joint's gain and lag are known") for note in found.notes)
