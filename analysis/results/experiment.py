@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from ..notebook.shown import Shown
@@ -69,16 +70,21 @@ class MirrorJoint:
 
 
 @dataclass(frozen=True)
-class WeakModule:
+class OrderedPair:
     """A joint that answers less or later than its mirror joint, whichever way the wave runs.
 
+    Either this joint is weaker or its mirror joint stronger: the contrast is the same.
+
     Attributes:
-        name: The joint.
+        name: The joint that answers less.
         mirror: Its mirror joint.
-        by: ``gain`` or ``lag``: which of them says so more clearly.
+        by: ``gain`` or ``lag``: which of them shows it more clearly.
         log_gain_contrast: ln gain of the joint minus that of its mirror joint, mean of both ways.
         lag_contrast_rad: The same of the lag [rad].
-        p: Family-wise, of the pair.
+        p: Family-wise over all pairs, gain and lag.
+        module: The single module that differs, ``name`` or ``mirror``; None where no further
+            evidence decides between them.
+        evidence: That evidence, one clause; empty without.
     """
 
     name: str
@@ -87,6 +93,41 @@ class WeakModule:
     log_gain_contrast: Estimate
     lag_contrast_rad: Estimate
     p: float
+    module: str | None = None
+    evidence: str = ""
+
+
+class Headings(StrEnum):
+    """What the robot's headings in the runs allow."""
+
+    BALANCED = "balanced"
+    """Each wave has its mirror image: the reverse, the robot turned by half a turn."""
+    UNBALANCED = "unbalanced"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class FloorTilt:
+    """Whether a tilted floor can make the differences of a reversal.
+
+    Attributes:
+        headings: Of the robot in the runs; balanced ones cancel a tilt by design.
+        strata: Sets of runs that are mirror images of each other.
+        ratio: Root mean square of what both joints of a pair do otherwise the other way, over that
+            of their contrast: above 1 for a tilt, below for one module.
+        middle: Largest size of the middle joint's difference over the least size of the largest
+            contrast (95 %): below 1 for one module; None for an even number of joints.
+        gravity_rad: Lean along the body by recorded gravity [rad], downhill towards the head
+            positive; empty without.
+        excluded: Whether headings or checks exclude a tilt as the cause.
+    """
+
+    headings: Headings
+    strata: int
+    ratio: Estimate
+    middle: float | None
+    gravity_rad: Estimate
+    excluded: bool
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,8 +143,8 @@ class Reversal(Shown):
         labellings: Ways to deal out the labels.
         labellings_tried: All of them, or a random subset.
         joints: In chain order, head to tail.
-        weak: The largest contrast first; empty where none is shown. Those after the first may be
-            what it does to its neighbours.
+        pairs: The largest contrast first; empty where none is shown. Those after the first may be
+            what a module does to its neighbours.
         gain_bound: No joint's gain differs from its mirror's by a larger share (95 %).
         lag_bound_rad: No joint's lag differs from its mirror's by more (95 %) [rad].
         equivalence_gain_p: Of 'some pair differs by 2 % or more'.
@@ -113,6 +154,8 @@ class Reversal(Shown):
         noise_variance: Of a mean profile.
         module_share: V_module / (V_module + V_boundary).
         boundary_share: The rest.
+        tilt: Whether a tilted floor can make the differences.
+        middle: The middle joint of an odd number, which is its own mirror joint.
         blind: What the test can't see.
     """
 
@@ -124,7 +167,7 @@ class Reversal(Shown):
     labellings: int
     labellings_tried: int
     joints: tuple[MirrorJoint, ...]
-    weak: tuple[WeakModule, ...]
+    pairs: tuple[OrderedPair, ...]
     gain_bound: float
     lag_bound_rad: float
     equivalence_gain_p: float
@@ -134,6 +177,8 @@ class Reversal(Shown):
     noise_variance: float
     module_share: Estimate
     boundary_share: Estimate
+    tilt: FloorTilt
+    middle: str | None = None
     blind: str = BLIND
 
 
