@@ -13,14 +13,17 @@ from enum import StrEnum
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from capture.arrays import ComplexArray
 from capture.robot import Robot
 
 from ..fitting import GaitFit
 from ..gait import phase_step, wave_name
 from ..reading import by_plane
+from ..response import Response
 from ..results.analysis import Analysis
+from ..reversal.posture import UNKNOWN_POSTURE, Posture
 from ..text import formats
+from .pooling import log_response
 
 SAME_COMMAND = 0.01
 """Largest deviation of a command, over its amplitude, that is the same gait still."""
@@ -49,7 +52,8 @@ class GaitRun:
         frequency_hz: Of the gait.
         command: Complex amplitudes of the commands [rad], shape (m,).
         wave: Which way the wave runs.
-        ratio: Response over command, NaN where it isn't known, shape (m,).
+        response: Response of the joints to their commands, NaN where it isn't known, m joints.
+        posture: How the robot lay.
     """
 
     label: str
@@ -60,10 +64,22 @@ class GaitRun:
     frequency_hz: float
     command: ComplexArray
     wave: str | None
-    ratio: ComplexArray
+    response: Response
+    posture: Posture
+
+    @property
+    def ratio(self) -> ComplexArray:
+        """Response over command, NaN where it isn't known, shape (m,)."""
+        return self.response.ratio
 
 
-def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit | None) -> GaitRun:
+def gait_run(
+    label: str,
+    robot: Robot | None,
+    analysis: Analysis,
+    gait: GaitFit | None,
+    posture: Posture = UNKNOWN_POSTURE,
+) -> GaitRun:
     """What an experiment needs of one session.
 
     Args:
@@ -71,6 +87,7 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
         robot: Its robot, or None.
         analysis: Its numbers.
         gait: Its fitted gait, or None.
+        posture: How the robot lay.
 
     Returns:
         The run.
@@ -78,15 +95,18 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
     name, start_ns = analysis.session.robot, analysis.session.start_ns
     if gait is None or not gait.driven:
         nothing = np.zeros(0, dtype=np.complex128)
-        return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, nothing)
+        return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, _unknown(0), posture)
     count = len(gait.driven)
     command = gait.fit.fundamental[:count]
-    ratio = np.full(count, np.nan, dtype=np.complex128)
+    response = _unknown(count)
     known = {joint.name for joint in analysis.joints if joint.gain.value is not None}
     if gait.response is not None:
-        for joint, one in zip(gait.answered, gait.response.ratio, strict=True):
-            if joint in known:
-                ratio[gait.command_of(joint)] = one
+        own = [k for k, joint in enumerate(gait.answered) if joint in known]
+        at = [gait.command_of(gait.answered[k]) for k in own]
+        response.ratio[at] = gait.response.ratio[own]
+        response.log_gain_variance[at] = gait.response.log_gain_variance[own]
+        response.lag_variance[at] = gait.response.lag_variance[own]
+        response.dof[at] = gait.response.dof[own]
     return GaitRun(
         label=label,
         robot=name,
@@ -96,8 +116,15 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
         frequency_hz=gait.fit.frequency_hz,
         command=command,
         wave=wave_name(phase_step(command)) if count > 1 else None,
-        ratio=ratio,
+        response=response,
+        posture=posture,
     )
+
+
+def _unknown(count: int) -> Response:
+    """The response of joints of which none is known yet."""
+    none = [np.full(count, np.nan) for _ in range(3)]
+    return Response(np.full(count, np.nan, dtype=np.complex128), *none)
 
 
 def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]:
@@ -148,13 +175,8 @@ def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
     ratio = np.stack([run.ratio for run in runs])
     known = np.all(np.isfinite(ratio), axis=0)
     known &= known[::-1]
-    ratio = ratio[:, known]
-    unit: ComplexArray = ratio / np.abs(ratio)
-    turn = np.angle(unit.sum())
-    phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
-    names = tuple(name for name, one in zip(runs[0].names, known, strict=True) if one)
-    y = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
-    return names, y
+    names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
+    return names, log_response(ratio[:, known])
 
 
 def mirror_fault(robot: Robot | None, driven: Sequence[str]) -> str | None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..compare.result import Comparison
 from ..compare.table import render_comparison
+from ..experiment.answer import pair_order
 from ..experiment.table import render_experiment, reversal_detail
 from ..kicks.answer import kick_answer, kick_detail
 from ..results.analysis import Analysis, Coupling

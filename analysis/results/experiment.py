@@ -182,6 +182,34 @@ class Reversal(Shown):
     blind: str = BLIND
 
 
+@dataclass(frozen=True)
+class PooledJoint:
+    """One joint's response over several runs.
+
+    Attributes:
+        name: The joint.
+        gain: Amplitude of the response over that of the command.
+        lag_rad: Positive = late [rad].
+    """
+
+    name: str
+    gain: Estimate
+    lag_rad: Estimate
+
+
+@dataclass(frozen=True)
+class PooledRuns:
+    """Several runs of one direction as one; the scatter from run to run is in the intervals.
+
+    Attributes:
+        runs: How many.
+        joints: In chain order, head to tail.
+    """
+
+    runs: int
+    joints: tuple[PooledJoint, ...]
+
+
 @dataclass(frozen=True, repr=False)
 class Experiment(Shown):
     """All numbers of several sessions.
@@ -199,6 +227,7 @@ class Experiment(Shown):
         provenance: How it was made.
         oscillators: From kicks around one gait: how oscillators that feel their servos would
             synchronise through the body; None without such kicks.
+        pooled: The response over the runs, where all of them are of one direction.
     """
 
     answer: str
@@ -210,6 +239,7 @@ class Experiment(Shown):
     warnings: tuple[str, ...]
     provenance: Provenance
     oscillators: BodyOscillators | None = None
+    pooled: PooledRuns | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -228,6 +258,7 @@ class Experiment(Shown):
                 name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
             },
             "reversal": None if self.reversal is None else dataclasses.asdict(self.reversal),
+            "pooled": None if self.pooled is None else dataclasses.asdict(self.pooled),
             "coupling": dataclasses.asdict(self.coupling),
             "oscillators": None
             if self.oscillators is None

@@ -259,7 +259,7 @@ class Strata:
             Genet. Mol. Biol. 9, 2010).
         """
         observed = np.arange(len(self.index)) < int(self.plus.sum())
-        own = [np.flatnonzero(self.index == s) for s in range(self.strata)]
+        own: list[IntArray] = [np.flatnonzero(self.index == s) for s in range(self.strata)]
         if self.count > MOST_LABELLINGS:
             random = np.random.default_rng(seed)
             drawn = np.zeros((RANDOM_LABELLINGS, len(self.index)), dtype=np.bool_)
@@ -269,7 +269,8 @@ class Strata:
             return np.concatenate([observed[None], drawn])
         labels = np.zeros((1, len(self.index)), dtype=np.bool_)
         for s, (runs, plus) in enumerate(zip(own, self.plus.tolist(), strict=True)):
-            chosen = np.array(list(combinations(runs.tolist(), plus)), dtype=np.int64)
+            members = [int(run) for run in runs]
+            chosen = np.array(list(combinations(members, plus)), dtype=np.int64)
             if s == 0 and self.symmetric:
                 chosen = chosen[: len(chosen) // 2]  # those with the first run in '+'
             part = np.zeros((len(chosen), len(self.index)), dtype=np.bool_)
@@ -292,7 +293,8 @@ class Strata:
             - runs[(self.index == s) & ~plus].mean(axis=0)
             for s in range(self.strata)
         ]
-        return self.weights @ np.stack(each)
+        mean: ComplexArray = (self.weights[:, None] * np.stack(each)).sum(axis=0)
+        return mean
 
     def residuals(self, runs: FloatArray) -> FloatArray:
         """Runs less the mean of their way in their stratum.
@@ -320,14 +322,11 @@ class Strata:
         """
         squares = self.residuals(runs) ** 2
         r1 = int(self.plus.sum())
-        parts_of: list[FloatArray] = []
-        dofs: list[FloatArray] = []
-        for rows, counts in ((squares[:r1], self.plus), (squares[r1:], self.minus)):
-            dof = float(counts.sum() - self.strata)
-            spread = float(np.sum(self.weights**2 / counts))
-            parts_of.append(rows.sum(axis=0) / dof * spread)
-            dofs.append(np.full(runs.shape[1], dof))
-        return np.stack(parts_of), np.stack(dofs)
+        counts = np.stack([self.plus, self.minus])
+        dof = np.sum(counts - 1.0, axis=1)[:, None]
+        spread = np.sum(self.weights**2 / counts, axis=1)[:, None]
+        totals: FloatArray = np.stack([squares[:r1].sum(axis=0), squares[r1:].sum(axis=0)])
+        return totals / dof * spread, np.broadcast_to(dof, totals.shape)
 
 
 def parts(y: ComplexArray) -> FloatArray:

@@ -9,7 +9,8 @@ It differs from one bad module in three ways:
   for one module, at its joint, contrast outweighs what is common.
 - The middle joint of an odd number is its own mirror joint. A module elsewhere changes it little,
   a tilt as much as the others.
-- Recorded gravity leans.
+- Recorded gravity leans: by more than 0.1 degrees, since the motion itself and the sensor's mount
+  make some hundredths. That it doesn't lean excludes nothing: an offset may hide it.
 
 The first two are statements about the size of effects, not theorems: measured on the twin in
 docs/heterogeneity.md. Runs with the robot turned by half a turn (:mod:`analysis.reversal.mirror`)
@@ -18,18 +19,25 @@ need none of them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray, IntArray
 
-from ..response import CONFIDENCE
-from ..results.analysis import Estimate, Interval, leaves_out_zero
+from ..response import CONFIDENCE, around, t_factor
+from ..results.analysis import Estimate, Interval
 from .mirror import MirrorTest
 
 MODULE_RATIO = 1.0
 """Common over contrast below which the pattern is a module's rather than a tilt's."""
+
+LEVEL_RAD = math.radians(0.1)
+"""Lean of recorded gravity that the motion itself may make."""
+
+LEAST_LEANS = 3
+"""Runs with recorded gravity below which its scatter is unknown."""
 
 RESAMPLES = 2_000
 
@@ -66,8 +74,7 @@ def tilt_check(
         reverse: y of the runs the other way, shape (r2, m), joints from head to tail too.
         test: Their reversal test.
         gravity_rad: Lean of recorded gravity along the body with its interval, None or empty where
-            none is recorded. It can only speak for a tilt: a lean of zero may be an offset of the
-            sensor that hides one.
+            none is recorded.
         seed: Of the bootstrap.
 
     Returns:
@@ -80,8 +87,38 @@ def tilt_check(
     if m % 2:
         middle = _middle_share(test)
         excluded &= middle < 1.0
-    excluded &= gravity_rad is None or not leaves_out_zero(gravity_rad.ci95)
+    lean = None if gravity_rad is None else gravity_rad.ci95
+    excluded &= lean is None or (lean[0] < LEVEL_RAD and lean[1] > -LEVEL_RAD)
     return TiltCheck(ratio, middle, excluded)
+
+
+def floor_lean(lean_rad: FloatArray, heading_rad: FloatArray) -> Estimate:
+    """Fall of the floor along the body by recorded gravity.
+
+    Args:
+        lean_rad: Of each run [rad], NaN where none is recorded, shape (r,).
+        heading_rad: Of the robot in each run [rad], NaN where it is unknown, shape (r,).
+
+    Returns:
+        The fall along the first run's heading with its interval over the runs; where the headings
+        differ by half a turn the sensor's own offset is taken out. Empty with fewer than three
+        runs.
+    """
+    known = np.isfinite(lean_rad)
+    lean, heading = lean_rad[known], heading_rad[known]
+    along = np.ones_like(lean)
+    columns = [along]
+    if np.isfinite(heading).all() and heading.size:
+        along = np.cos(heading - heading[0])
+        columns = [along, np.ones_like(lean)] if np.ptp(along) > 1.0 else [along]
+    design = np.stack(columns, axis=1)
+    dof = len(lean) - design.shape[1]
+    if dof < 1 or len(lean) < LEAST_LEANS:
+        return Estimate()
+    value = np.linalg.lstsq(design, lean, rcond=None)[0]
+    variance = np.sum((lean - design @ value) ** 2) / dof
+    error = float(np.sqrt(variance * np.linalg.inv(design.T @ design)[0, 0]))
+    return Estimate(float(value[0]), around(float(value[0]), t_factor(dof) * error))
 
 
 def common_ratio(forward: ComplexArray, reverse: ComplexArray, seed: int = 1) -> Estimate:
