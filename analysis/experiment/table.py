@@ -237,9 +237,10 @@ def _reversal_method(reversal: Reversal | None) -> str:
     return (
         f"reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
         "with the wave from head to tail minus its mirror joint with the wave from tail to head; "
-        f"largest studentised difference T = {formats.number(reversal.statistic, 2)}, its null by "
+        "largest studentised contrast or common part of a pair T = "
+        f"{formats.number(reversal.statistic, 2)}, its null by "
         f"dealing out the runs' labels anew{within} ({tried}; p can't go below "
-        f"{formats.number(reversal.p_floor, 4)}), family-wise over joints, gain and lag; a pair is "
-        "named only where that p is below 5 %, so 5 % is the level of the whole answer; intervals "
-        "hold together at 95 %, those of shares by bootstrap over runs."
+        f"{formats.number(reversal.p_floor, 4)}), family-wise over pairs, gain and lag, so that "
+        "5 % is the level of the whole answer; intervals hold together at 95 %, those of shares by "
+        "bootstrap over runs."
     )

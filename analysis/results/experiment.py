@@ -59,7 +59,7 @@ class MirrorJoint:
         mirror: The joint as far from the tail as this one is from the head.
         log_gain_difference: Of ln gain [1].
         lag_difference_rad: Positive = the joint is later than its mirror joint [rad].
-        p: Family-wise, of gain and lag together.
+        p: Family-wise, of the pair: of its contrast and its common part, gain and lag together.
     """
 
     name: str
@@ -137,7 +137,7 @@ class Reversal(Shown):
     Attributes:
         forward_runs: Independent runs with the wave from head to tail.
         reverse_runs: The same from tail to head.
-        statistic: T, the largest studentised difference of all joints, gain and lag.
+        statistic: T, the largest studentised contrast or common part of all pairs, gain and lag.
         p: Of H1; exact, family-wise.
         p_floor: The smallest p that so many runs can give.
         labellings: Ways to deal out the labels.

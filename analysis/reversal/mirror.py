@@ -5,7 +5,12 @@ Identical modules in a body that is its own mirror image, on level ground whose 
 fore and aft, answer a wave and its reverse with mirrored profiles: y_i(+) = y_{m+1-i}(-), whatever
 the free ends do to them. That is H1, and it needs no model. Of several independent runs each way::
 
-    d_i = mean y_i(+) - mean y_{m+1-i}(-)        T = max over i, gain and lag, of |d_i| / se(d_i)
+    d_i = mean y_i(+) - mean y_{m+1-i}(-)        contrast_i = (d_i - d_{m+1-i}) / 2
+                                                 common_i = (d_i + d_{m+1-i}) / 2
+    T = max over pairs, gain and lag, of |contrast_i| / se and |common_i| / se
+
+The contrast and the common part of a pair hold all of d_i; a module shows in the contrast, where
+both of its joints count, so T finds it more often than the largest d_i does.
 
 On a floor that is tilted the mirror image of a run is the reversed wave of a robot that is turned
 by half a turn: a wave and its reverse are compared within strata of runs that are mirror images of
@@ -60,14 +65,16 @@ class MirrorTest:
         error: Standard errors of its real and imaginary part, shape (2, m).
         dof: Their degrees of freedom, after Welch, shape (2, m).
         score: difference / error, shape (2, m).
-        p_adjusted: Family-wise p of each, after single-step max-T, shape (2, m).
         critical: Factor on ``error`` that makes all 2 m intervals hold together at 95 %.
+        statistic: T.
         contrast: (d_i - d_{m+1-i}) / 2: response of joint i minus that of its mirror joint, mean
             of both ways, complex, shape (m,).
         contrast_error: Standard errors of its parts, shape (2, m).
-        contrast_p: p of each contrast, family-wise over all pairs, gain and lag, shape (2, m).
+        contrast_p: p of each contrast after single-step max-T: family-wise over contrasts and
+            common parts of all pairs, gain and lag, shape (2, m); 1 of the middle joint.
         common: (d_i + d_{m+1-i}) / 2: what both joints of a pair do otherwise the other way, (m,).
         common_error: Standard errors of its parts, shape (2, m).
+        common_p: p of each common part, of the same family, shape (2, m).
         strata: How many sets of runs that are mirror images of each other were compared.
         labellings: How many labellings there are.
         tried: How many were tried; all or a random subset.
@@ -78,32 +85,33 @@ class MirrorTest:
     error: FloatArray
     dof: FloatArray
     score: FloatArray
-    p_adjusted: FloatArray
     critical: float
+    statistic: float
     contrast: ComplexArray
     contrast_error: FloatArray
     contrast_p: FloatArray
     common: ComplexArray
     common_error: FloatArray
+    common_p: FloatArray
     strata: int
     labellings: int
     tried: int
     floor: float
 
     @property
-    def statistic(self) -> float:
-        """T."""
-        return float(np.abs(self.score).max())
-
-    @property
     def p(self) -> float:
         """p-value of H1, identical modules."""
-        return float(self.p_adjusted.min())
+        return float(self.joint_p.min())
 
     @property
     def exact(self) -> bool:
         """Whether all labellings were tried."""
         return self.tried == self.labellings
+
+    @property
+    def joint_p(self) -> FloatArray:
+        """Family-wise p of each pair, of contrast and common part together, shape (m,)."""
+        return np.minimum(self.contrast_p, self.common_p).min(axis=0)
 
     @property
     def pair_p(self) -> FloatArray:
@@ -153,15 +161,17 @@ def mirror_test(
     half = m // 2
     # Contrast and common are taken run by run: both joints of a pair share what a run does to all.
     odd, even = (both - both[:, ::-1]) / 2, (both + both[:, ::-1]) / 2
-    columns = np.concatenate([parts(both), parts(odd[:, :half])], axis=1)
+    columns = np.concatenate([parts(odd[:, :half]), parts(even[:, : m - half])], axis=1)
     labels = design.labellings(seed)
     scores = np.abs(label_scores(columns, labels, design.index))
+    p = family_wise_p(scores)
     noise_only = np.abs(label_scores(design.residuals(parts(both)), labels, design.index))
     shares, dof = design.variances(parts(both))
-    p_contrast = np.ones((2, m))
-    if half:
-        pairs = family_wise_p(scores[..., 2 * m :]).reshape(2, half)
-        p_contrast[:, :half], p_contrast[:, m - half :] = pairs, pairs[:, ::-1]
+    p_contrast, p_common = np.ones((2, m)), np.ones((2, m))
+    p_contrast[:, :half] = p[: 2 * half].reshape(2, half)
+    p_common[:, : m - half] = p[2 * half :].reshape(2, m - half)
+    for of_pair in (p_contrast, p_common):
+        of_pair[:, m - half :] = of_pair[:, :half][:, ::-1]
     difference = design.difference(both)
     total = design.count
     every = total <= MOST_LABELLINGS
@@ -170,13 +180,14 @@ def mirror_test(
         error=frozen(np.sqrt(shares.sum(axis=0)).reshape(2, m)),
         dof=frozen(welch_satterthwaite(shares, dof).reshape(2, m)),
         score=frozen(label_scores(parts(both), labels[:1], design.index)[0].reshape(2, m)),
-        p_adjusted=frozen(family_wise_p(scores[..., : 2 * m]).reshape(2, m)),
         critical=float(np.quantile(noise_only.max(axis=-1), CONFIDENCE, method="higher")),
+        statistic=float(scores[0].max()),
         contrast=frozen((difference - difference[::-1]) / 2),
         contrast_error=frozen(np.sqrt(design.variances(parts(odd))[0].sum(axis=0)).reshape(2, m)),
         contrast_p=frozen(p_contrast),
         common=frozen((difference + difference[::-1]) / 2),
         common_error=frozen(np.sqrt(design.variances(parts(even))[0].sum(axis=0)).reshape(2, m)),
+        common_p=frozen(p_common),
         strata=design.strata,
         labellings=total,
         tried=total if every else len(labels),
@@ -269,7 +280,7 @@ class Strata:
             return np.concatenate([observed[None], drawn])
         labels = np.zeros((1, len(self.index)), dtype=np.bool_)
         for s, (runs, plus) in enumerate(zip(own, self.plus.tolist(), strict=True)):
-            members = [int(run) for run in runs]
+            members: list[int] = list(map(int, runs))
             chosen = np.array(list(combinations(members, plus)), dtype=np.int64)
             if s == 0 and self.symmetric:
                 chosen = chosen[: len(chosen) // 2]  # those with the first run in '+'

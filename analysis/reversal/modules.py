@@ -17,8 +17,8 @@ from .shares import variance_shares
 from .tilt import heading_strata, tilt_check
 
 SIGNIFICANT = 0.05
-"""Family-wise level of the whole result: a pair is named only where H1 is rejected at this level,
-and its contrast is significant at this level, too, over all pairs, gain and lag."""
+"""Family-wise level of the whole result: one family of the contrasts and the common parts of all
+pairs, gain and lag, gives the p of H1 and that of each pair."""
 
 SAME_HEADING_RAD = 0.2
 """Headings that differ by no more are the same [rad]: 2 % of a tilt along the body is left."""
@@ -106,12 +106,9 @@ def ordered_pairs(names: Sequence[str], test: MirrorTest) -> tuple[OrderedPair, 
         test: Of the same joints.
 
     Returns:
-        The largest contrast first: a module changes what its neighbours do, but less. Empty where
-        H1 isn't rejected.
+        The largest contrast first: a module changes what its neighbours do, but less.
     """
     m = len(names)
-    if test.p >= SIGNIFICANT:
-        return ()
     pairs: list[tuple[float, OrderedPair]] = []
     for i in range(m // 2):
         if test.pair_p[i] >= SIGNIFICANT:
@@ -130,7 +127,7 @@ def ordered_pairs(names: Sequence[str], test: MirrorTest) -> tuple[OrderedPair, 
 
 
 def _joints(names: Sequence[str], test: MirrorTest) -> tuple[MirrorJoint, ...]:
-    own = test.p_adjusted.min(axis=0)
+    own = test.joint_p
     result: list[MirrorJoint] = []
     for i, name in enumerate(names):
         gain, lag = _estimates(test.difference[i], test.critical * test.error[:, i])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,9 @@ from .plan_file import is_plan, parse_plan
 
 _EXPLAINS = ("plan.toml", "gait.toml")
 """Attachments of recorded commands that say what they were made from: they go on to the run."""
+
+_HEADING = "heading_rad"
+"""Key of a plan's record: by how much the robot is turned."""
 
 _RECORDS = ("undulog.plan",)
 """Metadata records of recorded commands that say what they are for: likewise."""
@@ -51,6 +55,8 @@ class Driven:
         records: Metadata records that go along, by name.
         kernels: What computed the force laws in the run that it is taken from.
         joints: The joints that recorded commands are for; None where it is no commands.
+        heading_rad: By how much its plan turns the robot against the world's own heading [rad].
+        turned: Whether the world that it was made for has that heading already.
     """
 
     kind: str
@@ -67,6 +73,8 @@ class Driven:
     records: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
     kernels: Kernels = Kernels.NUMPY
     joints: tuple[str, ...] | None = None
+    heading_rad: float = 0.0
+    turned: bool = False
 
     @property
     def session_facts(self) -> Mapping[str, str]:
@@ -104,8 +112,8 @@ class Driven:
             duration_s: Length of the run; its own if None.
 
         Returns:
-            The world, with the length, the settling time that it says, and, if it is a scenario's
-            gait, that gait and controller.
+            The world, with the length, the settling time that it says, the robot turned as its
+            plan says, and, if it is a scenario's gait, that gait and controller.
 
         Raises:
             UsageError: If no world is known, or its robot lacks a plane.
@@ -122,6 +130,8 @@ class Driven:
                     f"{self.name} moves {plane} joints and {where.robot.name} of {where.name} has "
                     "none"
                 )
+        if self.heading_rad and (world is not None or not self.turned):
+            where = dataclasses.replace(where, world=where.world.turned(self.heading_rad))
         if self.own is not None:
             where = dataclasses.replace(where, gait=self.own.gait, controller=self.own.controller)
         if self.settle_s is not None:
@@ -243,7 +253,34 @@ def _commands(
         records={name: told[name] for name in _RECORDS if name in told},
         kernels=_kernels(told.get("undulog", {}).get("kernels")),
         joints=recorded.commands.names,
+        heading_rad=_planned_heading(told.get("undulog.plan", {}), path),
+        turned="driven" in told.get("undulog", {}),
     )
+
+
+def _planned_heading(plan: Mapping[str, str], path: Path) -> float:
+    """By how much a plan turns the robot [rad].
+
+    Args:
+        plan: Its metadata record, empty where there is none.
+        path: Of the session, for messages.
+
+    Returns:
+        0 where it says nothing.
+
+    Raises:
+        DataError: If that is no number.
+    """
+    text = plan.get(_HEADING)
+    if text is None:
+        return 0.0
+    try:
+        heading = float(text)
+    except ValueError:
+        heading = math.nan
+    if not math.isfinite(heading):
+        raise DataError(f"{path}: {_HEADING} of its plan is {text!r}; expected an angle in rad")
+    return heading
 
 
 def _kernels(told: str | None) -> Kernels:
