@@ -60,7 +60,7 @@ def blind_spots(reversal: Reversal) -> str:
     Returns:
         A clause.
     """
-    middle = "" if reversal.middle is None else f" or is in the middle joint {reversal.middle}"
+    middle = "" if reversal.middle is None else f" or of the middle joint, {reversal.middle}"
     return f"blind to what is alike at both joints of a pair{middle}"
 
 

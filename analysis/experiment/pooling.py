@@ -30,7 +30,7 @@ class PooledResponse:
         runs: How many runs, r.
         response: Mean ln H with the variances of the mean; degrees of freedom r - 1, of one run
             its own.
-        each: ln H of each run, imaginary parts within pi of their common mean, shape (r, m).
+        each: ln H of each run, the phases of a joint within pi of their mean, shape (r, m).
         covariance: Of the mean's parts, ln|H| of all joints, then arg H [rad], shape (2 m, 2 m).
     """
 
@@ -65,7 +65,7 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
     ]
     known = np.flatnonzero(np.all(sound, axis=0))
     chosen = [one.select(known.tolist()) for one in runs]
-    each = log_response(np.stack([one.ratio for one in chosen]))
+    each = _log_response(np.stack([one.ratio for one in chosen]))
     mean = each.mean(axis=0)
     count, m = len(runs), len(known)
     within = np.concatenate(
@@ -100,16 +100,8 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
     )
 
 
-def log_response(ratio: ComplexArray) -> ComplexArray:
-    """Return ln H, its imaginary parts within pi of their common mean.
-
-    Args:
-        ratio: H of m joints in r runs, shape (r, m).
-
-    Returns:
-        Shape (r, m).
-    """
-    turn = float(np.angle((ratio / np.abs(ratio)).sum()))
+def _log_response(ratio: ComplexArray) -> ComplexArray:
+    """Ln H of each run, the phases of a joint within pi of their mean, shape (r, m)."""
+    turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
     phase = turn + np.angle(ratio * np.exp(-1j * turn))
-    y: ComplexArray = np.log(np.abs(ratio)) + 1j * phase
-    return y
+    return (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)

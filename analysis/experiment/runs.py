@@ -13,7 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from capture.arrays import ComplexArray
+from capture.arrays import ComplexArray, FloatArray
 from capture.robot import Robot
 
 from ..fitting import GaitFit
@@ -23,7 +23,6 @@ from ..response import Response
 from ..results.analysis import Analysis
 from ..reversal.posture import UNKNOWN_POSTURE, Posture
 from ..text import formats
-from .pooling import log_response
 
 SAME_COMMAND = 0.01
 """Largest deviation of a command, over its amplitude, that is the same gait still."""
@@ -175,8 +174,13 @@ def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
     ratio = np.stack([run.ratio for run in runs])
     known = np.all(np.isfinite(ratio), axis=0)
     known &= known[::-1]
+    ratio = ratio[:, known]
+    unit: ComplexArray = ratio / np.abs(ratio)
+    turn = np.angle(unit.sum())
+    phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
     names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
-    return names, log_response(ratio[:, known])
+    y = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
+    return names, y
 
 
 def mirror_fault(robot: Robot | None, driven: Sequence[str]) -> str | None:

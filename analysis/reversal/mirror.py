@@ -280,8 +280,8 @@ class Strata:
             return np.concatenate([observed[None], drawn])
         labels = np.zeros((1, len(self.index)), dtype=np.bool_)
         for s, (runs, plus) in enumerate(zip(own, self.plus.tolist(), strict=True)):
-            members: list[int] = list(map(int, runs))
-            chosen = np.array(list(combinations(members, plus)), dtype=np.int64)
+            members: list[int] = runs.tolist()
+            chosen: IntArray = np.array(list(combinations(members, int(plus))), dtype=np.int64)
             if s == 0 and self.symmetric:
                 chosen = chosen[: len(chosen) // 2]  # those with the first run in '+'
             part = np.zeros((len(chosen), len(self.index)), dtype=np.bool_)

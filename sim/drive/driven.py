@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from capture import Session
 from capture.errors import DataError, JointSetError, PlanError, UsageError
@@ -27,7 +27,10 @@ _EXPLAINS = ("plan.toml", "gait.toml")
 """Attachments of recorded commands that say what they were made from: they go on to the run."""
 
 _HEADING = "heading_rad"
-"""Key of a plan's record: by how much the robot is turned."""
+_RUN = "run"
+"""Keys of a plan's record: by how much the robot is turned [rad], and the number of the run."""
+
+_Number = TypeVar("_Number", int, float)
 
 _RECORDS = ("undulog.plan",)
 """Metadata records of recorded commands that say what they are for: likewise."""
@@ -56,7 +59,8 @@ class Driven:
         kernels: What computed the force laws in the run that it is taken from.
         joints: The joints that recorded commands are for; None where it is no commands.
         heading_rad: By how much its plan turns the robot against the world's own heading [rad].
-        turned: Whether the world that it was made for has that heading already.
+        run: Its number in its plan; every run gets noise of its own.
+        as_run: Whether it is taken from a run, whose world has that heading and noise already.
     """
 
     kind: str
@@ -74,7 +78,8 @@ class Driven:
     kernels: Kernels = Kernels.NUMPY
     joints: tuple[str, ...] | None = None
     heading_rad: float = 0.0
-    turned: bool = False
+    run: int = 0
+    as_run: bool = False
 
     @property
     def session_facts(self) -> Mapping[str, str]:
@@ -113,7 +118,8 @@ class Driven:
 
         Returns:
             The world, with the length, the settling time that it says, the robot turned as its
-            plan says, and, if it is a scenario's gait, that gait and controller.
+            plan says, the seed of the noise raised by its number in the plan, and, if it is a
+            scenario's gait, that gait and controller.
 
         Raises:
             UsageError: If no world is known, or its robot lacks a plane.
@@ -130,8 +136,9 @@ class Driven:
                     f"{self.name} moves {plane} joints and {where.robot.name} of {where.name} has "
                     "none"
                 )
-        if self.heading_rad and (world is not None or not self.turned):
-            where = dataclasses.replace(where, world=where.world.turned(self.heading_rad))
+        if world is not None or not self.as_run:
+            turned = where.world.turned(self.heading_rad) if self.heading_rad else where.world
+            where = dataclasses.replace(where, world=turned, seed=where.seed + self.run)
         if self.own is not None:
             where = dataclasses.replace(where, gait=self.own.gait, controller=self.own.controller)
         if self.settle_s is not None:
@@ -253,34 +260,37 @@ def _commands(
         records={name: told[name] for name in _RECORDS if name in told},
         kernels=_kernels(told.get("undulog", {}).get("kernels")),
         joints=recorded.commands.names,
-        heading_rad=_planned_heading(told.get("undulog.plan", {}), path),
-        turned="driven" in told.get("undulog", {}),
+        heading_rad=_planned(told, _HEADING, float, path),
+        run=_planned(told, _RUN, int, path),
+        as_run="driven" in told.get("undulog", {}),
     )
 
 
-def _planned_heading(plan: Mapping[str, str], path: Path) -> float:
-    """By how much a plan turns the robot [rad].
+def _planned(
+    told: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
+) -> _Number:
+    """A number of the plan's record.
 
     Args:
-        plan: Its metadata record, empty where there is none.
+        told: Metadata records.
+        key: Of the number.
+        kind: What reads it.
         path: Of the session, for messages.
 
     Returns:
-        0 where it says nothing.
+        The number; 0 where the record has none.
 
     Raises:
-        DataError: If that is no number.
+        DataError: If it is no finite number, or a negative count.
     """
-    text = plan.get(_HEADING)
-    if text is None:
-        return 0.0
+    text = told.get("undulog.plan", {}).get(key, "0")
     try:
-        heading = float(text)
+        value = kind(text)
     except ValueError:
-        heading = math.nan
-    if not math.isfinite(heading):
-        raise DataError(f"{path}: {_HEADING} of its plan is {text!r}; expected an angle in rad")
-    return heading
+        value = None
+    if value is None or not math.isfinite(value) or (isinstance(value, int) and value < 0):
+        raise DataError(f"{path}: {key} of its plan is {text!r}; expected a number")
+    return value
 
 
 def _kernels(told: str | None) -> Kernels:

@@ -57,7 +57,7 @@ def test_identical_modules_are_not_called_different(answered):
     reversal = result.reversal
     assert (reversal.forward_runs, reversal.reverse_runs) == (6, 6)
     assert reversal.p > 0.05
-    assert reversal.weak == ()
+    assert reversal.pairs == ()
     assert reversal.boundary_share.ci95[0] > 0.95
     assert ": the pattern is boundary (share" in result.answer
     # The pattern itself is there beyond doubt.
@@ -67,10 +67,11 @@ def test_identical_modules_are_not_called_different(answered):
 def test_the_weak_servo_is_named(answered):
     result = answered(**WEAK)
     assert result.reversal.p == pytest.approx(2 / 924)
-    assert result.answer.startswith("the modules differ: joint03 is weak (p = 0.002)")
-    weak = result.reversal.weak[0]
-    assert (weak.name, weak.mirror) == ("joint03", "joint05")
-    assert weak.lag_contrast_rad.ci95[0] > 0
+    assert "joint03 answers less than its mirror joint05 (p = 0.002)" in result.answer
+    assert "joint03 weaker or joint05 stronger" in result.answer
+    pair = result.reversal.pairs[0]
+    assert (pair.name, pair.mirror) == ("joint03", "joint05")
+    assert pair.lag_contrast_rad.ci95[0] > 0
     assert result.reversal.boundary_share.value > result.reversal.module_share.value
 
 
