@@ -146,7 +146,7 @@ def test_one_direction_is_not_separable(alike):
     truth = np.exp(BOUNDARY)
     for k, joint in enumerate(result.pooled.joints):
         assert joint.name == ROBOT.joint_names[YAW[k]]
-        # All 26 hold together at 1.9 times the half width of one (Bonferroni, 5 degrees of freedom).
+        # All 26 hold together at twice the half width of one (Bonferroni, 5 degrees of freedom).
         for estimate, value in ((joint.gain, abs(truth[k])), (joint.lag_rad, -np.angle(truth[k]))):
             half = (estimate.ci95[1] - estimate.ci95[0]) / 2
             assert abs(estimate.value - value) < 2 * half < 0.01
