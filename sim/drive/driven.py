@@ -59,7 +59,7 @@ class Driven:
         kernels: What computed the force laws in the run that it is taken from.
         joints: The joints that recorded commands are for; None where it is no commands.
         heading_rad: By how much its plan turns the robot against the world's own heading [rad].
-        run: Its number in its plan; every run gets noise of its own.
+        run: Its number in a plan that repeats commands; every run gets noise of its own.
         as_run: Whether it is taken from a run, whose world has that heading and noise already.
     """
 
@@ -261,7 +261,8 @@ def _commands(
         kernels=_kernels(told.get("undulog", {}).get("kernels")),
         joints=recorded.commands.names,
         heading_rad=_planned(told, _HEADING, float, path),
-        run=_planned(told, _RUN, int, path),
+        # A plan that turns the robot repeats its commands; others change them from run to run.
+        run=_planned(told, _RUN, int, path) if _HEADING in told.get("undulog.plan", {}) else 0,
         as_run="driven" in told.get("undulog", {}),
     )
 
