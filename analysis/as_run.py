@@ -49,6 +49,20 @@ def touches(scenario: dict[str, Any] | None) -> bool | None:
     return world.get("surface", "flat") != "none" or bool(world.get("obstacles"))
 
 
+def start_heading_rad(scenario: dict[str, Any] | None) -> float | None:
+    """Heading of the robot at the start of a simulated session [rad].
+
+    Args:
+        scenario: From :func:`scenario_of`.
+
+    Returns:
+        The heading; None of a real robot.
+    """
+    if scenario is None:
+        return None
+    return float(_table(scenario, "world").get("heading", 0.0))
+
+
 def physics_step_s(scenario: dict[str, Any] | None) -> float:
     """Physics step of a simulated session [s]; 0 of a real robot.
 

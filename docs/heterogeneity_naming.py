@@ -23,7 +23,7 @@ from heterogeneity_tables import LEVEL, WAYS
 
 from analysis import analyse_session
 from analysis.reversal.mirror import mirror_test
-from analysis.reversal.modules import weak_modules
+from analysis.reversal.modules import ordered_pairs
 from capture import Session
 from sim import Wave, load_scenario, parse_scenario
 from sim.modules import Modules
@@ -103,7 +103,7 @@ def rates(names, weak, ways, scatter, *, runs=6, seed=1):
     for _ in range(SETS):
         noise = random.normal(0.0, scatter, (2, 2, runs, len(names)))
         test = mirror_test(*(y + one[0] + 1j * one[1] for y, one in zip(ways, noise, strict=True)))
-        first = weak_modules(names, test)[:1]
+        first = ordered_pairs(names, test)[:1]
         found += test.p < LEVEL
         named += bool(first) and first[0].name == weak
     return found / SETS, named / SETS

@@ -17,13 +17,13 @@ from scipy.signal import lfilter
 
 from analysis import analyse_session
 from analysis.reversal.mirror import (
+    Strata,
     family_wise_p,
     label_scores,
-    labellings,
     mirror_test,
     parts,
 )
-from analysis.reversal.modules import weak_modules
+from analysis.reversal.modules import ordered_pairs
 from capture import Session
 from sim import load_scenario
 from sim.modules import Modules
@@ -70,7 +70,8 @@ def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
     """Share of experiments with identical modules in which a difference is claimed."""
     random = np.random.default_rng(seed)
     forward = boundary_pattern(joints)
-    labels = labellings(runs, runs)
+    one = np.zeros(runs, dtype=np.int64)
+    labels = Strata.of(one, one).labellings()
     claimed = 0
     for _ in range(sets // 100):
         one = sensed(random, forward, sets=100, runs=runs, **noise)
@@ -81,7 +82,11 @@ def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
 
 def _p(forward, reverse, labels):
     """Family-wise p of each of many experiments, shape (sets,)."""
-    runs = parts(np.concatenate([forward, reverse[..., ::-1]], axis=1))
+    both = np.concatenate([forward, reverse[..., ::-1]], axis=1)
+    half = both.shape[-1] // 2
+    odd, even = (both - both[..., ::-1]) / 2, (both + both[..., ::-1]) / 2
+    columns = odd[..., :half], even[..., : both.shape[-1] - half]
+    runs = np.concatenate([parts(one) for one in columns], axis=-1)
     return family_wise_p(np.abs(label_scores(runs, labels))).min(axis=-1)
 
 
@@ -120,9 +125,9 @@ def power(names, forward, reverse, scatter, *, runs=6, sets=500, seed=1):
         draw = random.normal(0.0, scatter, (2, 2, runs, len(names)))
         noise = draw[0] + 1j * draw[1]
         test = mirror_test(forward + noise[0], reverse + noise[1])
-        weak = weak_modules(names, test)
+        pairs = ordered_pairs(names, test)
         found += test.p < LEVEL
-        named += bool(weak) and weak[0].name == WEAK
+        named += bool(pairs) and pairs[0].name == WEAK
     return found / sets, named / sets
 
 

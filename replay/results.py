@@ -135,10 +135,11 @@ def _listed(ids: Sequence[str]) -> str:
 
 def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
     if isinstance(result, Experiment) and result.reversal is not None:
-        for weak in result.reversal.weak:
-            how = "less gain" if weak.by == "gain" else "more lag"
-            why = f"{how} than its mirror joint {weak.mirror}, {told_p(weak.p)}"
-            yield Named(weak.name, why)
+        for pair in result.reversal.pairs:
+            how = "less gain" if pair.by == "gain" else "more lag"
+            floor = "" if result.reversal.tilt.excluded else ", or the floor is tilted"
+            why = f"{how} than its mirror joint {pair.mirror}, {told_p(pair.p)}{floor}"
+            yield Named(pair.name, why)
     elif isinstance(result, Comparison):
         for joint in result.named:
             if joint.size >= 1.0:  # in margins: what differs by less is there, but small

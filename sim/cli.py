@@ -49,6 +49,7 @@ def run(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     duration: float | None = None,
     seed: int | None = None,
+    change: Annotated[list[str] | None, Parameter(name="--set")] = None,
     kernels: Literal["numpy", "numba", "auto"] = "numpy",
     force: bool = False,
     json: bool = False,
@@ -65,6 +66,8 @@ def run(
         output: The session file to write, `.mcap`.
         duration: Simulated length in seconds, instead of the scenario's.
         seed: Seed of the sensor noise, instead of the scenario's.
+        change: `KEY=VALUE`, a key of the scenario file with dots and its value, e.g.
+            `world.slope=0.005` (rad); as often as wanted.
         kernels: What computes the forces: `numba` is faster and rounds otherwise; `auto` takes it
             where it is installed.
         force: Replace the output if it is there.
@@ -72,13 +75,15 @@ def run(
     """
     from .physics.engine import Kernels
     from .record import record
-    from .scenario_file import load_scenario
+    from .scenario_file import load_scenario, read_changes
 
     if output.suffix != ".mcap":
         raise UsageError(
             f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
         )
-    chosen = load_scenario(scenario).changed(duration_s=duration, seed=seed)
+    chosen = load_scenario(scenario, read_changes(change or [])).changed(
+        duration_s=duration, seed=seed
+    )
     refuse_existing(output, force=force)
     compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
     start = time.monotonic()

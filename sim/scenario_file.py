@@ -88,11 +88,11 @@ frequency and lag (``delay_s`` of delay blocks).
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from capture.errors import Fault, ScenarioError
+from capture.errors import Fault, ScenarioError, UsageError
 from capture.robot import Plane, Robot
 from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
@@ -169,6 +169,9 @@ def parse_scenario(
     faults = Faults()
     for key, value in (changes or {}).items():
         _change(values, key, value, faults)
+    world = values.get("world")
+    if "world.slope" in (changes or {}) and isinstance(world, dict):
+        cast("dict[str, object]", world).pop("gravity", None)  # the slope replaces it
     top = Table(values, "", faults)
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
     robot_name = top.text("robot")
@@ -201,6 +204,30 @@ def parse_scenario(
     if (found := faults.all()) or robot is None:
         raise ScenarioError(source, found)
     return Scenario(robot=parts["modules"].fitted(robot), **parts)
+
+
+def read_changes(words: Sequence[str]) -> dict[str, Any]:
+    """Read the words of ``--set``.
+
+    Args:
+        words: ``KEY=VALUE``, the key with dots and the value as in TOML; a bare word is a string.
+
+    Returns:
+        Key to value, as :func:`parse_scenario` takes them.
+
+    Raises:
+        UsageError: If a word has another form.
+    """
+    changes: dict[str, Any] = {}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not (equals and key and text) or not all(key.split(".")):
+            raise UsageError(f"--set {word}: expected KEY=VALUE, e.g. servo.stall_torque=0.2")
+        try:
+            changes[key] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            changes[key] = text
+    return changes
 
 
 def _change(values: dict[str, Any], key: str, value: object, faults: Faults) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from capture import Session
+from capture.arrays import ComplexArray
 from capture.environment import base_versions
 from capture.errors import UsageError
 from capture.robot import Robot
@@ -24,13 +25,23 @@ from ..kicks.matrices import ROW_TOLERANCE
 from ..kicks.runs import MOST_KICK, MOST_PATTERN, SAME
 from ..oscillators.body import body_oscillators
 from ..reading import Warn
-from ..response import CONFIDENCE
+from ..response import CONFIDENCE, gain_estimate, lag_estimate
 from ..results.analysis import Analysis, Provenance
 from ..results.coupling import LocalCoupling
-from ..results.experiment import Experiment, Reversal, Run
+from ..results.experiment import (
+    Experiment,
+    Headings,
+    PooledJoint,
+    PooledRuns,
+    Reversal,
+    Run,
+)
 from ..reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
-from ..reversal.modules import SIGNIFICANT, reversal_of
+from ..reversal.modules import SAME_HEADING_RAD, SIGNIFICANT, reversal_of
+from ..reversal.posture import Posture, posture
 from ..reversal.shares import RESAMPLES
+from ..reversal.tilt import floor_lean
+from ..segments.pooled import pooled_answer
 from ..stretch import Options
 from ..sweep.answer import sweep_answer
 from ..sweep.coupling import NONLINEAR, sweep_coupling
@@ -43,6 +54,7 @@ from ..sweep.runs import (
 )
 from .answer import experiment_answer
 from .indices import experiment_indices
+from .pooling import PooledResponse, pool_runs
 from .runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
@@ -77,16 +89,18 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
     examined: list[Examined] = []
     robots: list[Robot | None] = []
     commanded: list[CommandTones | None] = []
+    postures: list[Posture] = []
     for session in sessions:
         examined.append(examine_session(session, options))
+        postures.append(posture(session, examined[-1].analysis.gait.windows))
         robots.append(session.robot)
         commanded.append(command_tones(session, options, examined[-1]))
     if not examined:
         raise UsageError("an experiment needs at least one session")
     warnings: list[str] = []
     runs = [
-        gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait)
-        for one, robot in zip(examined, robots, strict=True)
+        gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait, lay)
+        for one, robot, lay in zip(examined, robots, postures, strict=True)
     ]
     kicks = find_kicks(runs, [one.gait for one in examined])
     sweep = find_sweep(commanded) if kicks is None else None
@@ -109,16 +123,24 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
+    pooled = pool_runs(chosen[0].names, [run.response for run in chosen]) if one_way(ways) else None
     robot = robots[next(iter(roles))] if roles else None
+    joints = None
+    if pooled is not None:
+        own = [examined[k].analysis for k in roles]
+        joints = own[0].answer if len(own) == 1 else pooled_answer(robot, pooled, own)
     reversal = None
     if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
-        reversal = reversal_of(names, forward, reverse)
+        reversal = _reversal(names, (forward, reverse), chosen, ways)
         _warn_floor(reversal, warnings.append)
+        _warn_headings(reversal, warnings.append)
     coupling = (
         one_gait_coupling(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
     )
     return Experiment(
-        answer=kick_answer(coupling) if only_kicks else experiment_answer(reversal, roles),
+        answer=kick_answer(coupling)
+        if only_kicks
+        else experiment_answer(reversal, roles, pooled, joints),
         sessions=tuple(one.analysis for one in examined),
         runs=tuple(
             _run(one.analysis, run, told.get(k), why.get(k))
@@ -130,6 +152,7 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
         warnings=tuple(warnings),
         provenance=_provenance([one.analysis for one in examined], options),
         oscillators=body_oscillators(coupling) if isinstance(coupling, LocalCoupling) else None,
+        pooled=None if pooled is None else _pooled(pooled),
     )
 
 
@@ -163,6 +186,39 @@ def _of_sweep(
         warnings=tuple(warnings),
         provenance=_provenance(analyses, options),
     )
+
+
+def one_way(ways: Sequence[Role]) -> bool:
+    """Whether all runs are of one direction.
+
+    Args:
+        ways: Of the runs.
+
+    Returns:
+        False without runs, too.
+    """
+    return len(set(ways)) == 1
+
+
+def _reversal(
+    names: Sequence[str],
+    y: tuple[ComplexArray, ComplexArray],
+    runs: Sequence[GaitRun],
+    ways: Sequence[Role],
+) -> Reversal:
+    """The reversal test, with what the runs' headings and recorded gravity say of a tilt."""
+    heading = np.array([run.posture.heading_rad for run in runs])
+    lean = np.array([run.posture.lean_rad for run in runs])
+    forward = np.array([way is Role.FORWARD for way in ways])
+    return reversal_of(names, *y, (heading[forward], heading[~forward]), floor_lean(lean, heading))
+
+
+def _pooled(pooled: PooledResponse) -> PooledRuns:
+    joints = [
+        PooledJoint(name, gain_estimate(pooled.response, k), lag_estimate(pooled.response, k))
+        for k, name in enumerate(pooled.names)
+    ]
+    return PooledRuns(pooled.runs, tuple(joints))
 
 
 def _runs(count: int) -> str:
@@ -223,6 +279,21 @@ def _warn_floor(reversal: Reversal, warn: Warn) -> None:
     )
 
 
+def _warn_headings(reversal: Reversal, warn: Warn) -> None:
+    """Warn where a tilted floor isn't cancelled and could change what is named."""
+    if reversal.p >= SIGNIFICANT or reversal.tilt.headings is Headings.BALANCED:
+        return
+    why = (
+        "the robot's heading is not recorded"
+        if reversal.tilt.headings is Headings.UNKNOWN
+        else "the robot's headings are not balanced"
+    )
+    warn(
+        f"{why}, so a tilted floor doesn't cancel; turn the robot by half a turn in half of the "
+        "runs of each direction (undulog plan reversal)"
+    )
+
+
 def _run(one: Analysis, run: GaitRun, role: str | None, why: str | None) -> Run:
     return Run(one.session.id, one.session.path, run.wave, role, why if role is None else None)
 
@@ -241,6 +312,7 @@ def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
             "level": SIGNIFICANT,
             "same_command": SAME_COMMAND,
             "same_frequency": SAME_FREQUENCY,
+            "same_heading_rad": SAME_HEADING_RAD,
             "most_labellings": MOST_LABELLINGS,
             "random_labellings": RANDOM_LABELLINGS,
             "bootstrap_resamples": RESAMPLES,

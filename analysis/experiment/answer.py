@@ -5,18 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ..results.experiment import Reversal
+from ..results.answer import Answer
+from ..results.experiment import OrderedPair, Reversal
 from ..reversal.modules import SIGNIFICANT
 from ..text import formats
+from .pooling import PooledResponse
 from .runs import Role
 
+OR_TILT = "or the floor is tilted"
 
-def experiment_answer(reversal: Reversal | None, roles: Mapping[int, Role]) -> str:
-    """Answer from the reversal.
+
+def experiment_answer(
+    reversal: Reversal | None,
+    roles: Mapping[int, Role],
+    pooled: PooledResponse | None = None,
+    joints: Answer | None = None,
+) -> str:
+    """Answer from the reversal, or from the pooled runs of one direction.
 
     Args:
         reversal: Its result, or None.
         roles: Of the runs that have one.
+        pooled: The response over the runs of one direction, None where both were recorded.
+        joints: Its answer on the joints.
 
     Returns:
         One sentence without its full stop, intervals in square brackets.
@@ -24,22 +35,63 @@ def experiment_answer(reversal: Reversal | None, roles: Mapping[int, Role]) -> s
     if not roles:
         return "no gait with a travelling wave in these sessions: nothing to compare"
     if len(set(roles.values())) == 1:
-        return "boundary or module is open: one direction only; record the reverse"
+        return _one_direction(pooled, joints)
     if reversal is None:
         return "both directions, but not separable from these sessions"
     return _different(reversal) if reversal.p < SIGNIFICANT else _bounded(reversal)
 
 
+def pair_order(pair: OrderedPair) -> str:
+    """Which joint of a pair answers less.
+
+    Args:
+        pair: The pair.
+
+    Returns:
+        A clause; joints as they are named.
+    """
+    return f"{pair.name} answers less than its mirror {pair.mirror}"
+
+
+def blind_spots(reversal: Reversal) -> str:
+    """What a reversal of these joints can't see.
+
+    Args:
+        reversal: Its result.
+
+    Returns:
+        A clause.
+    """
+    middle = "" if reversal.middle is None else f" or of the middle joint, {reversal.middle}"
+    return f"blind to what is alike at both joints of a pair{middle}"
+
+
+def _one_direction(pooled: PooledResponse | None, joints: Answer | None) -> str:
+    remains = "boundary or module is open: one direction only; record the reverse"
+    if pooled is None or joints is None or not pooled.names:
+        return remains
+    runs = "1 run" if pooled.runs == 1 else f"{pooled.runs} runs pooled"
+    return f"{runs}: {joints.sentence.rstrip('.')}; {remains}"
+
+
 def _different(reversal: Reversal) -> str:
-    told = formats.told_p(reversal.p)
-    if not reversal.weak:
+    reported = formats.told_p(reversal.p)
+    if not reversal.pairs:
+        cause = "check that ground and body are alike fore and aft"
+        if not reversal.tilt.excluded:
+            cause = "the floor may be tilted, or ground or body differ fore and aft"
         return (
-            f"the two directions differ ({told}), but not as a module would make them: check that "
-            "ground and body are alike fore and aft"
+            f"the two directions differ ({reported}), but not as a module would make them: {cause}"
         )
-    others = len(reversal.weak) - 1
+    first = reversal.pairs[0]
+    either = f"{first.name} weaker or {first.mirror} stronger"
+    either += "" if reversal.tilt.excluded else f", {OR_TILT}"
+    others = len(reversal.pairs) - 1
     also = f"; {others} more pair{'s differ' if others > 1 else ' differs'}, by less"
-    return f"the modules differ: {reversal.weak[0].name} is weak ({told}){also if others else ''}"
+    lead = "the modules differ: " if reversal.tilt.excluded else ""
+    return (
+        f"{lead}{pair_order(first)} ({formats.told_p(first.p)}): {either}{also if others else ''}"
+    )
 
 
 def _bounded(reversal: Reversal) -> str:
@@ -48,13 +100,16 @@ def _bounded(reversal: Reversal) -> str:
         f"{_at_most(100 * reversal.gain_bound)} % in gain and "
         f"{_at_most(math.degrees(reversal.lag_bound_rad))}° in lag"
     )
+    blind = blind_spots(reversal)
     share = reversal.boundary_share
     if share.value is None:
-        return f"{bound}: the joints' spread is no more than noise"
-    told = f"share {formats.percent(share)}"
+        return f"{bound}: the joints' spread is no more than noise; {blind}"
+    stated = f"share {formats.percent(share)}"
     if share.ci95 is not None and share.ci95[0] > 0.5:
-        return f"{bound}: the pattern is boundary ({told})"
-    return f"{bound}: boundary or module is still open (boundary {told}); record more runs"
+        return f"{bound}: the pattern is boundary ({stated}); {blind}"
+    return (
+        f"{bound}: boundary or module is still open (boundary {stated}); record more runs; {blind}"
+    )
 
 
 def _at_most(bound: float) -> str:

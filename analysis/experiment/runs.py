@@ -20,7 +20,9 @@ from capture.robot import Robot
 from ..fitting import GaitFit
 from ..gait import phase_step, wave_name
 from ..reading import by_plane
+from ..response import Response
 from ..results.analysis import Analysis
+from ..reversal.posture import UNKNOWN_POSTURE, Posture
 from ..text import formats
 from ..text.deciding import distinct
 
@@ -51,7 +53,8 @@ class GaitRun:
         frequency_hz: Of the gait; of several groups, the largest group's.
         command: Complex amplitudes of the commands, each at its group's frequency [rad], (m,).
         wave: Which way the wave runs; of several groups, the largest group's.
-        ratio: Response over command, NaN where it isn't known, shape (m,).
+        response: Response of the joints to their commands, NaN where it isn't known, m joints.
+        posture: How the robot lay.
         group: Index of each joint's group, m.
         frequencies_hz: Of each group, the largest group first.
         waves: Which way each group's wave runs.
@@ -65,10 +68,16 @@ class GaitRun:
     frequency_hz: float
     command: ComplexArray
     wave: str | None
-    ratio: ComplexArray
+    response: Response
+    posture: Posture = UNKNOWN_POSTURE
     group: tuple[int, ...] = ()
     frequencies_hz: tuple[float, ...] = ()
     waves: tuple[str | None, ...] = ()
+
+    @property
+    def ratio(self) -> ComplexArray:
+        """Response over command, NaN where it isn't known, shape (m,)."""
+        return self.response.ratio
 
     @property
     def by_group(self) -> list[IntArray]:
@@ -77,7 +86,13 @@ class GaitRun:
         return [np.flatnonzero(groups == k) for k in range(len(self.frequencies_hz))]
 
 
-def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit | None) -> GaitRun:
+def gait_run(
+    label: str,
+    robot: Robot | None,
+    analysis: Analysis,
+    gait: GaitFit | None,
+    posture: Posture = UNKNOWN_POSTURE,
+) -> GaitRun:
     """What an experiment needs of one session.
 
     Args:
@@ -85,6 +100,7 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
         robot: Its robot, or None.
         analysis: Its numbers.
         gait: Its fitted gait, or None.
+        posture: How the robot lay.
 
     Returns:
         The run.
@@ -92,24 +108,28 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
     name, start_ns = analysis.session.robot, analysis.session.start_ns
     if gait is None or not gait.driven:
         nothing = np.zeros(0, dtype=np.complex128)
-        return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, nothing)
+        return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, _unknown(0), posture)
     group_of = {joint: k for k, one in enumerate(gait.groups) for joint in one.driven}
     chain = [joint.name for joint in analysis.joints if joint.name in group_of]
     names = tuple(chain) if gait.others else gait.driven
     command = np.zeros(len(names), dtype=np.complex128)
-    ratio = np.full(len(names), np.nan, dtype=np.complex128)
+    response = _unknown(len(names))
     known = {joint.name for joint in analysis.joints if joint.gain.value is not None}
     planes: list[tuple[str, ...]] = []
     waves: list[str | None] = []
     for group in gait.groups:
-        own = group.fit.fundamental[: len(group.driven)]
-        command[[names.index(joint) for joint in group.driven]] = own
+        fundamental = group.fit.fundamental[: len(group.driven)]
+        command[[names.index(joint) for joint in group.driven]] = fundamental
         planes.append(tuple(by_plane(robot, group.driven)))
-        waves.append(wave_name(phase_step(own)) if own.size > 1 else None)
-        if group.response is not None:
-            for joint, one in zip(group.answered, group.response.ratio, strict=True):
-                if joint in known:
-                    ratio[names.index(joint)] = one
+        waves.append(wave_name(phase_step(fundamental)) if fundamental.size > 1 else None)
+        if group.response is None:
+            continue
+        own = [k for k, joint in enumerate(group.answered) if joint in known]
+        at = [names.index(group.answered[k]) for k in own]
+        response.ratio[at] = group.response.ratio[own]
+        response.log_gain_variance[at] = group.response.log_gain_variance[own]
+        response.lag_variance[at] = group.response.lag_variance[own]
+        response.dof[at] = group.response.dof[own]
     return GaitRun(
         label=label,
         robot=name,
@@ -119,11 +139,18 @@ def gait_run(label: str, robot: Robot | None, analysis: Analysis, gait: GaitFit 
         frequency_hz=gait.fit.frequency_hz,
         command=command,
         wave=waves[0],
-        ratio=ratio,
+        response=response,
+        posture=posture,
         group=tuple(group_of[joint] for joint in names),
         frequencies_hz=tuple(one.fit.frequency_hz for one in gait.groups),
         waves=tuple(waves),
     )
+
+
+def _unknown(count: int) -> Response:
+    """The response of joints of which none is known yet."""
+    gain, lag, dof = (np.full(count, np.nan) for _ in range(3))
+    return Response(np.full(count, np.nan, dtype=np.complex128), gain, lag, dof)
 
 
 def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]:
@@ -178,7 +205,7 @@ def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
     unit: ComplexArray = ratio / np.abs(ratio)
     turn = np.angle(unit.sum())
     phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
-    names = tuple(name for name, one in zip(runs[0].names, known, strict=True) if one)
+    names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
     y = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
     return names, y
 

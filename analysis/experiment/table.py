@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from ..kicks.answer import kick_detail
 from ..oscillators.text import body_detail
 from ..results.analysis import Estimate
 from ..results.coupling import LocalCoupling
-from ..results.experiment import Experiment, Reversal
+from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
 from ..results.sweep import LinearCoupling
 from ..reversal.modules import SIGNIFICANT
 from ..sweep.answer import sweep_detail, sweep_method
@@ -86,12 +87,20 @@ def reversal_detail(reversal: Reversal) -> Iterable[str]:
     Yields:
         Sentences.
     """
-    for weak in reversal.weak:
+    for pair in reversal.pairs:
         yield (
-            f"{weak.name} against its mirror {weak.mirror}, over both directions: "
-            f"{_gain(weak.log_gain_contrast)} in gain, {_lag(weak.lag_contrast_rad)} in lag "
-            f"({formats.told_p(weak.p)}, named by {weak.by})."
+            f"{pair.name} against its mirror {pair.mirror}, over both directions: "
+            f"{_gain(pair.log_gain_contrast)} in gain, {_lag(pair.lag_contrast_rad)} in lag "
+            f"({formats.told_p(pair.p)}, ordered by {pair.by})."
         )
+    if reversal.pairs:
+        first = reversal.pairs[0]
+        yield (
+            f"Which of the two differs, the contrast can't decide: swap {first.name} for another "
+            "module and record again, or compare one direction with a model (--null)."
+        )
+    if reversal.p < SIGNIFICANT:
+        yield _tilt(reversal.tilt, reversal.middle)
     shares = (reversal.module_share, reversal.boundary_share)
     if shares[0].value is not None:
         yield (
@@ -101,6 +110,22 @@ def reversal_detail(reversal: Reversal) -> Iterable[str]:
     if max(reversal.equivalence_gain_p, reversal.equivalence_lag_p) < SIGNIFICANT:
         yield "Shown to be alike: every mirror pair within 2 % and 1°."
     yield f"The test is {reversal.blind}."
+
+
+def _tilt(tilt: FloorTilt, middle: str | None) -> str:
+    """What speaks for and against a tilted floor."""
+    lean = ""
+    if tilt.gravity_rad.value is not None:
+        fall = formats.estimate(formats.degrees(tilt.gravity_rad), "°", most=2)
+        lean = f" Recorded gravity: the floor falls by {fall} along the body."
+    if tilt.headings is Headings.BALANCED:
+        return f"A tilted floor cancels: {tilt.strata} sets of mirror-image runs.{lean}"
+    checks = f"the common part is {formats.estimate(tilt.ratio, most=2)} of the contrast"
+    if tilt.middle is not None:
+        middle_size = formats.number(tilt.middle, 2) if math.isfinite(tilt.middle) else "any size"
+        checks += f", the middle joint {middle} at most {middle_size} of the largest contrast"
+    verdict = "excluded" if tilt.excluded else "not excluded"
+    return f"A tilted floor is {verdict}: {checks} (a tilt makes both large).{lean}"
 
 
 def _gain(log_gain: Estimate) -> str:
@@ -227,11 +252,14 @@ def _reversal_method(reversal: Reversal | None) -> str:
         if reversal.labellings_tried == reversal.labellings
         else f"{reversal.labellings_tried} random ones of {reversal.labellings}"
     )
+    within = " within each set of mirror-image runs" if reversal.tilt.strata > 1 else ""
     return (
         f"reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
         "with the wave from head to tail minus its mirror joint with the wave from tail to head; "
-        f"largest studentised difference T = {formats.number(reversal.statistic, 2)}, its null by "
-        f"dealing out the runs' labels anew ({tried}; p can't go below "
-        f"{formats.number(reversal.p_floor, 4)}), family-wise over joints, gain and lag; intervals "
-        "hold together at 95 %, those of shares by bootstrap over runs."
+        "largest studentised contrast or common part of a pair T = "
+        f"{formats.number(reversal.statistic, 2)}, its null by "
+        f"dealing out the runs' labels anew{within} ({tried}; p can't go below "
+        f"{formats.number(reversal.p_floor, 4)}), family-wise over pairs, gain and lag, so that "
+        "5 % is the level of the whole answer; intervals hold together at 95 %, those of shares by "
+        "bootstrap over runs."
     )

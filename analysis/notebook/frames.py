@@ -27,9 +27,9 @@ from ..results.coupling import (
 from ..results.experiment import (
     Experiment,
     MirrorJoint,
+    OrderedPair,
     Reversal,
     Run,
-    WeakModule,
 )
 from ..results.sweep import LinearCoupling, ToneCoupling
 from .rows import named, row_of, table
@@ -91,7 +91,7 @@ def _(result: Experiment) -> Frames:
 
 @frames_of.register
 def _(result: Reversal) -> Frames:
-    return {"mirror": table(MirrorJoint, result.joints), "weak": table(WeakModule, result.weak)}
+    return {"mirror": table(MirrorJoint, result.joints), "pairs": table(OrderedPair, result.pairs)}
 
 
 @frames_of.register

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..compare.result import Comparison
 from ..compare.table import render_comparison
+from ..experiment.answer import pair_order
 from ..experiment.table import render_experiment, reversal_detail
 from ..kicks.answer import kick_answer, kick_detail
 from ..results.analysis import Analysis, Coupling
@@ -58,8 +59,9 @@ def _(result: Comparison) -> str:
 @headline_of.register
 def _(result: Reversal) -> str:
     runs = f"{result.forward_runs} + {result.reverse_runs} runs"
-    differ = f"{result.weak[0].name} is weak" if result.weak else "no module is named"
-    return f"Reversal, {runs}: {differ} ({formats.told_p(result.p)})"
+    differ = pair_order(result.pairs[0]) if result.pairs else "no pair is ordered"
+    floor = "" if result.tilt.excluded or not result.pairs else ", or the floor is tilted"
+    return f"Reversal, {runs}: {differ}{floor} ({formats.told_p(result.p)})"
 
 
 @headline_of.register

@@ -80,12 +80,16 @@ def reversal(
 ) -> None:
     """Write the commands of a recorded gait and of its reverse, which tell boundary from module.
 
+    The robot is turned by 180 degrees in half of the runs of each direction, so that a tilted floor
+    cancels. The heading is in each file's name and metadata; the twin starts with it, a robot has
+    to be put down so.
+
     Example: `undulog plan reversal --like run.mcap -o reversal`
 
     Args:
         like: A session of the gait.
         output: Folder for the sessions.
-        runs: Runs each way.
+        runs: Runs each way, an even number so that half of them are turned.
         settle: Time before what is measured [s].
         measure: Length of what is measured [s].
         json: Print one JSON object.
@@ -97,6 +101,11 @@ def reversal(
         return both_ways(base.amplitude, runs)
 
     _plan("reversal", like, output, design, (runs, settle, measure), as_json=json)
+    if not json:
+        print(
+            "Before each file whose name ends in -180, put the robot down turned by 180 degrees; "
+            "before the others, as in the first"
+        )
 
 
 def _plan(

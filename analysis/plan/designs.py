@@ -9,6 +9,8 @@ import numpy as np
 
 from capture.arrays import ComplexArray
 
+from ..reversal.posture import HEADING
+
 KICK = 0.05
 """Of phase [rad] and of log amplitude."""
 
@@ -105,14 +107,25 @@ def phase_kicks(
 
 
 def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
-    """Runs of a wave and of its reverse, in turn.
+    """Runs of a wave and of its reverse, the robot turned by half a turn in half of each.
+
+    A tilted floor then cancels between runs that are each other's mirror image: the wave at one
+    heading and its reverse at the other.
 
     Args:
         amplitude: Of the gait, head to tail, shape (m,).
         each: Runs each way.
 
     Returns:
-        Twice as many runs.
+        Twice as many runs, the heading among their facts. Four make a block, in which the two
+        runs of a mirror image follow each other; the next block swaps the waves, so that warming
+        up looks like neither direction nor heading, and the robot is turned every second run.
     """
     ways = (("as-recorded", amplitude), ("reversed", amplitude[::-1]))
-    return tuple(PlannedRun(way, one, {"kind": way}) for _ in range(each) for way, one in ways)
+    runs: list[PlannedRun] = []
+    for k in range(2 * each):
+        way, own = ways[(k + k // 4) % 2]
+        turned = k % 4 in (1, 2)
+        facts = {"kind": way, HEADING: f"{math.pi if turned else 0.0:.6f}"}
+        runs.append(PlannedRun(f"{way}-{180 if turned else 0}", own, facts))
+    return tuple(runs)

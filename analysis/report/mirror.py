@@ -172,7 +172,7 @@ def _differences(
     *,
     what: str,
 ) -> None:
-    named = {one.name for one in reversal.weak}
+    named = {pair.name for pair in reversal.pairs}
     axes.axhline(0.0, color=REFERENCE, linestyle=(0, (5, 3)), zorder=1)
     unit = " %" if what == "gain" else "°"
     for k, (joint, value, color) in enumerate(zip(reversal.joints, values, colors, strict=True)):
@@ -207,10 +207,10 @@ def _differences(
 
 
 def _in_words(reversal: Reversal) -> str:
-    weak = ", ".join(one.name for one in reversal.weak) or "none"
+    less = ", ".join(f"{pair.name} less than {pair.mirror}" for pair in reversal.pairs) or "none"
     return (
         f"{len(reversal.joints)} joints, {reversal.forward_runs} and {reversal.reverse_runs} runs. "
-        f"Modules that differ beyond doubt: {weak}. The table of mirror pairs holds every number."
+        f"Pairs that differ beyond doubt: {less}. The table of mirror pairs holds every number."
     )
 
 

@@ -175,7 +175,9 @@ def _equivalence(index: Index, quantity: str, question: str) -> Trial:
 
 def _reversal(reversal: Reversal, indices: Mapping[str, Index]) -> Iterable[Trial]:
     different = reversal.p < SIGNIFICANT
-    no = "no, modules differ" if reversal.weak else "no, but not as a module would make it"
+    no = "no, but not as a module would make it"
+    if reversal.pairs:
+        no = f"no, modules differ{'' if reversal.tilt.excluded else ' or the floor is tilted'}"
     yield Trial(
         "Do the modules mirror, as identical ones do? (H1, reversal)",
         f"T = {formats.number(reversal.statistic, 2)}",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from ..notebook.shown import Shown
@@ -58,7 +59,7 @@ class MirrorJoint:
         mirror: The joint as far from the tail as this one is from the head.
         log_gain_difference: Of ln gain [1].
         lag_difference_rad: Positive = the joint is later than its mirror joint [rad].
-        p: Family-wise, of gain and lag together.
+        p: Family-wise, of the pair: of its contrast and its common part, gain and lag together.
     """
 
     name: str
@@ -69,16 +70,21 @@ class MirrorJoint:
 
 
 @dataclass(frozen=True)
-class WeakModule:
+class OrderedPair:
     """A joint that answers less or later than its mirror joint, whichever way the wave runs.
 
+    Either this joint is weaker or its mirror joint stronger: the contrast is the same.
+
     Attributes:
-        name: The joint.
+        name: The joint that answers less.
         mirror: Its mirror joint.
-        by: ``gain`` or ``lag``: which of them says so more clearly.
+        by: ``gain`` or ``lag``: which of them shows it more clearly.
         log_gain_contrast: ln gain of the joint minus that of its mirror joint, mean of both ways.
         lag_contrast_rad: The same of the lag [rad].
-        p: Family-wise, of the pair.
+        p: Family-wise over all pairs, gain and lag.
+        module: The single module that differs, ``name`` or ``mirror``; None where no further
+            evidence decides between them.
+        evidence: That evidence, one clause; empty without.
     """
 
     name: str
@@ -87,6 +93,41 @@ class WeakModule:
     log_gain_contrast: Estimate
     lag_contrast_rad: Estimate
     p: float
+    module: str | None = None
+    evidence: str = ""
+
+
+class Headings(StrEnum):
+    """What the robot's headings in the runs allow."""
+
+    BALANCED = "balanced"
+    """Each wave has its mirror image: the reverse, the robot turned by half a turn."""
+    UNBALANCED = "unbalanced"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class FloorTilt:
+    """Whether a tilted floor can make the differences of a reversal.
+
+    Attributes:
+        headings: Of the robot in the runs; balanced ones cancel a tilt by design.
+        strata: Sets of runs that are mirror images of each other.
+        ratio: Root mean square of what both joints of a pair do otherwise the other way, over that
+            of their contrast: above 1 for a tilt, below for one module.
+        middle: Largest size of the middle joint's difference over the least size of the largest
+            contrast (95 %): below 1 for one module; None for an even number of joints.
+        gravity_rad: Lean along the body by recorded gravity [rad], downhill towards the head
+            positive; empty without.
+        excluded: Whether headings or checks exclude a tilt as the cause.
+    """
+
+    headings: Headings
+    strata: int
+    ratio: Estimate
+    middle: float | None
+    gravity_rad: Estimate
+    excluded: bool
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,14 +137,14 @@ class Reversal(Shown):
     Attributes:
         forward_runs: Independent runs with the wave from head to tail.
         reverse_runs: The same from tail to head.
-        statistic: T, the largest studentised difference of all joints, gain and lag.
+        statistic: T, the largest studentised contrast or common part of all pairs, gain and lag.
         p: Of H1; exact, family-wise.
         p_floor: The smallest p that so many runs can give.
         labellings: Ways to deal out the labels.
         labellings_tried: All of them, or a random subset.
         joints: In chain order, head to tail.
-        weak: The largest contrast first; empty where none is shown. Those after the first may be
-            what it does to its neighbours.
+        pairs: The largest contrast first; empty where none is shown. Those after the first may be
+            what a module does to its neighbours.
         gain_bound: No joint's gain differs from its mirror's by a larger share (95 %).
         lag_bound_rad: No joint's lag differs from its mirror's by more (95 %) [rad].
         equivalence_gain_p: Of 'some pair differs by 2 % or more'.
@@ -113,6 +154,8 @@ class Reversal(Shown):
         noise_variance: Of a mean profile.
         module_share: V_module / (V_module + V_boundary).
         boundary_share: The rest.
+        tilt: Whether a tilted floor can make the differences.
+        middle: The middle joint of an odd number, which is its own mirror joint.
         blind: What the test can't see.
     """
 
@@ -124,7 +167,7 @@ class Reversal(Shown):
     labellings: int
     labellings_tried: int
     joints: tuple[MirrorJoint, ...]
-    weak: tuple[WeakModule, ...]
+    pairs: tuple[OrderedPair, ...]
     gain_bound: float
     lag_bound_rad: float
     equivalence_gain_p: float
@@ -134,7 +177,37 @@ class Reversal(Shown):
     noise_variance: float
     module_share: Estimate
     boundary_share: Estimate
+    tilt: FloorTilt
+    middle: str | None = None
     blind: str = BLIND
+
+
+@dataclass(frozen=True)
+class PooledJoint:
+    """One joint's response over several runs.
+
+    Attributes:
+        name: The joint.
+        gain: Amplitude of the response over that of the command.
+        lag_rad: Positive = late [rad].
+    """
+
+    name: str
+    gain: Estimate
+    lag_rad: Estimate
+
+
+@dataclass(frozen=True)
+class PooledRuns:
+    """Several runs of one direction as one; the scatter from run to run is in the intervals.
+
+    Attributes:
+        runs: How many.
+        joints: In chain order, head to tail.
+    """
+
+    runs: int
+    joints: tuple[PooledJoint, ...]
 
 
 @dataclass(frozen=True, repr=False)
@@ -154,6 +227,7 @@ class Experiment(Shown):
         provenance: How it was made.
         oscillators: From kicks around one gait: how oscillators that feel their servos would
             synchronise through the body; None without such kicks.
+        pooled: The response over the runs, where all of them are of one direction.
     """
 
     answer: str
@@ -165,6 +239,7 @@ class Experiment(Shown):
     warnings: tuple[str, ...]
     provenance: Provenance
     oscillators: BodyOscillators | None = None
+    pooled: PooledRuns | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -183,6 +258,7 @@ class Experiment(Shown):
                 name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
             },
             "reversal": None if self.reversal is None else dataclasses.asdict(self.reversal),
+            "pooled": None if self.pooled is None else dataclasses.asdict(self.pooled),
             "coupling": dataclasses.asdict(self.coupling),
             "oscillators": None
             if self.oscillators is None

@@ -42,6 +42,7 @@ class Chain:
         names: Those of them that are compared, in the same order, m of them.
         response: Of these, shape (m,), with errors.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by name.
+        scatter: Errors of log gain and of lag; None where they are those of the response.
     """
 
     plane: str
@@ -50,6 +51,14 @@ class Chain:
     names: tuple[str, ...]
     response: Response
     offsets: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
+    scatter: tuple[Scatter, Scatter] | None = None
+
+    @property
+    def errors(self) -> tuple[Scatter, Scatter] | None:
+        """Errors of log gain and of lag; None where they are not known."""
+        if self.scatter is not None:
+            return self.scatter
+        return None if self.response.errors is None else scatter_of(self.response.errors)
 
 
 @dataclass(frozen=True)
@@ -80,7 +89,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
     Returns:
         The findings, all of one family-wise level.
     """
-    some = [each for each in chains if len(each.names) > 1 and each.response.errors is not None]
+    some = [each for each in chains if len(each.names) > 1 and each.errors is not None]
     profiles = [
         (chain, quantity, profile_of(chain, quantity)) for chain in some for quantity in _MARGINS
     ]
@@ -133,9 +142,9 @@ def profile_of(chain: Chain, quantity: str) -> Profile:
         ValueError: If the response carries no errors.
     """
     response = chain.response
-    if response.errors is None:
+    if chain.errors is None:
         raise ValueError("the response carries no errors to judge contrasts by")
-    gains, lags = scatter_of(response.errors)
+    gains, lags = chain.errors
     place = np.array([chain.commanded.index(name) for name in chain.names], dtype=np.float64)
     if quantity == "gain":
         values = np.asarray(np.log(response.gain), dtype=np.float64)

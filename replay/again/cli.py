@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -95,9 +94,11 @@ def replay(
         raise UsageError("--arm, --robot and --recorder are for a bus")
     if output is None:
         raise UsageError("a run of the twin is recorded: name the session with -o, e.g. -o b.mcap")
+    from sim.scenario_file import read_changes
+
     from .run import find_repetition, replay_in_twin, what_next
 
-    changes = _changes(change or [])
+    changes = read_changes(change or [])
     repetition = find_repetition(file, world or None, changes, duration)
     start = time.monotonic()
     with interruptible() as stop, progress(file.name, repetition.scenario.duration_s) as bar:
@@ -129,20 +130,6 @@ def _show(comparison: Comparison) -> None:
 
     print()
     show(lambda width, color: render_comparison(comparison, width=width, color=color), None)
-
-
-def _changes(words: Sequence[str]) -> dict[str, Any]:
-    """What ``--set`` says: keys to values, as TOML has them."""
-    found: dict[str, Any] = {}
-    for word in words:
-        key, equals, text = word.partition("=")
-        if not (equals and key and text) or not all(key.split(".")):
-            raise UsageError(f"--set {word}: expected KEY=VALUE, e.g. servo.stall_torque=0.2")
-        try:
-            found[key] = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            found[key] = text  # a bare word is a string
-    return found
 
 
 def _told(again: Again) -> Iterator[str]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from capture import Session
 from capture.errors import DataError, JointSetError, PlanError, UsageError
@@ -24,6 +25,12 @@ from .plan_file import is_plan, parse_plan
 
 _EXPLAINS = ("plan.toml", "gait.toml")
 """Attachments of recorded commands that say what they were made from: they go on to the run."""
+
+_HEADING = "heading_rad"
+_RUN = "run"
+"""Keys of a plan's record: by how much the robot is turned [rad], and the number of the run."""
+
+_Number = TypeVar("_Number", int, float)
 
 _RECORDS = ("undulog.plan",)
 """Metadata records of recorded commands that say what they are for: likewise."""
@@ -51,6 +58,9 @@ class Driven:
         records: Metadata records that go along, by name.
         kernels: What computed the force laws in the run that it is taken from.
         joints: The joints that recorded commands are for; None where it is no commands.
+        heading_rad: By how much its plan turns the robot against the world's own heading [rad].
+        run: Its number in a plan that repeats commands; every run gets noise of its own.
+        as_run: Whether it is taken from a run, whose world has that heading and noise already.
     """
 
     kind: str
@@ -67,6 +77,9 @@ class Driven:
     records: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
     kernels: Kernels = Kernels.NUMPY
     joints: tuple[str, ...] | None = None
+    heading_rad: float = 0.0
+    run: int = 0
+    as_run: bool = False
 
     @property
     def session_facts(self) -> Mapping[str, str]:
@@ -104,8 +117,9 @@ class Driven:
             duration_s: Length of the run; its own if None.
 
         Returns:
-            The world, with the length, the settling time that it says, and, if it is a scenario's
-            gait, that gait and controller.
+            The world, with the length, the settling time that it says, the robot turned as its
+            plan says, the seed of the noise raised by its number in the plan, and, if it is a
+            scenario's gait, that gait and controller.
 
         Raises:
             UsageError: If no world is known, or its robot lacks a plane.
@@ -122,6 +136,9 @@ class Driven:
                     f"{self.name} moves {plane} joints and {where.robot.name} of {where.name} has "
                     "none"
                 )
+        if world is not None or not self.as_run:
+            turned = where.world.turned(self.heading_rad) if self.heading_rad else where.world
+            where = dataclasses.replace(where, world=turned, seed=where.seed + self.run)
         if self.own is not None:
             where = dataclasses.replace(where, gait=self.own.gait, controller=self.own.controller)
         if self.settle_s is not None:
@@ -243,7 +260,38 @@ def _commands(
         records={name: told[name] for name in _RECORDS if name in told},
         kernels=_kernels(told.get("undulog", {}).get("kernels")),
         joints=recorded.commands.names,
+        heading_rad=_planned(told, _HEADING, float, path),
+        # A plan that turns the robot repeats its commands; others change them from run to run.
+        run=_planned(told, _RUN, int, path) if _HEADING in told.get("undulog.plan", {}) else 0,
+        as_run="driven" in told.get("undulog", {}),
     )
+
+
+def _planned(
+    told: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
+) -> _Number:
+    """A number of the plan's record.
+
+    Args:
+        told: Metadata records.
+        key: Of the number.
+        kind: What reads it.
+        path: Of the session, for messages.
+
+    Returns:
+        The number; 0 where the record has none.
+
+    Raises:
+        DataError: If it is no finite number, or a negative count.
+    """
+    text = told.get("undulog.plan", {}).get(key, "0")
+    try:
+        value = kind(text)
+    except ValueError:
+        value = None
+    if value is None or not math.isfinite(value) or (isinstance(value, int) and value < 0):
+        raise DataError(f"{path}: {key} of its plan is {text!r}; expected a number")
+    return value
 
 
 def _kernels(told: str | None) -> Kernels:

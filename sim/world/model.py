@@ -41,6 +41,20 @@ class World:
     target: Target | None = None
     field: RandomField | None = field(default=None, compare=False)
 
+    def turned(self, angle: float) -> World:
+        """The same world with the robot put down turned about the vertical.
+
+        Args:
+            angle: Counter-clockwise [rad].
+
+        Returns:
+            The world; the robot's velocity at the start turns along.
+        """
+        x, y, z = self.velocity
+        c, s = math.cos(angle), math.sin(angle)
+        velocity = (c * x - s * y, s * x + c * y, z)
+        return dataclasses.replace(self, heading=self.heading + angle, velocity=velocity)
+
     def scattered(self, field: RandomField, seed: int, body_length: float) -> World:
         """The same world with a field of obstacles in it.
 

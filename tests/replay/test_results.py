@@ -11,9 +11,11 @@ from analysis.null_model.result import ModelledAnalysis, ModuleDeviation, NullMo
 from analysis.results.analysis import Coupling, Estimate, Provenance
 from analysis.results.experiment import (
     Experiment,
+    FloorTilt,
+    Headings,
+    OrderedPair,
     Reversal,
     Run,
-    WeakModule,
 )
 from capture import Session
 from capture.errors import DataError
@@ -65,7 +67,7 @@ def comparison(analysis):
 @pytest.fixture
 def experiment(analysis):
     """An experiment of the session and its reverse, that names the joint it finds weak."""
-    weak = WeakModule("joint03", "joint23", "lag", Estimate(-0.01), Estimate(0.03), 0.002)
+    pair = OrderedPair("joint03", "joint23", "lag", Estimate(-0.01), Estimate(0.03), 0.002)
     nothing = Estimate()
     reversal = Reversal(
         forward_runs=6,
@@ -76,7 +78,7 @@ def experiment(analysis):
         labellings=924,
         labellings_tried=924,
         joints=(),
-        weak=(weak,),
+        pairs=(pair,),
         gain_bound=0.1,
         lag_bound_rad=0.1,
         equivalence_gain_p=1.0,
@@ -86,6 +88,7 @@ def experiment(analysis):
         noise_variance=0.0,
         module_share=nothing,
         boundary_share=nothing,
+        tilt=FloorTilt(Headings.BALANCED, 2, nothing, None, nothing, excluded=True),
     )
     one = dataclasses.replace(analysis, session=dataclasses.replace(analysis.session, id="reverse"))
     runs = (

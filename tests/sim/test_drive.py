@@ -1,5 +1,6 @@
 """Driving the twin in process: gaits, plans, recorded commands, and the end on request."""
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from sim.drive.command_session import CommandReplay, RecordedCommands
 from sim.drive.fading import FadingGait
 from sim.gait import GaitTick
-from sim.scenario_file import scenario_names
+from sim.scenario_file import load_scenario, parse_scenario, scenario_names
 
 T0_NS = 10**18
 COLUMNS = (
@@ -333,6 +334,66 @@ def test_what_planned_commands_are_for_goes_on_to_the_run(tmp_path):
         assert session.settle_s == 0.04
         said = [m.msg for _, m in session.messages("/rosout")]
         assert "settled: 0.04 s have passed" in said
+
+
+def planned_commands(path, **plan):
+    with SessionWriter(path, session_id="s", epoch_ns=T0_NS) as writer:
+        writer.note("undulog.plan", {"plan": "reversal", **plan})
+        channel = writer.joint_state("/joint_commands", ("joint01",), unit="rad")
+        for k in range(3):
+            channel.write(T0_NS + k * 10_000_000, (0.01 * k,))
+    return path
+
+
+def test_a_plan_turns_the_robot_and_gives_each_run_noise_of_its_own(tmp_path):
+    source = planned_commands(tmp_path / "planned.mcap", run="3", heading_rad="3.141593")
+    world = tmp_path / "sloping.toml"
+    flat = load_scenario("flat", {"world.slope": 0.02, "world.heading": 0.5})
+    flat = dataclasses.replace(flat, world=dataclasses.replace(flat.world, velocity=(0.1, 0.2, 0)))
+    world.write_text(flat.toml())
+    path, again = tmp_path / "run.mcap", tmp_path / "again.mcap"
+    assert front.run(["drive", str(source), "--on", f"twin:{world}", "-o", str(path)]) == 0
+    # Driven again in the world of the run, which is turned already.
+    assert front.run(["drive", str(path), "--on", "twin", "-o", str(again)]) == 0
+    for one in (path, again):
+        with Session.open(one) as session:
+            ran = parse_scenario(session.attachments["scenario.toml"].decode(), "s", session.robot)
+            assert session.metadata["undulog.plan"]["heading_rad"] == "3.141593"
+            pose = session.table("/odom").iloc[0]
+        assert ran.world.heading == pytest.approx(0.5 + np.pi, abs=1e-6)
+        assert ran.world.velocity == pytest.approx((-0.1, -0.2, 0), abs=1e-6)
+        assert ran.world.gravity == flat.world.gravity
+        assert ran.seed == flat.seed + 3
+        yaw = 2 * np.arctan2(pose["pose.pose.orientation.z"], pose["pose.pose.orientation.w"])
+        assert np.exp(1j * yaw) == pytest.approx(np.exp(1j * (0.5 + np.pi)), abs=1e-6)
+    positions = []
+    for one in (path, again):
+        with Session.open(one) as session:
+            positions.append(session.joints("/joint_states").signal("joint01").values)
+    np.testing.assert_array_equal(*positions)
+
+
+@pytest.mark.parametrize(("key", "value"), [("heading_rad", "north"), ("run", "-1")])
+def test_a_senseless_plan_is_refused(tmp_path, capsys, key, value):
+    source = planned_commands(tmp_path / "planned.mcap", **{"heading_rad": "0", key: value})
+    path = tmp_path / "run.mcap"
+    assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) != 0
+    assert f"{key} of its plan is '{value}'" in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_a_slope_can_be_set(tmp_path):
+    path = tmp_path / "run.mcap"
+    words = ["sim", "run", "weak-servo-pi3", "-o", str(path), "--duration", "0.02"]
+    assert front.run([*words, "--set", "world.slope=0.1", "--set", "world.heading=1.5"]) == 0
+    with Session.open(path) as session:
+        text = session.attachments["scenario.toml"].decode()
+    # The run's scenario has its gravity written out; a slope takes its place.
+    for changes, fall in (({}, 0.1), ({"world.slope": 0.2}, 0.2)):
+        world = parse_scenario(text, "s", changes=changes).world
+        assert world.gravity == pytest.approx((9.81 * np.sin(fall), 0, -9.81 * np.cos(fall)))
+        assert world.heading == 1.5
+    assert front.run([*words, "--force", "--set", "world.slope"]) == 2
 
 
 @pytest.mark.parametrize("stated", ["soon", "-1", "inf", "nan"])

@@ -97,7 +97,7 @@ def test_identical_modules_with_a_boundary_pattern(alike):
     reversal = result.reversal
     assert (reversal.forward_runs, reversal.reverse_runs) == (6, 6)
     assert reversal.p > 0.05
-    assert reversal.weak == ()
+    assert reversal.pairs == ()
     # What identical modules differ by is 0; what the bound says lies above the noise.
     error = 0.003 * (2 / 200) ** 0.5 / 0.27 * (2 / 6) ** 0.5
     assert 2 * error < reversal.lag_bound_rad < 8 * error
@@ -109,13 +109,21 @@ def test_identical_modules_with_a_boundary_pattern(alike):
     assert result.heterogeneity["common_response"].p < 1e-6
     assert result.heterogeneity["mirror_response"].p == reversal.p
     assert result.heterogeneity["equivalence_mirror_lag"].p < 0.05
+    assert result.answer.endswith(
+        "blind to what is alike at both joints of a pair or of the middle joint, joint13"
+    )
     assert result.warnings == ()
 
 
 def test_a_weak_module_is_named(weak):
     result = experiment(weak)
-    assert result.answer == "the modules differ: joint07 is weak (p = 0.002)"
-    (one,) = result.reversal.weak
+    assert result.answer == (
+        "the modules differ: joint07 answers less than its mirror joint19 (p = 0.002): "
+        "joint07 weaker or joint19 stronger"
+    )
+    (one,) = result.reversal.pairs
+    assert (result.reversal.tilt.headings, result.reversal.tilt.excluded) == ("unknown", True)
+    assert result.reversal.middle == "joint13"
     assert (one.name, one.mirror) == ("joint07", "joint19")
     for estimate, truth in ((one.log_gain_contrast, math.log(0.96)), (one.lag_contrast_rad, 0.02)):
         low, high = estimate.ci95
@@ -129,8 +137,19 @@ def test_a_weak_module_is_named(weak):
 
 def test_one_direction_is_not_separable(alike):
     result = experiment(alike[::2])
-    assert result.answer == "boundary or module is open: one direction only; record the reverse"
+    assert result.answer.startswith("6 runs pooled: lag from ")
+    assert result.answer.endswith(
+        "; boundary or module is open: one direction only; record the reverse"
+    )
     assert result.reversal is None
+    assert result.pooled.runs == 6
+    truth = np.exp(BOUNDARY)
+    for k, joint in enumerate(result.pooled.joints):
+        assert joint.name == ROBOT.joint_names[YAW[k]]
+        # All 26 hold together at twice the half width of one (Bonferroni, 5 degrees of freedom).
+        for estimate, value in ((joint.gain, abs(truth[k])), (joint.lag_rad, -np.angle(truth[k]))):
+            half = (estimate.ci95[1] - estimate.ci95[0]) / 2
+            assert abs(estimate.value - value) < 2 * half < 0.01
     assert result.heterogeneity["module_share"].value is None
     assert result.heterogeneity["common_response"].p < 1e-6
     (warning,) = result.warnings
@@ -214,6 +233,7 @@ def test_the_json_object(weak, capsys, tmp_path):
         "runs",
         "heterogeneity",
         "reversal",
+        "pooled",
         "coupling",
         "oscillators",
         "warnings",
@@ -221,7 +241,7 @@ def test_the_json_object(weak, capsys, tmp_path):
     ]
     assert [one["session"]["path"] for one in printed["sessions"]] == [str(path) for path in weak]
     assert printed["reversal"]["p"] == pytest.approx(2 / 924)
-    assert printed["reversal"]["weak"][0]["name"] == "joint07"
+    assert printed["reversal"]["pairs"][0]["name"] == "joint07"
     assert len(printed["reversal"]["joints"]) == M
     assert printed["coupling"]["identifiable"] is False
     assert printed["oscillators"] is None
@@ -234,13 +254,14 @@ def test_the_json_object(weak, capsys, tmp_path):
 def test_the_first_line_is_the_answer(weak, alike, capsys):
     assert undulog.run(["analyse", *map(str, weak)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "12 sessions: the modules differ: joint07 is weak (p = 0.002)."
+    assert lines[0].startswith(
+        "12 sessions: the modules differ: joint07 answers less than its mirror joint19 (p = 0.002)"
+    )
+    assert any(line.startswith("A tilted floor is excluded: ") for line in lines)
     assert any("blind to what is alike at both joints of a mirror pair" in line for line in lines)
     method = next(line for line in lines if line.startswith("Method: reversal, 6 + 6 runs"))
     assert "all 924" in method
     assert all(line.startswith("Note: ") for line in lines[lines.index(method) + 1 :])
     text = render_experiment(experiment(alike[::2]), width=80)
-    assert text.startswith(
-        "6 sessions: boundary or module is open: one direction only; record the reverse.\n"
-    )
+    assert text.startswith("6 sessions: 6 runs pooled: lag from ")
     assert max(len(line) for line in text.splitlines()[1:]) <= 80

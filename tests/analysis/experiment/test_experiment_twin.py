@@ -1,6 +1,7 @@
 """Experiments on recorded twins, a short chain on the ground: six runs each way, and kicks."""
 
 import json
+import math
 import runpy
 from pathlib import Path
 
@@ -57,7 +58,7 @@ def test_identical_modules_are_not_called_different(answered):
     reversal = result.reversal
     assert (reversal.forward_runs, reversal.reverse_runs) == (6, 6)
     assert reversal.p > 0.05
-    assert reversal.weak == ()
+    assert reversal.pairs == ()
     assert reversal.boundary_share.ci95[0] > 0.95
     assert ": the pattern is boundary (share" in result.answer
     # The pattern itself is there beyond doubt.
@@ -67,11 +68,56 @@ def test_identical_modules_are_not_called_different(answered):
 def test_the_weak_servo_is_named(answered):
     result = answered(**WEAK)
     assert result.reversal.p == pytest.approx(2 / 924)
-    assert result.answer.startswith("the modules differ: joint03 is weak (p = 0.002)")
-    weak = result.reversal.weak[0]
-    assert (weak.name, weak.mirror) == ("joint03", "joint05")
-    assert weak.lag_contrast_rad.ci95[0] > 0
+    assert "joint03 answers less than its mirror joint05 (p = 0.002)" in result.answer
+    assert "joint03 weaker or joint05 stronger" in result.answer
+    pair = result.reversal.pairs[0]
+    assert (pair.name, pair.mirror) == ("joint03", "joint05")
+    assert pair.lag_contrast_rad.ci95[0] > 0
     assert result.reversal.boundary_share.value > result.reversal.module_share.value
+
+
+def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
+    """From a recorded gait to the pair, by the verbs, on a floor that falls by 1 degree."""
+    (tmp_path / "chain.toml").write_text(ROBOT)
+    like, folder = tmp_path / "like.mcap", tmp_path / "plan"
+    (tmp_path / "like.toml").write_text(wave())
+    assert undulog.run(["sim", "run", str(tmp_path / "like.toml"), "-o", str(like)]) == 0
+    words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]
+    assert undulog.run(["plan", "reversal", *words]) == 0
+    answers = {}
+    for name, more in (("sound", {}), ("weak", WEAK)):
+        world = tmp_path / f"{name}.toml"
+        world.write_text(wave(world={"slope": math.radians(1.0)}, **more))
+        driven = []
+        for commands in sorted(folder.glob("*.mcap")):
+            driven.append(str(tmp_path / f"{name}-{commands.name}"))
+            on = ["--on", f"twin:{world}", "-o", driven[-1]]
+            assert undulog.run(["drive", str(commands), *on]) == 0
+        at_one_heading = [path for path in driven if path.endswith("-0.mcap")]
+        for plan, paths in (("balanced", driven), ("one heading", at_one_heading)):
+            capsys.readouterr()
+            assert undulog.run(["analyse", *paths, "--json"]) == 0
+            answers[name, plan] = json.loads(capsys.readouterr().out)
+    sound, weak = (answers[name, "balanced"] for name in ("sound", "weak"))
+    for one in (sound, weak):
+        reversal = one["reversal"]
+        assert (reversal["forward_runs"], reversal["reverse_runs"]) == (6, 6)
+        assert reversal["labellings"] == 400
+        assert (reversal["tilt"]["headings"], reversal["tilt"]["strata"]) == ("balanced", 2)
+    assert sound["reversal"]["pairs"] == []
+    assert sound["reversal"]["p"] > 0.05
+    pair = weak["reversal"]["pairs"][0]
+    assert (pair["name"], pair["mirror"]) == ("joint03", "joint05")
+    assert "the modules differ: joint03 answers less than its mirror joint05" in weak["answer"]
+    # With one heading the floor makes identical modules differ, and no module is named.
+    alone = answers["sound", "one heading"]["reversal"]
+    assert (alone["forward_runs"], alone["reverse_runs"]) == (3, 3)
+    tilt = alone["tilt"]
+    assert (tilt["headings"], tilt["excluded"]) == ("unbalanced", False)
+    largest = max(abs(one["lag_difference_rad"]["value"]) for one in alone["joints"])
+    assert largest > 5 * max(
+        abs(one["lag_difference_rad"]["value"]) for one in sound["reversal"]["joints"]
+    )
 
 
 def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):

@@ -7,6 +7,7 @@ import pytest
 
 import undulog
 from analysis.kicks.runs import Kind, missing_kicks, sort_kicks
+from analysis.plan.designs import reversal
 from capture import Session, SessionWriter, load_robot
 from capture.robot import Plane
 
@@ -85,6 +86,24 @@ def test_a_reversal_alternates(like, tmp_path, capsys):
     command = [phasors(file, 2.0)[0][YAW] for file in files]
     step = np.angle([one[1] / one[0] for one in command])
     np.testing.assert_allclose(step, np.array([-1, 1, -1, 1]) * np.pi / 3, atol=1e-5)
+    plans = [phasors(file, 2.0)[2] for file in files]
+    assert [float(one["heading_rad"]) for one in plans] == pytest.approx([0, np.pi, np.pi, 0])
+    assert [file.rpartition("-")[2] for file in files] == [f"{h}.mcap" for h in (0, 180, 180, 0)]
+
+
+@pytest.mark.parametrize("each", [2, 6, 8])
+def test_half_of_each_direction_is_turned_and_drift_cancels(each):
+    runs = reversal(BASE, each)
+    way = np.array([1 if run.facts["kind"] == "as-recorded" else -1 for run in runs])
+    turn = np.array([1 if run.label.endswith("-0") else -1 for run in runs])
+    place = np.arange(len(runs)) - (len(runs) - 1) / 2
+    assert [(way == 1).sum(), (turn == 1).sum()] == [each, each]
+    # Each way at each heading as often: the three contrasts are orthogonal.
+    assert way @ turn == 0
+    if each % 4 == 0:  # pairs of blocks: a drift that is linear in time is in no contrast
+        assert place @ way == place @ turn == 0
+    # The robot is turned every second run at most.
+    assert (np.diff(turn) != 0).sum() <= each
 
 
 def test_what_is_refused(like, tmp_path, capsys):

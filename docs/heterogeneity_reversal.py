@@ -1,0 +1,249 @@
+"""Level and power of the reversal test on a tilted floor, for docs/heterogeneity.md.
+
+Profiles without noise come from the 25-joint twin (``weak-servo-pi3``): identical modules on a
+floor tilted by 0, 0.3, 1 and 2 degrees along the body and across it, and each yaw module in turn
+20 % weaker and stronger. Experiments are drawn on these profiles.
+
+The robot is its own mirror image, so the reversed wave is the wave read from tail to head on a
+floor that falls the other way along the body. That relation gives the reversed wave of single
+modules; it is checked on runs, and the runs of identical modules and of joint05 need it not.
+
+``.venv/bin/python docs/heterogeneity_reversal.py`` prints the tables; it takes about a quarter of
+an hour of one core, nearly all of it for the runs of the twin, which ``--profiles FOLDER`` keeps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from analysis import analyse_session
+from analysis.reversal.mirror import mirror_test
+from analysis.reversal.modules import SIGNIFICANT, ordered_pairs
+from analysis.reversal.tilt import tilt_check
+from capture import Session
+from sim import load_scenario
+from sim.physics.engine import Kernels
+from sim.record import record
+
+TILTS_DEG = (0.3, 1.0, 2.0)
+DIRECTIONS = {"fore-aft": 0.0, "sideways": math.pi / 2}
+SHARE = 0.2
+YAW = tuple(f"joint{k:02d}" for k in range(1, 26, 2))
+MIDDLE = YAW[len(YAW) // 2]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of the twin.
+
+    Attributes:
+        tilt_deg: Of the floor [degrees].
+        direction: Where it falls to, a key of ``DIRECTIONS``.
+        heading_deg: Of the robot at the start, 0 or 180 [degrees].
+        joint: The module that differs; empty: none.
+        share: By how much its stall torque does.
+        reverse: Whether the wave runs from tail to head.
+    """
+
+    tilt_deg: float = 0.0
+    direction: str = "fore-aft"
+    heading_deg: int = 0
+    joint: str = ""
+    share: float = 0.0
+    reverse: bool = False
+
+    @property
+    def file(self) -> str:
+        """Name of the file that keeps its profile."""
+        way = "reverse" if self.reverse else "forward"
+        module = f"{self.joint}{self.share:+g}" if self.joint else "identical"
+        return f"{way}-{self.tilt_deg:g}-{self.direction}-{self.heading_deg}-{module}.npy"
+
+
+def profile(case, folder):
+    """ln(response/command) of the yaw joints without noise, kept or from a run, shape (13,)."""
+    kept = folder / case.file
+    if kept.exists():
+        return np.load(kept)
+    changes = {"world.heading": math.radians(case.heading_deg)}
+    if case.tilt_deg:
+        changes["world.slope"] = math.radians(case.tilt_deg)
+        changes["world.slope_heading"] = DIRECTIONS[case.direction]
+    if case.joint:
+        changes[f"servo_of.{case.joint}.stall_torque"] = 0.25 * (1 + case.share)
+    scenario = load_scenario("weak-servo-pi3" + ("-reverse" if case.reverse else ""), changes)
+    path = folder / "run.mcap"
+    record(scenario, path, kernels=Kernels.NUMBA, force=True)
+    with Session.open(path) as session:
+        joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
+    if tuple(one.name for one in joints) != YAW:
+        raise RuntimeError(f"{case}: gain and lag of {len(joints)} joints only")
+    y = np.array([np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints])
+    np.save(kept, y)
+    return y
+
+
+def is_run(case):
+    """Whether the reversed wave of a case is simulated rather than taken from the relation."""
+    return not case.joint or (case.joint == "joint05" and case.share < 0)
+
+
+def other_way(case, folder):
+    """The profile of the reversed wave, joints from head to tail."""
+    return profile(replace(case, reverse=True), folder) if is_run(case) else mirrored(case, folder)
+
+
+def mirrored(case, folder):
+    """The profile of the reversed wave by the relation, joints from head to tail."""
+    falls_along = case.tilt_deg and case.direction == "fore-aft"
+    heading = 180 - case.heading_deg if falls_along else case.heading_deg
+    mirror = YAW[-1 - YAW.index(case.joint)] if case.joint else ""
+    return profile(replace(case, heading_deg=heading, joint=mirror), folder)[::-1]
+
+
+@dataclass
+class Rates:
+    """Shares of experiments, counted up."""
+
+    rejected: int = 0
+    stated: int = 0
+    named: int = 0
+    right: int = 0
+
+    def text(self, count):
+        """As percentages."""
+        parts = (self.rejected, self.stated, self.named, self.right)
+        return "  ".join(f"{100 * part / count:5.1f}" for part in parts)
+
+
+def experiments(case, folder, *, balanced, count, scatter, seed):
+    """Draw experiments of 6 + 6 runs on a case.
+
+    Args:
+        case: The floor and the module; its heading is that of the runs with one heading.
+        folder: Of the kept profiles.
+        balanced: Whether half of the runs of each direction are turned.
+        count: Experiments.
+        scatter: Standard deviation of a run's log gain, and of its lag [rad].
+        seed: Of the scatter.
+
+    Returns:
+        How often identical modules are rejected, a pair is stated, it is named (stated without
+        'or the floor is tilted'), and the right one is first and in the right order.
+    """
+    random = np.random.default_rng(seed)
+    headings = (0, 180) if balanced and case.tilt_deg else (0, 0)
+    ways = [
+        np.stack([each(replace(case, heading_deg=one), folder) for one in headings])
+        for each in (profile, other_way)
+    ]
+    # The wave at one heading is the mirror image of its reverse at the other.
+    strata = (np.repeat([0, 1], 3), np.repeat([1, 0], 3)) if balanced else None
+    first = None
+    if case.joint:
+        pair = (case.joint, YAW[-1 - YAW.index(case.joint)])
+        first = pair if case.share < 0 else pair[::-1]
+    rates = Rates()
+    for _ in range(count):
+        noise = random.normal(0.0, scatter, (2, 2, 6, len(YAW)))
+        runs = [
+            np.repeat(y, 3, axis=0) + z[0] + 1j * z[1] for y, z in zip(ways, noise, strict=True)
+        ]
+        test = mirror_test(*runs, strata)
+        rates.rejected += test.p < SIGNIFICANT
+        pairs = ordered_pairs(YAW, test)
+        if pairs:
+            rates.stated += 1
+            rates.named += balanced or tilt_check(*runs, test).excluded
+            rates.right += (pairs[0].name, pairs[0].mirror) == first
+    return rates
+
+
+def check_relation(folder):
+    """Print how far runs of the reversed wave are from the relation."""
+    checked = [Case(), Case(joint="joint05", share=-SHARE)]
+    for direction in DIRECTIONS:
+        for heading in (0, 180):
+            checked += [Case(tilt, direction, heading) for tilt in TILTS_DEG]
+            checked.append(Case(2.0, direction, heading, "joint05", -SHARE))
+    worst = max(
+        float(np.abs(other_way(case, folder) - mirrored(case, folder)).max()) for case in checked
+    )
+    print(
+        f"{len(checked)} runs of the reversed wave against the relation: at most "
+        f"{math.degrees(worst):.4f} degrees"
+    )
+
+
+def check_cancelling(folder):
+    """Print what a floor leaves of d with one heading and with both, identical modules."""
+    print(
+        "floor                 |d| in degrees: one heading, balanced; common/contrast, one heading"
+    )
+    for tilt in TILTS_DEG:
+        for direction in DIRECTIONS:
+            plus = [profile(Case(tilt, direction, one), folder) for one in (0, 180)]
+            minus = [other_way(Case(tilt, direction, one), folder)[::-1] for one in (0, 180)]
+            one, both = plus[0] - minus[0], (plus[0] + plus[1] - minus[0] - minus[1]) / 2
+            ratio = np.linalg.norm(one + one[::-1]) / np.linalg.norm(one - one[::-1])
+            size = [math.degrees(np.abs(d).max()) for d in (one, both)]
+            print(f"  {tilt:3.1f} {direction:9s} {size[0]:16.3f} {size[1]:10.4f} {ratio:10.2f}")
+
+
+def main():
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--profiles", type=Path, help="folder that keeps the twin's profiles")
+    parser.add_argument("--count", type=int, default=500, help="experiments a row")
+    parser.add_argument("--scatter", type=float, default=0.1, help="of a run [degrees]")
+    chosen = parser.parse_args()
+    count, scatter = chosen.count, math.radians(chosen.scatter)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = chosen.profiles or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        check_relation(folder)
+        check_cancelling(folder)
+        print(f"{count} experiments of 6 + 6 runs a row, scatter {chosen.scatter:g} degrees")
+        print("                                        rejected stated named right, in %")
+        floors = [(0.0, "fore-aft"), *((t, d) for t in TILTS_DEG for d in DIRECTIONS)]
+        plans = {"one heading": False, "balanced": True}
+        for plan, balanced in plans.items():
+            for seed, (tilt, direction) in enumerate(floors):
+                case = Case(tilt, direction)
+                how = {"balanced": balanced, "count": count, "scatter": scatter, "seed": seed}
+                rates = experiments(case, folder, **how)
+                print(f"  identical {plan:11s} {tilt:3.1f} {direction:9s}  {rates.text(count)}")
+        for plan, balanced in plans.items():
+            for tilt, direction, share in (
+                (0.0, "fore-aft", -SHARE),
+                (0.0, "fore-aft", SHARE),
+                *((2.0, direction, -SHARE) for direction in DIRECTIONS),
+            ):
+                rows = {}
+                for seed, joint in enumerate(YAW):
+                    if joint == MIDDLE:
+                        continue
+                    case = Case(tilt, direction, joint=joint, share=share)
+                    how = {"balanced": balanced, "count": count, "scatter": scatter, "seed": seed}
+                    rows[joint] = experiments(case, folder, **how)
+                hardest = min(rows, key=lambda joint: rows[joint].right)
+                title = f"{100 * share:+.0f} % {plan:11s} {tilt:3.1f} {direction:9s}"
+                mean = Rates(
+                    *(
+                        np.mean([getattr(one, key) for one in rows.values()])
+                        for key in ("rejected", "stated", "named", "right")
+                    )
+                )
+                print(f"  {title} joint05       {rows['joint05'].text(count)}")
+                print(f"  {title} mean of 12    {mean.text(count)}")
+                print(f"  {title} worst {hardest} {rows[hardest].text(count)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
