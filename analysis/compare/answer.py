@@ -12,7 +12,7 @@ from .decisions import SIGNIFICANT, Decided
 from .result import BODY, BrokenJoint, Difference
 
 MOST = 4
-"""Broken joints that the sentence lists at most."""
+"""Broken or differing joints that the sentence lists at most."""
 
 WORDS = {
     "gain": "gain",
@@ -135,6 +135,10 @@ def _largest(decided: Decided) -> str:
         others = len(decided.named) - 1
         more = f"; {others} other joint{'s' if others > 1 else ''} by less" if others else ""
         smallest = min(one.p_holm for one in own)
+        others = [formats.plain(one.name) for one in decided.named[1:]]
+        listed = ", ".join(others[:MOST])
+        listed += f" and {len(others) - MOST} more" if len(others) > MOST else ""
+        more = f"; {listed} by less" if others else ""
         return f"{name} most, {parts} ({formats.told_p(smallest)}){more}"
     first = beyond_doubt[0]
     others = len(beyond_doubt) - 1

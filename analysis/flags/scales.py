@@ -39,6 +39,9 @@ SAME_RATE = 1.25
 """A velocity and its position that differ by less than this agree: sampled in step with a ripple of
 the control period, a sound velocity may be off by 14 % (twin)."""
 
+SURE = 4.0
+"""Standard errors by which a scale is off beyond what counts as agreement."""
+
 HOLE_SHARE = 0.02
 """More of a cycle without samples says nothing."""
 
@@ -56,12 +59,14 @@ class Compared:
         ratio: Standard deviation of the first over that of the second, shape (c,); NaN where
             either stands still or has a gap.
         correlation: Shape (c,).
+        error: Standard error that noise makes of the logarithm of the ratio, shape (c,).
     """
 
     start_s: FloatArray
     stop_s: FloatArray
     ratio: FloatArray
     correlation: FloatArray
+    error: FloatArray
 
     def spans(self, marked: BoolArray) -> tuple[Span, ...]:
         """The marked cycles as stretches.
@@ -127,7 +132,9 @@ def compare(first: Series, second: Series, edges_s: FloatArray) -> Compared:
     nothing = np.full(starts.size, np.nan)
     ratio = np.sqrt(np.divide(xx, yy, out=nothing.copy(), where=usable))
     correlation = np.divide(xy, np.sqrt(xx * yy), out=nothing, where=usable)
-    return Compared(first.t_s[starts], stops, ratio, correlation)
+    # Of two noisy copies of one signal (delta method): var(ln ratio) = (1 - r^2) / n.
+    error = np.sqrt(np.maximum(1 - correlation**2, 0.0) / np.maximum(count, 1))
+    return Compared(first.t_s[starts], stops, ratio, correlation, error)
 
 
 def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
@@ -167,7 +174,7 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     if known.size:
         ratio[known] = _smoothed(ratio[known])
     unit = _near(ratio, DEGREE) | _near(ratio, 1 / DEGREE)
-    off = np.abs(np.log(ratio)) > np.log(same)
+    off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
     return _found(
         one,
         {

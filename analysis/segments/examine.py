@@ -43,6 +43,8 @@ class Chain:
         response: Of these, shape (m,), with errors.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by name.
         scatter: Errors of log gain and of lag; None where they are those of the response.
+        loaded: Names of joints at a limit of their servo beside others that are, too: what
+            they do is their load's doing, and no joint's own.
     """
 
     plane: str
@@ -52,6 +54,7 @@ class Chain:
     response: Response
     offsets: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
     scatter: tuple[Scatter, Scatter] | None = None
+    loaded: frozenset[str] = frozenset()
 
     @property
     def errors(self) -> tuple[Scatter, Scatter] | None:
@@ -102,6 +105,8 @@ def examine(chains: Iterable[Chain]) -> Findings:
         if len(chain.names) < MIN_JOINTS:
             continue
         for each in standing_out(profile, critical):
+            if chain.names[each.joint] in chain.loaded:
+                continue
             excluded[id(chain)].add(each.joint)
             out.append(_stand_out(chain, quantity, each, critical))
     for chain in some:

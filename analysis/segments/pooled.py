@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from capture.arrays import FloatArray, IntArray
 from capture.robot import Robot
 
 from ..experiment.pooling import PooledResponse
@@ -63,8 +63,11 @@ def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
     """Scatter of the mean of values (r runs, m joints): r - 1 columns, and what noise adds (m,)."""
     runs, joints = values.shape
     centred = values - values.mean(axis=0)
-    # Columns of an orthonormal basis of the contrasts between runs: r - 1 independent ones.
-    basis = np.linalg.qr(np.column_stack([np.ones(runs), np.eye(runs)[:, 1:]]))[0][:, 1:]
-    columns = np.asarray(centred.T @ basis / runs**0.5, dtype=np.float64)
-    raised = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
+    # Helmert's contrasts between the runs are orthonormal, so the columns are independent.
+    size: IntArray = np.arange(1, runs, dtype=np.int64)
+    lower = np.tril(np.ones((runs - 1, runs)))
+    lower[np.arange(runs - 1), size] = -size
+    basis = lower / np.sqrt(size * (size + 1.0))[:, None]
+    columns = (basis @ centred).T / runs**0.5
+    raised: FloatArray = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
     return Scatter(columns, raised, np.zeros(joints))

@@ -273,7 +273,7 @@ def _worst(profile: Profile, state: _State, critical: float) -> tuple[int | None
     value = rows @ profile.values
     error = np.sqrt(profile.scatter.variance(rows))
     score = np.where(state.active, np.abs(value) / np.maximum(error, 1e-300), 0.0)
-    for joint in np.argsort(-score)[: 1 + len(score) // 3].tolist():
+    for joint in np.argsort(-score).tolist():
         if score[joint] <= critical:
             break
         one = Deviation(joint, float(value[joint]), float(error[joint]))

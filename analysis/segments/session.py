@@ -188,6 +188,7 @@ def compare_joints(
     old = {j.name for j in results if j.name in sound and "stale" in j.flags}
     if old != sound:  # where all samples are late by a hold, that makes no difference
         sound -= old
+    loaded = _loaded(results, commanded)
     chains: list[Chain] = []
     for index, group in enumerate(gait.groups):
         if group.response is None:
@@ -198,5 +199,18 @@ def compare_joints(
             own = [name for name in names if name in sound and name in group.answered]
             response = group.response.select([group.answered.index(name) for name in own])
             means = {name: offsets[name] for name in own if name in offsets}
-            chains.append(Chain(plane, index, tuple(names), tuple(own), response, means))
+            chains.append(
+                Chain(plane, index, tuple(names), tuple(own), response, means, loaded=loaded)
+            )
     return examine(chains)
+
+
+def _loaded(joints: Iterable[JointResult], commanded: tuple[str, ...]) -> frozenset[str]:
+    """Commanded joints at a limit beside another that is, head to tail."""
+    flags = {joint.name: joint.flags for joint in joints}
+    limited = ["saturated" in flags.get(name, ()) for name in commanded]
+    return frozenset(
+        name
+        for k, name in enumerate(commanded)
+        if limited[k] and any(limited[j] for j in (k - 1, k + 1) if 0 <= j < len(limited))
+    )

@@ -30,6 +30,9 @@ JOIN = 0.3
 HELD_WINDOWS = 2
 """Windows in turn in which a joint that is held stands still."""
 
+STARTING = 2.0
+"""Cycles in which a joint may stand at the beginning of a record: it is being started."""
+
 LOADED_WINDOWS = 2 * BLOCKS + 1
 """The same where its neighbours are held back, too."""
 
@@ -119,6 +122,9 @@ def find_holds(
         before, after = np.flatnonzero(away[: i + quarter]), np.flatnonzero(away[j - quarter :])
         start = int(before[-1]) + 1 if before.size else 0
         end = j - quarter + int(after[0]) - 1 if after.size else position.t_s.size - 1
+        begun = float(position.t_s[start]) - float(position.t_s[0]) < response.period_s / 4
+        if begun and position.t_s[end] - position.t_s[0] < STARTING * response.period_s:
+            continue
         spans.append((float(position.t_s[start]), float(position.t_s[end])))
         levels.append(level)
     if not spans:

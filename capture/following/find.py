@@ -49,7 +49,7 @@ NEIGHBOURS = 4
 MIN_WINDOWS = 5
 """Windows (two whole cycles) that a joint's own usual response needs."""
 
-LOADED = 0.5
+LOADED = 0.7
 """Gain below which a joint's neighbours are held back by a load: then it may be, too."""
 
 ORDERLY = 0.8

@@ -260,8 +260,8 @@ def test_dead_and_frozen_joints_are_left_out_and_named(bag, wave):
     )
     assert any(text.startswith("joint05: no response") for text in result.warnings)
     assert [(one.joint, one.flag, one.about) for one in result.artefacts] == [
-        ("joint03", "frozen", "sensor"),
-        ("joint07", "frozen", "sensor"),
+        ("joint03", "frozen", "sensor or joint"),
+        ("joint07", "frozen", "sensor or joint"),
     ]
     assert result.artefacts[1].spans_s == (
         (pytest.approx(3.0, abs=1e-6), pytest.approx(3.99, abs=1e-6)),

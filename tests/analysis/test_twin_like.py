@@ -279,7 +279,7 @@ def test_the_json_object(twin, capsys):
 def test_the_first_line_is_the_answer_and_the_last_the_method(twin, capsys):
     assert undulog.run(["analyse", str(twin)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("twin.mcap: The segments move alike, all within 2 %")
+    assert lines[0].startswith("twin.mcap: The segments move alike: all 13 joints are within 2 %")
     assert lines[1].startswith("13 of 25 joints respond to a gait of 0.5")
     assert any(line.startswith("joint25  horizontal") for line in lines)
     assert "Method: harmonic least squares" in "\n".join(lines[-4:])

@@ -96,6 +96,7 @@ def found_in(joints, *, effort=None, second=None):
         voltage={},
         reference=signals(second),
         topics={},
+        powers={},
     )
     found = dead_bands(columns, commands, responses, gait, 0)
     return {int(name.removeprefix("joint")): one for name, one in found.items()}, gait

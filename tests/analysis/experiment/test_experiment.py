@@ -137,7 +137,7 @@ def test_a_weak_module_is_named(weak):
 
 def test_one_direction_is_not_separable(alike):
     result = experiment(alike[::2])
-    assert result.answer.startswith("6 runs pooled: lag from ")
+    assert result.answer.startswith("6 runs pooled: The segments do not move alike: ")
     assert result.answer.endswith(
         "; boundary or module is open: one direction only; record the reverse"
     )
@@ -263,5 +263,5 @@ def test_the_first_line_is_the_answer(weak, alike, capsys):
     assert "all 924" in method
     assert all(line.startswith("Note: ") for line in lines[lines.index(method) + 1 :])
     text = render_experiment(experiment(alike[::2]), width=80)
-    assert text.startswith("6 sessions: 6 runs pooled: lag from ")
+    assert text.startswith("6 sessions: 6 runs pooled: The segments do not move alike: ")
     assert max(len(line) for line in text.splitlines()[1:]) <= 80

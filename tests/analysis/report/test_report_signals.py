@@ -59,7 +59,7 @@ def test_a_page_that_grows_too_large_goes_without_signals_and_says_so(snake, rec
         assert "the cycles one by one, are not drawn" in lean
         assert "the cycles one by one, are not drawn" not in full
         monkeypatch.setattr("analysis.report.page.LARGEST_BYTES", 1000)
-        with pytest.raises(UsageError, match=r"page on one session would be 0\.2 MB"):
+        with pytest.raises(UsageError, match=r"page on one session would be 0\.157 MB"):
             render(snake, session)
 
 
