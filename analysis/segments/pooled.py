@@ -61,7 +61,7 @@ def pooled_answer(
 
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
     """Scatter of the mean of values (r runs, m joints): r - 1 columns, and what noise adds (m,)."""
-    runs, joints = values.shape
+    runs = len(values)
     centred = values - values.mean(axis=0)
     # Helmert's contrasts between the runs are orthonormal, so the columns are independent.
     size: IntArray = np.arange(1, runs, dtype=np.int64)
@@ -70,4 +70,4 @@ def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
     basis = lower / np.sqrt(size * (size + 1.0))[:, None]
     columns = (basis @ centred).T / runs**0.5
     raised: FloatArray = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
-    return Scatter(columns, raised, np.zeros(joints))
+    return Scatter(columns, raised, np.zeros_like(raised))

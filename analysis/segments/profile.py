@@ -33,6 +33,9 @@ ROUGH = 2.0
 MIN_JOINTS = 4
 """Fewer sound joints can't say which of them differs."""
 
+NOISIER = 3.0
+"""Variance, in medians of all joints', from which a joint counts less."""
+
 ENDS, MIDDLE = 2, 5
 MAX_DEGREE = 4
 
@@ -62,9 +65,13 @@ class Profile:
 
     @property
     def precision(self) -> FloatArray:
-        """Weights of least squares: a joint noisier than most counts less, shape (m,)."""
+        """Weights of least squares: a joint much noisier than most counts less, shape (m,).
+
+        Weights that follow the estimated variances closely would favour those that happen to be
+        estimated too small, and make intervals too narrow.
+        """
         own = self.scatter.variance(np.eye(self.values.size))
-        return 1 / np.maximum(own, max(float(np.median(own)), 1e-300))
+        return 1 / np.maximum(own, max(NOISIER * float(np.median(own)), 1e-300))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,107 @@
+"""Who stands out of a profile, and what shape the rest has: planted, with known covariance."""
+
+import math
+
+import numpy as np
+import pytest
+
+from analysis.segments.family import Member, Scatter, critical_value
+from analysis.segments.profile import Profile, contrasts, family_of, standing_out
+
+SIGMA, COLUMNS = 1e-3, 24
+
+
+def scatter(rng, joints, shared=0.0):
+    own, common = rng.standard_normal((joints, COLUMNS)), rng.standard_normal((1, COLUMNS))
+    columns = SIGMA * (math.sqrt(1 - shared) * own + math.sqrt(shared) * common)
+    return Scatter(columns, np.zeros(joints), np.zeros(joints))
+
+
+def profile(rng, values, margin=0.0, shared=0.0):
+    joints = len(values)
+    common = math.sqrt(shared) * rng.standard_normal()
+    noise = SIGMA * (math.sqrt(1 - shared) * rng.standard_normal(joints) + common)
+    place = np.arange(joints, dtype=float)
+    return Profile(place, joints, values + noise, scatter(rng, joints, shared), margin)
+
+
+def test_one_contrast_of_known_error_has_student_s_quantile():
+    rng = np.random.default_rng(1)
+    many = Scatter(rng.standard_normal((1, COLUMNS)), np.zeros(1), np.zeros(1))
+    found = critical_value([Member(np.ones((1, 1)), many)], draws=40_000)
+    assert found == pytest.approx(2.064, abs=0.05)  # t with 24 degrees of freedom
+
+
+def test_many_independent_contrasts_have_the_quantile_of_their_largest():
+    rng = np.random.default_rng(2)
+    many = Scatter(rng.standard_normal((10, 100)), np.zeros(10), np.zeros(10))
+    found = critical_value([Member(np.eye(10), many)], draws=2000)
+    assert found == pytest.approx(2.87, abs=0.12)  # Student's t with 100 at 1 - 0.05 / 20
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.8])
+def test_identical_joints_are_rarely_told_apart(shared):
+    rng = np.random.default_rng(3)
+    wrong = 0
+    for _ in range(200):
+        one = profile(rng, np.full(9, 0.5), shared=shared)
+        critical = critical_value([family_of(one)], draws=2000)
+        claims = [c for c in contrasts(one, np.ones(9, bool)) if abs(c.value) > critical * c.error]
+        wrong += bool(standing_out(one, critical)) or bool(claims)
+    assert wrong <= 20  # 10 are expected, 20 or more have a chance of 0.3 %
+
+
+@pytest.mark.parametrize("joint", [0, 4, 8])
+def test_a_joint_that_is_off_is_named_wherever_it_is(joint):
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        values = np.full(9, 0.5)
+        values[joint] += 15 * SIGMA
+        one = profile(rng, values)
+        found = standing_out(one, critical_value([family_of(one)], draws=2000))[0]
+        assert found.joint == joint
+        assert found.value == pytest.approx(15 * SIGMA, abs=5 * SIGMA)
+
+
+def test_two_that_are_off_do_not_hide_each_other():
+    rng = np.random.default_rng(5)
+    values = np.full(12, 0.5)
+    values[[2, 7]] -= 30 * SIGMA, 20 * SIGMA
+    one = profile(rng, values)
+    found = standing_out(one, critical_value([family_of(one)], draws=300))
+    assert [each.joint for each in found] == [2, 7]
+
+
+def test_below_the_margin_nobody_is_named():
+    rng = np.random.default_rng(6)
+    values = np.full(9, 0.5)
+    values[3] += 15 * SIGMA
+    one = profile(rng, values, margin=0.02)
+    assert standing_out(one, critical_value([family_of(one)], draws=300)) == []
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        (lambda x: 0.05 * x, "trend"),
+        (lambda x: 0.05 * np.abs(x), "mirror"),
+        (lambda x: 0.05 * (np.abs(x) > 0.99), "ends"),
+    ],
+)
+def test_a_smooth_profile_is_a_shape_and_names_nobody(shape, kind):
+    rng = np.random.default_rng(7)
+    one = profile(rng, 0.5 + shape(np.linspace(-1, 1, 13)))
+    critical = critical_value([family_of(one)], draws=300)
+    assert standing_out(one, critical) == []
+    found = {each.kind: each for each in contrasts(one, np.ones(13, bool))}
+    assert abs(found[kind].value) > critical * found[kind].error
+
+
+def test_a_joint_stands_out_of_a_profile_too():
+    rng = np.random.default_rng(8)
+    values = 0.5 + 0.05 * np.linspace(-1, 1, 13)
+    values[5] -= 0.05
+    one = profile(rng, values)
+    (found,) = standing_out(one, critical_value([family_of(one)], draws=300))
+    assert found.joint == 5
+    assert found.value == pytest.approx(-0.05, abs=0.01)

@@ -1,0 +1,167 @@
+"""Joints that do not follow: signals in closed form, one fault each, and the kinds that fit."""
+
+import numpy as np
+import pytest
+
+from capture.following import KINDS, JointMotion, joints_not_following
+from capture.following.motion import Samples, cycle_s, windowed_response
+
+RATE, LENGTH, OMEGA, GAIN, LAG, NOISE = 100.0, 15.0, 2 * np.pi * 0.83, 0.95, np.radians(10), 4e-3
+BROKEN = 3
+
+
+class Chain:
+    """Nine identical joints whose signals a test may change before they are judged."""
+
+    def __init__(self, joints=9, seed=1, step=-np.pi / 3):
+        self.t = np.arange(int(RATE * LENGTH)) / RATE
+        phase = OMEGA * self.t + step * np.arange(joints)[:, None]
+        self.rng = np.random.default_rng(seed)
+        self.command = 0.4 * np.sin(phase)
+        self.true = GAIN * 0.4 * np.sin(phase - LAG)
+        self.position = self.true + self.rng.normal(0, NOISE, self.true.shape)
+        self.velocity = GAIN * 0.4 * OMEGA * np.cos(phase - LAG)
+        self.effort = 5 * (self.command - self.true)
+        self.second = self.true.copy()
+        self.channels = set()
+
+    def judged(self, *channels):
+        def samples(values, quantity=None):
+            return Samples(self.t, values) if quantity is None or quantity in channels else None
+
+        motions = [
+            JointMotion(
+                f"j{k + 1}",
+                Samples(self.t, self.command[k]),
+                Samples(self.t, self.position[k]),
+                velocity=samples(self.velocity[k], "velocity"),
+                effort=samples(self.effort[k], "effort"),
+                reference=samples(self.second[k], "second"),
+            )
+            for k in range(len(self.command))
+        ]
+        return {fault.joint: fault for fault in joints_not_following(motions)}
+
+
+@pytest.fixture
+def chain():
+    return Chain()
+
+
+def jam(chain, at_s=7.4):
+    later = chain.t > at_s
+    chain.position[BROKEN, later] = chain.position[BROKEN, ~later][-1]
+    chain.velocity[BROKEN, later] = 0.0
+    chain.second[BROKEN, later] = chain.true[BROKEN, ~later][-1]
+    chain.effort[BROKEN] = np.where(
+        later, 5 * (chain.command[BROKEN] - chain.position[BROKEN]), chain.effort[BROKEN]
+    )
+
+
+@pytest.mark.parametrize("joints", [1, 2, 4, 9, 40])
+@pytest.mark.parametrize("step", [-np.pi / 3, 0.0])
+def test_sound_joints_are_not_named(joints, step):
+    for seed in range(5):
+        assert Chain(joints, seed, step).judged("velocity", "effort", "second") == {}
+
+
+def test_the_windowed_response_is_gain_and_lag(chain):
+    command, position = Samples(chain.t, chain.command[0]), Samples(chain.t, chain.true[0])
+    assert cycle_s(command) == pytest.approx(2 * np.pi / OMEGA, rel=0.01)
+    found = windowed_response(command, position, 2 * np.pi / OMEGA)
+    ratio = found.ratio[1:]  # before the record there is no delayed command
+    np.testing.assert_allclose(np.abs(ratio), GAIN, rtol=2e-3)
+    np.testing.assert_allclose(-np.angle(ratio), LAG, atol=2e-3)
+
+
+def test_a_jam_is_named_with_its_time_and_all_kinds_that_fit(chain):
+    jam(chain)
+    found = chain.judged("velocity")
+    assert list(found) == ["j4"]
+    assert found["j4"].since_s == pytest.approx(7.4, abs=0.3)
+    assert found["j4"].until_s is None
+    assert {"jammed", "frozen_sensor"} <= set(found["j4"].kinds)
+    assert found["j4"].about == "mechanics or sensor"
+
+
+@pytest.mark.parametrize(
+    ("channel", "excluded"), [("effort", {"frozen_sensor", "dead"}), ("second", {"frozen_sensor"})]
+)
+def test_effort_or_a_second_sensor_exclude_kinds_of_a_jam(chain, channel, excluded):
+    jam(chain)
+    kinds = set(chain.judged(channel)["j4"].kinds)
+    assert "jammed" in kinds
+    assert not kinds & excluded
+
+
+@pytest.mark.parametrize("channel", ["velocity", "effort", "second"])
+def test_a_frozen_sensor_is_decided_by_any_other_channel(chain, channel):
+    later = chain.t > 7.4
+    chain.position[BROKEN, later] = chain.position[BROKEN, ~later][-1]
+    assert chain.judged(channel)["j4"].kinds == ("frozen_sensor",)
+
+
+def test_a_dead_joint_has_no_effort(chain):
+    chain.position[BROKEN] = chain.rng.normal(0, NOISE, chain.t.size)
+    chain.velocity[BROKEN] = chain.effort[BROKEN] = 0.0
+    found = chain.judged("velocity")["j4"]
+    assert found.since_s is None
+    assert {"dead", "jammed"} <= set(found.kinds)
+    assert "frozen_sensor" not in found.kinds  # new noise in each sample
+    assert chain.judged("effort")["j4"].kinds == ("dead",)
+
+
+def test_an_inverted_joint(chain):
+    chain.position[BROKEN] *= -1
+    assert chain.judged()["j4"].kinds == ("inverted", "inverted_sensor")
+    assert chain.judged("second")["j4"].kinds == ("inverted_sensor",)
+    assert chain.judged("velocity")["j4"].kinds == ("inverted_sensor",)
+    chain.second[BROKEN] *= -1
+    assert chain.judged("second")["j4"].kinds == ("inverted",)
+
+
+def test_holds_again_and_again_are_intermittent(chain):
+    for start in np.arange(1.0, 14.0, 2.5):
+        held = (chain.t > start) & (chain.t < start + 0.5)
+        chain.position[BROKEN, held] = chain.position[BROKEN, held][0]
+    found = chain.judged()["j4"]
+    assert found.kinds[0] == "intermittent"
+    assert 0.02 < found.share < 0.4
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (lambda p, t, rng: p + 0.15 * (t > 8), "slipped_sensor"),
+        (lambda p, t, rng: p + 0.01 * t, "drifting_sensor"),
+        (lambda p, t, rng: np.degrees(p), "scaled_sensor"),
+        (lambda p, t, rng: np.repeat(p[::3], 3)[: t.size], "stale_sensor"),
+        (lambda p, t, rng: p + rng.normal(0, 0.15, t.size) * ((t % 5) < 0.6), "noisy_sensor"),
+    ],
+)
+def test_faults_of_a_sensor(chain, change, kind):
+    chain.position[BROKEN] = change(chain.position[BROKEN], chain.t, chain.rng)
+    found = chain.judged()
+    assert list(found) == ["j4"]
+    assert kind in found["j4"].kinds
+
+
+def test_swapped_cables_name_both(chain):
+    chain.position[[3, 4]] = chain.position[[4, 3]]
+    found = chain.judged()
+    assert {name: fault.kinds for name, fault in found.items()} == {
+        "j4": ("swapped",),
+        "j5": ("swapped",),
+    }
+
+
+def test_what_all_joints_do_together_is_no_joint_s_fault(chain):
+    stopped = (chain.t > 6) & (chain.t < 8)
+    first = int(np.argmax(stopped))
+    chain.position[:, stopped] = chain.position[:, first : first + 1]
+    found = chain.judged()
+    assert not found or len(found) == 9
+
+
+def test_every_kind_says_where_it_lies():
+    assert {about for about, _ in KINDS.values()} == {"mechanics", "wiring", "sensor", "record"}
