@@ -17,7 +17,7 @@ from ..arrays import BoolArray, FloatArray
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span
 from .kinds import Symptom, fault_of
-from .motion import JointMotion, Response, cycle_s, windowed_response
+from .motion import FEW_SAMPLES, JointMotion, Response, cycle_s, windowed_response
 from .records import record_faults, wraps
 from .swaps import swapped_pairs
 
@@ -26,6 +26,9 @@ DRIVEN_SHARE = 0.01
 
 MIN_COMMAND_RAD = 1e-3
 """A command that moves less than this is held still, whatever the others do [rad]."""
+
+SHORTEST_S = 2.0
+"""A shorter record is not judged [s]."""
 
 COHERENT = 0.5
 """Explained share above which a window follows its command, with whatever gain and lag."""
@@ -104,11 +107,7 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     """
     largest = max((each.command.range for each in motions), default=0.0)
     least = max(DRIVEN_SHARE * largest, MIN_COMMAND_RAD)
-    driven = [
-        each
-        for each in motions
-        if each.command.range > least and each.position.t_s.size > 1 and each.command.t_s.size > 1
-    ]
+    driven = [each for each in motions if each.command.range > least and _lasts(each)]
     responses = [
         windowed_response(each.command, each.position, cycle_s(each.command)) for each in driven
     ]
@@ -147,6 +146,14 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
         if symptoms[each.name]
     )
     return tuple(fault for fault in faults if fault is not None)
+
+
+def _lasts(motion: JointMotion) -> bool:
+    """Whether command and position overlap for long enough to judge the one by the other."""
+    command, position = motion.command.t_s, motion.position.t_s
+    if min(command.size, position.size) < FEW_SAMPLES:
+        return False
+    return min(command[-1], position[-1]) - max(command[0], position[0]) >= SHORTEST_S
 
 
 def own_response(response: Response) -> complex | None:

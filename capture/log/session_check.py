@@ -17,7 +17,7 @@ from ..robot import Robot
 from ..robot.description import robot_in_session
 from .chunk import Block
 from .container_check import Container, check_chunk, check_container
-from .health import judge_file, judge_following
+from .health import judge_file, judge_following, verdict_of
 from .joined import Finding
 from .mcap_file import McapFile
 from .measures import FileHealth
@@ -39,6 +39,8 @@ class SessionHealth(SessionMeasures):
         stored: The verdict stored by whoever recorded it, or None.
         stored_reasons: The reasons stored with it.
         file: The container.
+        following: Joints that do not follow their command: only the whole file shows them, so a
+            recorder's verdict is without.
     """
 
     path: Path
@@ -46,6 +48,17 @@ class SessionHealth(SessionMeasures):
     stored: str | None
     stored_reasons: tuple[str, ...]
     file: FileHealth
+    following: tuple[Finding, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """``good``, ``degraded`` or ``bad``."""
+        return verdict_of((*self.findings, *self.following))
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is not better: joints that do not follow first, then heaviest first."""
+        return (*(finding.sentence for finding in self.following), *super().reasons)
 
 
 def check_session(
@@ -87,8 +100,7 @@ class _Check:
     def run(self, on_part: Callable[[float], None]) -> SessionHealth:
         """Read, then judge."""
         file = self._against_summary(self._read(on_part))
-        before = [*judge_file(file), *self._judge_following(file)]
-        found = self._scan.result(*self._file.limits, before)
+        found = self._scan.result(*self._file.limits, judge_file(file))
         stored = self._file.metadata.get("undulog.health", {})
         return SessionHealth(
             **{each.name: getattr(found, each.name) for each in fields(found)},
@@ -98,6 +110,7 @@ class _Check:
             stored=stored.get("verdict"),
             stored_reasons=_reasons(stored.get("reasons", "[]")),
             file=file,
+            following=tuple(self._judge_following(file)),
         )
 
     def _judge_following(self, file: FileHealth) -> list[Finding]:
@@ -105,7 +118,9 @@ class _Check:
         if file.damage:
             return []
         with Session(self._file.path) as session:
-            return [judge_following(fault) for fault in faults_in_session(session)]
+            faults = faults_in_session(session)
+        # Lost samples have rules of their own.
+        return [judge_following(fault) for fault in faults if fault.kinds != ("lost_samples",)]
 
     # -- reading ---------------------------------------------------------------------------
 

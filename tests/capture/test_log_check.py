@@ -268,8 +268,11 @@ def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(tmp_path: Pa
     assert joint_of(health, "joint07").frozen_s == 7  # whole seconds within 4.8 to 12.3 s
     assert joint_of(health, "joint07").frozen_at_ns == at(500)
     assert joint_of(health, "joint02").frozen_s == 0
-    assert health.reasons == (
-        "/joint_states, joint07: frozen for 7 s while its command moved, at 5.000 s",
+    following, frozen = health.reasons
+    assert frozen == "/joint_states, joint07: frozen for 7 s while its command moved, at 5.000 s"
+    assert following.startswith("joint07 from 4.8 s to 12.3 s stands still while its command moves")
+    assert following.endswith(
+        "intermittent or jammed or dead or stalled or frozen_sensor or stale_sensor"
     )
 
 
