@@ -40,6 +40,7 @@ def inside(estimates, truth):
     return [e.ci95[0] <= value <= e.ci95[1] for e, value in zip(estimates, truth, strict=True)]
 
 
+@pytest.mark.slow
 def test_twenty_sessions_of_known_gain_lag_and_noise(bag, wave):
     """f = 0.97 Hz, 7.3 s at 100 Hz, A 0.3 to 0.5 rad, sigma = 0.01 rad, polling skew 5 ms."""
     rng = np.random.default_rng(2024)

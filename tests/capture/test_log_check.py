@@ -271,9 +271,7 @@ def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(tmp_path: Pa
     following, frozen = health.reasons
     assert frozen == "/joint_states, joint07: frozen for 7 s while its command moved, at 5.000 s"
     assert following.startswith("joint07 from 4.8 s to 12.3 s stands still while its command moves")
-    assert following.endswith(
-        "intermittent or jammed or dead or stalled or frozen_sensor or stale_sensor"
-    )
+    assert following.endswith("the velocity shows that it moves: frozen_sensor or stale_sensor")
 
 
 def test_half_of_the_joints_frozen_is_bad(tmp_path: Path) -> None:

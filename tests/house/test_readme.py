@@ -44,6 +44,7 @@ def test_make_targets_exist_and_are_run_by_the_integration(command: str) -> None
     assert command in (ROOT / ".ci" / "run").read_text()
 
 
+@pytest.mark.slow
 def test_the_verbs_in_order_then_the_snippets(tmp_path: Path) -> None:
     (tmp_path / "trace.log").write_text(TRACE)
     verbs = [command for command in COMMANDS if not command.startswith("make ")]
