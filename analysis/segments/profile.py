@@ -328,19 +328,33 @@ def _stands_out(profile: Profile, state: _State, one: Deviation, critical: float
     typical = float(np.median(np.sqrt(profile.scatter.variance(rows[index]))))
     if robust <= ROUGH * typical and not state.shapes:
         return True
-    # The rest has a profile of its own: a joint stands out of it beside its neighbours, too,
-    # and what its mirror joint shows is part of the profile.
-    beside = _beside_neighbours(profile, index, one.joint)
-    if min(each / one.value for each in beside) < LOCAL:
+    return _out_of_profile(profile, index, one, rows)
+
+
+def _out_of_profile(profile: Profile, others: IntArray, one: Deviation, rows: FloatArray) -> bool:
+    """Whether a joint stands out of a rest that has a profile of its own.
+
+    It stands out beside its neighbours, too; at an end, where its prediction is an extrapolation,
+    it leaves the others' range; and its mirror joint does not show a third of the same.
+    """
+    reach = float(np.ptp(profile.values[others]))
+    beside = _beside_neighbours(profile, others, one.joint)
+    extrapolated = _at_an_end(profile, others, one.joint) and abs(one.value) <= reach
+    if extrapolated or min(each / one.value for each in beside) < LOCAL:
         return False
     mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])
     if not mirror.size or mirror[0] == one.joint:
         return True
     partner = int(mirror[0])
     by_model = float(rows[partner] @ profile.values)
-    beside = _beside_neighbours(profile, index[index != partner], partner)
-    shared = max(each / one.value for each in (by_model, *beside))
-    return shared < MIRRORED
+    beside = _beside_neighbours(profile, others[others != partner], partner)
+    return max(abs(each / one.value) for each in (by_model, *beside)) < MIRRORED
+
+
+def _at_an_end(profile: Profile, others: IntArray, joint: int) -> bool:
+    """Whether all other joints are on one side of a joint."""
+    place = profile.place
+    return bool(place[joint] < place[others].min() or place[joint] > place[others].max())
 
 
 def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:
