@@ -106,7 +106,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", help="scenarios; all that are shipped by default")
     parser.add_argument("--write", action="store_true", help="put the table into docs/energy.md")
+    parser.add_argument("--quick", action="store_true", help="one short scenario")
     options = parser.parse_args()
+    if options.quick:
+        options.names = ["snake13-horizontal-pi2"]
     rows, worst, left, flags = [], 0.0, [0.0, 0.0], []
     with tempfile.TemporaryDirectory() as folder:
         for name in options.names or scenario_names():
@@ -122,9 +125,9 @@ def main():
         PAGE.write_text(f"{before}{BEGIN}\n\n{table(rows)}\n\n{END}{after}")
     else:
         print(f"\n{table(rows)}")
+    print(f"sensors blamed: {flags or 'none'}")
     print(f"largest error {100 * worst:.4f} %, bar {100 * BAR:g} %")
     print(f"the ledger's own balance closes within {100 * left[0]:.3f} % and {100 * left[1]:.4f} %")
-    print(f"sensors blamed: {flags or 'none'}")
 
 
 if __name__ == "__main__":

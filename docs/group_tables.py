@@ -178,4 +178,4 @@ def main(draws):
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 500)
+    main(10 if "--quick" in sys.argv else int(sys.argv[1]) if len(sys.argv) > 1 else 500)

@@ -133,7 +133,7 @@ def _complex(random, shape):
 
 def main():
     """Print the tables."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+    count = 4 if "--quick" in sys.argv else int(sys.argv[1]) if len(sys.argv) > 1 else 300
     random = np.random.default_rng(1)
     print(
         "| joints | scatter | P | R | G | S | worst row of P | half width of P | called nonlinear "

@@ -37,8 +37,8 @@ _OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
 }
 """Artefacts that mean that a joint does not follow, or can't be seen to: kinds that fit."""
 
-_WHOLE = 0.95
-"""Share of the analysed time above which a fault holds throughout."""
+_LASTING = 0.1
+"""Share of the window that an artefact holds at least: a joint may press on an obstacle."""
 
 
 def commanded_joints(columns: Columns) -> tuple[str, ...]:
@@ -125,7 +125,10 @@ def _offsets(motion: JointMotion) -> FloatArray:
 
 
 def not_following(
-    faults: Iterable[Fault], artefacts: Iterable[Artefact], names: tuple[str, ...]
+    faults: Iterable[Fault],
+    artefacts: Iterable[Artefact],
+    names: tuple[str, ...],
+    duration_s: float,
 ) -> tuple[NotFollowing, ...]:
     """Join faults with the artefacts that falsify a joint's position.
 
@@ -133,6 +136,7 @@ def not_following(
         faults: Of the analysed window.
         artefacts: Of the same.
         names: All joints, in chain order.
+        duration_s: Length of the window [s].
 
     Returns:
         One entry a joint, in chain order.
@@ -147,13 +151,13 @@ def not_following(
         kinds = _OF_FLAG.get((artefact.quantity, artefact.flag))
         if kinds is None:
             continue
-        had = found.get(artefact.joint)
-        if had is None:
+        lasted = sum(stop - start for start, stop in artefact.spans_s)
+        share = lasted / duration_s if artefact.spans_s and duration_s > 0 else 1.0
+        if artefact.joint not in found and share >= _LASTING:
             since = artefact.spans_s[0][0] if artefact.spans_s else None
             until = artefact.spans_s[-1][1] if artefact.spans_s else None
             text = f"{artefact.quantity} {artefact.flag}"
             text += f" ({artefact.note})" if artefact.note else ""
-            share = 1.0 if since is None else 0.0
             found[artefact.joint] = NotFollowing(artefact.joint, kinds, since, until, share, text)
     return tuple(found[name] for name in names if name in found)
 
