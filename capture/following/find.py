@@ -33,7 +33,7 @@ SHORTEST_S = 2.0
 COHERENT = 0.5
 """Explained share above which a window follows its command, with whatever gain and lag."""
 
-NO_RESPONSE = 0.1
+NO_RESPONSE = 0.2
 """Gain, as a share of the common one, below which a window shows no response."""
 
 STILL = 0.3
