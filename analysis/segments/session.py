@@ -10,14 +10,13 @@ import numpy as np
 from capture import Session
 from capture.arrays import FloatArray
 from capture.following import Fault, JointMotion, joints_not_following
-from capture.following.motion import BLOCKS, Samples, cycle_s, windowed_response
-from capture.following.session import samples_of
-from capture.log.signals import Signal
+from capture.following.motion import BLOCKS, cycle_s, windowed_response
+from capture.following.session import motions_of
 from capture.robot import Robot
 
 from ..fitting import GaitFit
 from ..gait import DRIVEN_SHARE
-from ..reading import Columns, by_plane
+from ..reading import QUANTITIES, Columns, by_plane
 from ..results.analysis import JointResult
 from ..results.answer import NotFollowing
 from ..results.artefact import Artefact
@@ -83,35 +82,12 @@ def following(session: Session, columns: Columns, window: Stretch) -> Following:
     Returns:
         The joints that do not follow, and the offsets of all.
     """
-    robot = session.robot
-    limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
-    empty = Samples(np.zeros(0), np.zeros(0))
-
-    def samples(signals: Mapping[str, Signal], name: str) -> Samples | None:
-        signal = signals.get(name)
-        if signal is None:
-            return None
-        i, j = np.searchsorted(signal.t_ns, (window.start_ns, window.stop_ns)).tolist()
-        part = Signal(signal.name, signal.unit, signal.t_ns[i:j], signal.values[i:j])
-        return samples_of(part, session.start_ns)
-
-    motions: list[JointMotion] = []
-    for name in columns.names:
-        command = samples(columns.command, name)
-        if command is None:
-            continue
-        effort = samples(columns.effort, name)
-        motions.append(
-            JointMotion(
-                name=name,
-                command=command,
-                position=samples(columns.position, name) or empty,
-                velocity=samples(columns.velocity, name),
-                effort=effort if effort is not None else samples(columns.current, name),
-                reference=samples(columns.reference, name),
-                limits=limits.get(name),
-            )
-        )
+    motions = motions_of(
+        session,
+        {quantity: columns.of(quantity) for quantity in QUANTITIES},
+        columns.names,
+        (window.start_ns, window.stop_ns),
+    )
     return Following(
         joints_not_following(motions),
         {each.name: _offsets(each) for each in motions if each.position.t_s.size > 1},

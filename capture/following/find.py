@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -65,6 +66,9 @@ MIN_SHARE = 0.5
 """A joint whose windows follow less than this share of the time has no usual response."""
 
 
+_Value = TypeVar("_Value")
+
+
 @dataclass(frozen=True)
 class Judged:
     """One joint's windows, judged.
@@ -88,6 +92,11 @@ class Judged:
     ratio: complex
     offset: float
     common: complex
+
+    @property
+    def loaded(self) -> bool:
+        """Whether its neighbours are held back by a load: then it may be, too."""
+        return abs(self.common) < LOADED
 
     @property
     def has_usual(self) -> bool:
@@ -121,31 +130,29 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     for each in driven:
         if (wrapped := wraps(each)) is not None:
             symptoms[each.name].append(wrapped)
-    for each in judged:
-        if symptoms[each.motion.name]:
-            continue
-        symptoms[each.motion.name] += _from_windows(each, _coherence(judged, each))
-        if not symptoms[each.motion.name] and (
-            held := find_holds(
-                each.motion, each.response, each.still, loaded=abs(each.common) < LOADED
-            )
-        ):
-            symptoms[each.motion.name].append(held)
+    explained = [_explained(each) for each in responses]
+    for k, each in enumerate(judged):
+        found = symptoms[each.motion.name]
+        near = [share for share in neighbours(explained, k) if share is not None]
+        if not found:
+            found += _from_windows(each, float(np.median(near)) if near else 1.0)
+        if not found:
+            held = find_holds(each.motion, each.response, each.still, loaded=each.loaded)
+            found += [] if held is None else [held]
     for name, partner in swapped_pairs(judged, common).items():
         symptoms[name] = [Symptom("swapped", (), f"carries out the command of {partner}")]
-    for name, found in _from_residuals(judged, symptoms).items():
-        symptoms[name] += found
-    for name, found in record_faults(motions).items():
+    for name, departed in _from_residuals(judged, symptoms).items():
+        symptoms[name] += departed
+    for name, lacking in record_faults(motions).items():
         standing = {each.name for each in symptoms[name]} & {"still", "held"}
-        symptoms[name] += [] if standing else found
+        symptoms[name] += [] if standing else lacking
     by_name: Mapping[str, Judged] = {each.motion.name: each for each in judged}
     usual_effort = _usual_effort(judged)
-    faults = (
+    return tuple(
         fault_of(each, by_name.get(each.name), symptoms[each.name], usual_effort)
         for each in motions
         if symptoms[each.name]
     )
-    return tuple(fault for fault in faults if fault is not None)
 
 
 def _lasts(motion: JointMotion) -> bool:
@@ -172,18 +179,18 @@ def own_response(response: Response) -> complex | None:
     return _median(response.ratio[coherent])
 
 
-def neighbours(own: Sequence[complex | None], k: int) -> list[complex | None]:
-    """The responses of the joints nearest to one joint in the chain, without its own.
+def neighbours(values: Sequence[_Value], k: int) -> list[_Value]:
+    """The values of the joints nearest to one joint in the chain, without its own.
 
     Args:
-        own: Responses of all driven joints, in chain order.
+        values: One of each driven joint, e.g. its response, in chain order.
         k: Index of the joint.
 
     Returns:
-        Up to ``NEIGHBOURS`` responses: the gain of a loaded chain changes along the body.
+        Up to ``NEIGHBOURS`` values: the gain of a loaded chain changes along the body.
     """
-    others = sorted((j for j in range(len(own)) if j != k), key=lambda j: (abs(j - k), j))
-    return [own[j] for j in others[:NEIGHBOURS]]
+    others = sorted((j for j in range(len(values)) if j != k), key=lambda j: (abs(j - k), j))
+    return [values[j] for j in others[:NEIGHBOURS]]
 
 
 def common_response(own: Sequence[complex | None]) -> complex:
@@ -242,7 +249,7 @@ def _from_windows(each: Judged, coherence: float) -> list[Symptom]:
     follows = np.count_nonzero(each.follows) / valid
     gain = abs(each.ratio) / abs(each.common)
     found: Symptom | None = None
-    orderly = coherence > ORDERLY and abs(each.common) > LOADED
+    orderly = coherence > ORDERLY and not each.loaded
     if (unit := _unit_factor(each, gain)) is not None:
         found = Symptom("scaled", (), f"moves {unit} times as far as the other joints")
     elif np.count_nonzero(each.opposite) > 0.5 * valid:
@@ -267,16 +274,11 @@ def _unit_factor(each: Judged, gain: float) -> str | None:
     return None
 
 
-def _coherence(judged: Sequence[Judged], each: Judged) -> float:
-    """Median explained share of a joint's neighbours; 1 where it has none."""
-    k = judged.index(each)
-    explained: list[float | None] = [
-        float(np.median(j.response.explained[j.response.valid])) if j.response.valid.any() else None
-        for j in judged
-    ]
-    others = sorted((j for j in range(len(judged)) if j != k), key=lambda j: (abs(j - k), j))
-    near = [e for j in others[:NEIGHBOURS] if (e := explained[j]) is not None]
-    return float(np.median(near)) if near else 1.0
+def _explained(response: Response) -> float | None:
+    """Median explained share of a joint's windows; None where none is judged."""
+    if not response.valid.any():
+        return None
+    return float(np.median(response.explained[response.valid]))
 
 
 def _from_residuals(
@@ -292,9 +294,7 @@ def _from_residuals(
     result: dict[str, list[Symptom]] = {}
     for k, (each, found) in enumerate(kept):
         alone = [not _shared(span, spans, k) for span in found.spans_s]
-        result[each.motion.name] = departures(
-            each.response, found, alone, loaded=abs(each.common) < LOADED
-        )
+        result[each.motion.name] = departures(each.response, found, alone, loaded=each.loaded)
     return result
 
 

@@ -95,7 +95,7 @@ def fault_of(
     judged: Judged | None,
     symptoms: list[Symptom],
     usual_effort: FloatArray,
-) -> Fault | None:
+) -> Fault:
     """Turn the symptoms of one joint into its fault.
 
     Args:

@@ -66,7 +66,6 @@ class JointMotion:
         effort: Torque [N m], or motor current [A] where no torque was recorded.
         reference: Position by a second sensor [rad].
         limits: Lower and upper limit of the joint [rad], or None.
-        missing: Positions that are not finite.
     """
 
     name: str
@@ -76,7 +75,6 @@ class JointMotion:
     effort: Samples | None = None
     reference: Samples | None = None
     limits: tuple[float, float] | None = None
-    missing: int = 0
 
 
 def cycle_s(command: Samples) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+
 import numpy as np
 
 from ..errors import DataError, LogError, MissingChannelError
@@ -69,19 +71,23 @@ def faults_in_session(session: Session) -> tuple[Fault, ...]:
         columns[quantity] = {name: signals.signal(name) for name in signals.names}
     if "command" not in columns or "position" not in columns:
         return ()
-    return joints_not_following(motions_of(columns, session, session.start_ns))
+    return joints_not_following(motions_of(session, columns, columns["command"]))
 
 
 def motions_of(
-    columns: dict[str, dict[str, Signal]], session: Session, origin_ns: int
+    session: Session,
+    columns: Mapping[str, Mapping[str, Signal]],
+    names: Iterable[str],
+    window_ns: tuple[int, int] | None = None,
 ) -> list[JointMotion]:
-    """The joints' signals, in chain order.
+    """Take the recorded signals of joints, times from the session's start.
 
     Args:
+        session: The session.
         columns: ``command``, ``position`` and whichever of ``velocity``, ``effort``, ``current``
             and ``reference`` there are, to signals by joint name.
-        session: The session, for its robot.
-        origin_ns: Unix time that becomes 0 s.
+        names: Joints, in chain order.
+        window_ns: Half-open window [Unix ns]; None for all.
 
     Returns:
         The joints that have a command; a joint without positions has an empty record.
@@ -90,26 +96,28 @@ def motions_of(
     limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
     empty = Samples(np.zeros(0), np.zeros(0))
     motions: list[JointMotion] = []
-    for name, signal in columns["command"].items():
-        command = samples_of(signal, origin_ns)
+
+    def samples(quantity: str, name: str) -> Samples | None:
+        signal = columns.get(quantity, {}).get(name)
+        if signal is not None and window_ns is not None:
+            i, j = np.searchsorted(signal.t_ns, window_ns).tolist()
+            signal = Signal(signal.name, signal.unit, signal.t_ns[i:j], signal.values[i:j])
+        return samples_of(signal, session.start_ns)
+
+    for name in names:
+        command = samples("command", name)
         if command is None:
             continue
-
-        def other(quantity: str, joint: str = name) -> Samples | None:
-            return samples_of(columns.get(quantity, {}).get(joint), origin_ns)
-
-        raw = columns["position"].get(name)
-        effort = other("effort")
+        effort = samples("effort", name)
         motions.append(
             JointMotion(
                 name=name,
                 command=command,
-                position=other("position") or empty,
-                velocity=other("velocity"),
-                effort=effort if effort is not None else other("current"),
-                reference=other("reference"),
+                position=samples("position", name) or empty,
+                velocity=samples("velocity", name),
+                effort=effort if effort is not None else samples("current", name),
+                reference=samples("reference", name),
                 limits=limits.get(name),
-                missing=0 if raw is None else int(np.count_nonzero(~np.isfinite(raw.values))),
             )
         )
     return motions

@@ -33,7 +33,6 @@ def detected(log: Log) -> Statement:
     for j, name in enumerate(robot.names):
         position = samples(log.position, j)
         assert position is not None
-        lost = 0 if robot.per_servo else len(robot.t_s) - position.t_s.size
         motions.append(
             JointMotion(
                 name,
@@ -42,7 +41,6 @@ def detected(log: Log) -> Statement:
                 velocity=samples(log.velocity, j),
                 effort=samples(log.effort, j),
                 reference=samples(log.second, j),
-                missing=lost,
             )
         )
     found = {
