@@ -43,6 +43,9 @@ class HeadlessViewer:
         try:
             self._client = client_of(self._viewer.address, lambda: self._viewer.ended)
             self._let_greetings_pass()
+        except (ConnectionError, RuntimeError, TimeoutError) as error:
+            self.close()
+            raise _not_started() from error  # it may answer before it asks for a driver
         except BaseException:
             self.close()
             raise
@@ -183,10 +186,14 @@ def client_of(
             client.get_state()
         except (ConnectionError, RuntimeError, TimeoutError) as error:
             if ended() or time.monotonic() > deadline:
-                raise UndulogError(
-                    "the headless viewer did not start; it needs a Vulkan driver "
-                    "(Debian: mesa-vulkan-drivers libvulkan1)"
-                ) from error
+                raise _not_started() from error
             time.sleep(look_s)
         else:
             return client
+
+
+def _not_started() -> UndulogError:
+    return UndulogError(
+        "the headless viewer did not start; it needs a Vulkan driver "
+        "(Debian: mesa-vulkan-drivers libvulkan1)"
+    )

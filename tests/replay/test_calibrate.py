@@ -267,7 +267,7 @@ coulomb_friction = 0.035
 mu_tangential = 0.045
 mu_normal = 0.56
 """
-    room = room_for(tmp_path, 5, 14.0, hidden)
+    room = room_for(tmp_path, 5, 14.0, hidden, seed=0)
     names = ("stall_torque", "proportional_gain", "coulomb_friction", "mu_tangential", "mu_normal")
     words = [word for name in names for word in ("--only", name)]
     report, found = fitted(

@@ -169,13 +169,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outputs = tuple(chosen.outputs)
     cases: list[Case] = []
     seeds = range(chosen.first, chosen.first + chosen.seeds)
+    print(f"fault zoo, seeds {seeds[0]} to {seeds[-1]}", flush=True)
     for case in run_all(names, seeds, small=chosen.small, outputs=outputs, jobs=chosen.jobs):
         cases.append(case)
+        if not chosen.quiet:
+            for line in failures([case]):
+                print(line, flush=True)
         if sys.stderr.isatty():
             print(f"\r{len(cases)} of {len(names) * len(seeds)}", end="", file=sys.stderr)
-    print(f"fault zoo, seeds {chosen.first} to {chosen.first + chosen.seeds - 1}")
-    if not chosen.quiet:
-        print("\n".join(failures(cases)))
     lines = table(cases, outputs)
     print("\n".join(lines))
     return int(any(line.endswith("FAILS") for line in lines))
