@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from capture import Session
-from capture.arrays import IntArray
+from capture.arrays import FloatArray, IntArray
 from capture.environment import base_versions
 from capture.log.signals import Signal
 
@@ -75,11 +75,13 @@ class Measured(Examined):
         responses: Measured joint angles by name, on the analysed stretch.
         energies: By joint name.
         span: Whole cycles over which energies are taken.
+        offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
     """
 
     responses: Mapping[str, Series]
     energies: Mapping[str, Energies]
     span: Span
+    offsets: Mapping[str, FloatArray]
 
 
 def analyse_session(session: Session, options: Options | None = None) -> Analysis:
@@ -219,7 +221,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     )
     answer = compose(Facts(analysis.gait, joints, commanded, faulty, findings, analysis.warnings))
     analysis = dataclasses.replace(analysis, answer=answer)
-    return Measured(analysis, gait, sound, energies, span)
+    return Measured(analysis, gait, sound, energies, span, follows.offsets)
 
 
 def _series(

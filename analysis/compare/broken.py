@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeVar
 
+import numpy as np
+
 from ..results.answer import Answer, NotFollowing, StandOut
+from ..segments.examine import OFFSET_RAD
 from ..text import formats
 from ..text.answer import deviation_in_words, fault_in_words
 from .result import BrokenJoint
+from .side import Seen
 
 
-def broken_joints(a: Sequence[Answer], b: Sequence[Answer]) -> tuple[BrokenJoint, ...]:
+def broken_joints(a: Sequence[Seen], b: Sequence[Seen]) -> tuple[BrokenJoint, ...]:
     """Find the joints that do not follow, or stand off their command, on one side only.
 
     Args:
-        a: Answers of the sessions of side A.
+        a: Sessions of side A.
         b: Those of side B.
 
     Returns:
@@ -23,15 +27,15 @@ def broken_joints(a: Sequence[Answer], b: Sequence[Answer]) -> tuple[BrokenJoint
     """
     found: list[BrokenJoint] = []
     for side, own, other in (("B", b, a), ("A", a, b)):
-        elsewhere = {each.joint for answer in other for each in answer.not_following}
-        for fault in _first([each for answer in own for each in answer.not_following]):
+        answers = [one.analysis.answer for one in own]
+        elsewhere = {each.joint for one in other for each in one.analysis.answer.not_following}
+        for fault in _first([each for answer in answers for each in answer.not_following]):
             if fault.joint not in elsewhere:
                 text = f"in {side} {fault_in_words(fault)}"
                 found.append(BrokenJoint(fault.joint, side, fault.kinds, text))
-        off = {each.joint for answer in other for each in _off(answer)}
         known = {each.name for each in found}
-        for each in _first([each for answer in own for each in _off(answer)]):
-            if each.joint not in off | known | elsewhere:
+        for each in _first([each for answer in answers for each in _off(answer)]):
+            if each.joint not in known | elsewhere and _moved(each.joint, own, other):
                 text = f"in {side} {formats.plain(each.joint)} has {deviation_in_words(each)}"
                 found.append(BrokenJoint(each.joint, side, (), text))
     return tuple(sorted(found, key=lambda each: not each.kinds))
@@ -39,6 +43,16 @@ def broken_joints(a: Sequence[Answer], b: Sequence[Answer]) -> tuple[BrokenJoint
 
 def _off(answer: Answer) -> list[StandOut]:
     return [each for each in answer.stand_out if each.quantity == "offset"]
+
+
+def _moved(joint: str, own: Sequence[Seen], other: Sequence[Seen]) -> bool:
+    """Whether a joint's mean differs between the sides, too: both may share a zero."""
+    here, there = (
+        [one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)
+    )
+    if not here or not there:
+        return True
+    return abs(float(np.median(here)) - float(np.median(there))) > OFFSET_RAD
 
 
 _Entry = TypeVar("_Entry", NotFollowing, StandOut)

@@ -117,7 +117,7 @@ def compare_seen(
     decided = decide(keys, first, second, found, choices.margins)
     partial = _partial(aligned)
     _warn(a, b, design, said.append)
-    broken = broken_joints([one.analysis.answer for one in a], [one.analysis.answer for one in b])
+    broken = broken_joints(a, b)
     verdict, sentence = answer_of(decided, partial is not None, broken)
     return Comparison(
         answer=sentence,

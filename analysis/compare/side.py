@@ -40,6 +40,7 @@ class Seen:
         estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
             cost of transport of the body.
         cycles: Mean cycle of each joint by the phase of the first command of its group [rad].
+        offsets: Mean of each joint's position less that of its command [rad].
     """
 
     analysis: Analysis
@@ -47,6 +48,7 @@ class Seen:
     facts: Mapping[str, str]
     estimates: Mapping[Key, Known]
     cycles: Mapping[str, Quantities]
+    offsets: Mapping[str, float]
 
 
 def see(session: Session, options: Options, warn: Warn) -> Seen:
@@ -83,7 +85,8 @@ def see(session: Session, options: Options, warn: Warn) -> Seen:
                 warn(f"no {quantity.replace('_', ' ')}: it hardly gets anywhere")
             else:
                 estimates[quantity, BODY] = known
-    return Seen(analysis, run, facts_of(session), estimates, _cycles(measured, run))
+    offsets = {name: float(np.median(each)) for name, each in measured.offsets.items() if each.size}
+    return Seen(analysis, run, facts_of(session), estimates, _cycles(measured, run), offsets)
 
 
 def turned(cycle: Quantities, by_rad: float) -> Quantities:

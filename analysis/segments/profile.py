@@ -318,12 +318,14 @@ def _stands_out(profile: Profile, state: _State, one: Deviation, critical: float
     others[one.joint] = False
     index = np.flatnonzero(others)
     rows = _deviation_weights(profile, others, state.shapes)
-    residual = rows[index] @ profile.values
+    # Of equal scatter, a deviation has that of its weights: more at an end, where a shape leads on.
+    reach = np.sqrt(np.sum(rows**2, axis=1))
+    residual = (rows @ profile.values / reach)[index]
     parameters = 1 + len(state.shapes)
     spare = max(index.size - parameters, 1)
     centred = np.abs(residual - np.median(residual))
     robust = 1.4826 * float(np.median(centred)) * (index.size / spare) ** 0.5
-    if abs(one.value) <= ROBUST * robust:
+    if abs(one.value) <= ROBUST * robust * reach[one.joint]:
         return False
     typical = float(np.median(np.sqrt(profile.scatter.variance(rows[index]))))
     if robust <= ROUGH * typical and not state.shapes:

@@ -28,6 +28,7 @@ _COMPARABLE = {"lost_samples"}
 
 _OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("position", "wrapped"): ("wrapped_sensor",),
+    ("position", "wrong_sign"): ("inverted", "inverted_sensor"),
     ("position", "wrong_unit"): ("scaled_sensor",),
     ("position", "scale_mismatch"): ("scaled_sensor",),
     ("position", "clipped"): ("at_limit", "clipped_sensor"),

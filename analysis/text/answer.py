@@ -94,7 +94,7 @@ def compose(facts: Facts) -> Answer:
         alike = True
     return Answer(
         verdict=verdict,
-        sentence=" ".join(part for part in (first, rest) if part),
+        sentence=" ".join(part for part in (first, rest, _left_out(facts)) if part),
         detail=detail,
         not_following=facts.not_following,
         stand_out=findings.stand_out,
@@ -184,6 +184,17 @@ def _named(facts: Facts) -> str:
         clauses.append(undecided)
     # A joint's name keeps its letters at the beginning, too: a reader searches for it.
     return f"{'; '.join(clauses)}." if clauses else ""
+
+
+def _left_out(facts: Facts) -> str:
+    """Driven joints that are neither compared nor named; empty where nothing was compared."""
+    known = {*facts.findings.compared, *(each.joint for each in facts.not_following)}
+    names = [formats.plain(name) for name in facts.commanded if name not in known]
+    if not names or not facts.findings.compared:
+        return ""
+    listed = ", ".join(names[:NAMED])
+    listed += f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"Not compared: {listed}."
 
 
 def _undecided(findings: Findings, facts: Facts) -> str:

@@ -59,6 +59,15 @@ LOADED = 0.7
 ORDERLY = 0.8
 """Explained share of its neighbours beside which a joint that follows nothing stands out."""
 
+POWERLESS = 0.2
+"""Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction."""
+
+ASTRAY = 2.5
+"""Control error, in those of the neighbours, from which a motor with power would push."""
+
+ENDS = 2
+"""Joints at either end of a free chain, which little load may keep from any effort."""
+
 RARELY = 0.1
 """A joint that follows in less than this share of its windows does not follow."""
 
@@ -133,6 +142,8 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     explained = [_explained(each) for each in responses]
     for k, each in enumerate(judged):
         found = symptoms[each.motion.name]
+        if not found:
+            found += _powerless(judged, k)
         near = [share for share in neighbours(explained, k) if share is not None]
         if not found:
             found += _from_windows(each, float(np.median(near)) if near else 1.0)
@@ -251,7 +262,9 @@ def _from_windows(each: Judged, coherence: float) -> list[Symptom]:
     found: Symptom | None = None
     orderly = coherence > ORDERLY and not each.loaded
     if (unit := _unit_factor(each, gain)) is not None:
-        found = Symptom("scaled", (), f"moves {unit} times as far as the other joints")
+        # A joint that hardly moves may as well stand still, but for what its neighbours do to it.
+        name = "scaled" if gain > 1 else "slight"
+        found = Symptom(name, (), f"moves {unit} times as far as the other joints")
     elif np.count_nonzero(each.opposite) > 0.5 * valid:
         spans = _whole_or(_spans(r, each.opposite), r)
         found = Symptom("opposite", spans, f"gain {-abs(each.ratio):.2f}")
@@ -262,6 +275,51 @@ def _from_windows(each: Judged, coherence: float) -> list[Symptom]:
     elif follows < RARELY and not each.opposite.any() and orderly:
         found = Symptom("incoherent", (), "moves, but not with its command")
     return [] if found is None else [found]
+
+
+def _powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
+    """A joint that its neighbours swing: far from its command, and no effort against it."""
+    each, near = judged[k], neighbours(judged, k)
+    r = each.response
+    if each.motion.effort is None or min(k, len(judged) - 1 - k) < ENDS:
+        return []
+    usual = float(np.median([_usual(one, _control_error(one.response)) for one in near]))
+    far = _control_error(r) > np.maximum(ASTRAY * usual, r.asked / 2)
+    off = r.valid & ~each.still & far
+    if not off.any():
+        return []
+    effort, pushes = _effort_spread(each), max(_usual(one, _effort_spread(one)) for one in near)
+    light = off & (effort < POWERLESS * pushes)
+    if np.count_nonzero(light) < max(MIN_WINDOWS, MIN_SHARE * np.count_nonzero(off)):
+        return []
+    share = 100 * float(np.median(effort[light])) / pushes
+    text = f"moves with its neighbours, at {share:.0f} % of their largest effort"
+    return [Symptom("powerless", _whole_or(_spans(r, light), r), text)]
+
+
+def _control_error(response: Response) -> FloatArray:
+    """Standard deviation of the position less the command in each window [rad], shape (w,)."""
+    covariance = response.ratio.real * response.asked**2
+    return np.sqrt(np.maximum(response.asked**2 + response.spread**2 - 2 * covariance, 0.0))
+
+
+def _effort_spread(each: Judged) -> FloatArray:
+    """Standard deviation of the effort in each window, shape (w,); NaN where it has no sample."""
+    r, effort = each.response, each.motion.effort
+    if effort is None:
+        return np.full(r.start_s.size, np.nan)
+    i, j = (np.searchsorted(effort.t_s, edges) for edges in (r.start_s, r.stop_s))
+    level = effort.values - (float(np.median(effort.values)) if effort.values.size else 0.0)
+    first, second = (np.concatenate(([0.0], np.cumsum(level**power))) for power in (1, 2))
+    count = np.where(j > i, j - i, np.nan)
+    mean, square = (first[j] - first[i]) / count, (second[j] - second[i]) / count
+    return np.sqrt(np.maximum(square - mean**2, 0.0))
+
+
+def _usual(each: Judged, values: FloatArray) -> float:
+    """Median over the windows that are judged; NaN without any."""
+    known = values[each.response.valid & np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")
 
 
 def _unit_factor(each: Judged, gain: float) -> str | None:

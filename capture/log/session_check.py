@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
@@ -110,17 +111,23 @@ class _Check:
             stored=stored.get("verdict"),
             stored_reasons=_reasons(stored.get("reasons", "[]")),
             file=file,
-            following=tuple(self._judge_following(file)),
+            following=tuple(self._judge_following(file, found.reasons)),
         )
 
-    def _judge_following(self, file: FileHealth) -> list[Finding]:
-        """Joints that do not follow their command; none of a file with damage."""
+    def _judge_following(self, file: FileHealth, said: Sequence[str]) -> list[Finding]:
+        """Joints that do not follow their command; none of a file with damage.
+
+        Lost samples have rules of their own; what these say of a joint is not said twice.
+        """
         if file.damage:
             return []
         with Session(self._file.path) as session:
             faults = faults_in_session(session)
-        # Lost samples have rules of their own.
-        return [judge_following(fault) for fault in faults if fault.kinds != ("lost_samples",)]
+        return [
+            judge_following(fault)
+            for fault in faults
+            if fault.kinds != ("lost_samples",) or not any(_names(one, fault.joint) for one in said)
+        ]
 
     # -- reading ---------------------------------------------------------------------------
 
@@ -290,3 +297,7 @@ def _reasons(text: str) -> tuple[str, ...]:
     except ValueError:
         return (text,)
     return tuple(map(str, cast("list[Any]", found))) if isinstance(found, list) else (str(found),)
+
+
+def _names(sentence: str, joint: str) -> bool:
+    return re.search(rf"(?<![\w/]){re.escape(joint)}(?![\w/])", sentence) is not None
