@@ -164,7 +164,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     session.forget()
     span = _span(stretch, origin_ns, gait)
     follows = following(session, columns, whole)
-    faulty = not_following(follows.faults, held, columns.names, whole.duration_s)
+    faulty = not_following(follows, held, columns.names, whole.duration_s)
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)

@@ -14,15 +14,8 @@ from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equiva
 from ..response import Response
 from ..results.answer import Shape, StandOut
 from .family import LEVEL, Scatter, critical_value, scatter_of
-from .profile import (
-    MIN_JOINTS,
-    Contrast,
-    Deviation,
-    Profile,
-    contrasts,
-    family_of,
-    standing_out,
-)
+from .outliers import Deviation, standing_out
+from .profile import MIN_JOINTS, Contrast, Profile, contrasts, family_of
 
 _MARGINS = {"gain": EQUIVALENT_GAIN, "lag": EQUIVALENT_LAG_RAD}
 OFFSET_RAD = EQUIVALENT_LAG_RAD

@@ -10,7 +10,7 @@ import numpy as np
 from capture import Session
 from capture.arrays import FloatArray
 from capture.following import Fault, JointMotion, joints_not_following
-from capture.following.motion import BLOCKS, cycle_s, windowed_response
+from capture.following.motion import BLOCKS, Samples, cycle_s, windowed_response
 from capture.following.session import motions_of
 from capture.robot import Robot
 
@@ -36,6 +36,12 @@ _OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("current", "stalled"): ("stalled", "jammed"),
 }
 """Artefacts that mean that a joint does not follow, or can't be seen to: kinds that fit."""
+
+_AGAIN = 3
+"""Stalls that a limit causes, too, in each cycle."""
+
+_TOGETHER = 0.5
+"""Correlation with the command that shows motion."""
 
 _LASTING = 0.1
 """Share of the window that an artefact holds at least: a joint may press on an obstacle."""
@@ -66,10 +72,12 @@ class Following:
     Attributes:
         faults: Joints that do not, times from the session's start, in chain order.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
+        motions: The joints' signals.
     """
 
     faults: tuple[Fault, ...]
     offsets: Mapping[str, FloatArray]
+    motions: Mapping[str, JointMotion]
 
 
 def following(session: Session, columns: Columns, window: Stretch) -> Following:
@@ -92,6 +100,7 @@ def following(session: Session, columns: Columns, window: Stretch) -> Following:
     return Following(
         joints_not_following(motions),
         {each.name: _offsets(each) for each in motions if each.position.t_s.size > 1},
+        {each.name: each for each in motions},
     )
 
 
@@ -102,7 +111,7 @@ def _offsets(motion: JointMotion) -> FloatArray:
 
 
 def not_following(
-    faults: Iterable[Fault],
+    found_by_motion: Following,
     artefacts: Iterable[Artefact],
     names: tuple[str, ...],
     duration_s: float,
@@ -110,7 +119,7 @@ def not_following(
     """Join faults with the artefacts that falsify a joint's position.
 
     Args:
-        faults: Of the analysed window.
+        found_by_motion: Of the analysed window.
         artefacts: Of the same.
         names: All joints, in chain order.
         duration_s: Length of the window [s].
@@ -122,21 +131,44 @@ def not_following(
         each.joint: NotFollowing(
             each.joint, each.kinds, each.since_s, each.until_s, each.share, each.evidence
         )
-        for each in faults
+        for each in found_by_motion.faults
     }
-    for artefact in artefacts:
-        kinds = _OF_FLAG.get((artefact.quantity, artefact.flag))
-        if kinds is None:
-            continue
+    # A flat top changes the scale, too.
+    for artefact in sorted(artefacts, key=lambda one: one.flag != "clipped"):
+        kinds = _kinds_of(artefact, found_by_motion.motions.get(artefact.joint))
         lasted = sum(stop - start for start, stop in artefact.spans_s)
         share = lasted / duration_s if artefact.spans_s and duration_s > 0 else 1.0
-        if artefact.joint not in found and share >= _LASTING:
+        if kinds and artefact.joint not in found and share >= _LASTING:
             since = artefact.spans_s[0][0] if artefact.spans_s else None
             until = artefact.spans_s[-1][1] if artefact.spans_s else None
             text = f"{artefact.quantity} {artefact.flag}"
             text += f" ({artefact.note})" if artefact.note else ""
             found[artefact.joint] = NotFollowing(artefact.joint, kinds, since, until, share, text)
     return tuple(found[name] for name in names if name in found)
+
+
+def _kinds_of(artefact: Artefact, motion: JointMotion | None) -> tuple[str, ...]:
+    """Kinds of fault that fit an artefact; none for most artefacts."""
+    kinds = _OF_FLAG.get((artefact.quantity, artefact.flag), ())
+    if artefact.flag == "stalled" and len(artefact.spans_s) >= _AGAIN:
+        return ("at_limit", *kinds)
+    if artefact.flag == "clipped" and motion is not None and motion.reference is not None:
+        goes_on = _goes_on(motion.reference, motion.command, artefact.spans_s)
+        return ("clipped_sensor",) if goes_on else ("at_limit",)
+    return kinds
+
+
+def _goes_on(second: Samples, command: Samples, spans_s: Iterable[tuple[float, float]]) -> bool:
+    """Whether a second sensor moves with the command where the first one is flat."""
+    parts: list[FloatArray] = []
+    for span in spans_s:
+        i, j = np.searchsorted(second.t_s, span)
+        both = np.stack([second.values[i:j], command.at(second.t_s[i:j])])
+        if j > i:
+            parts.append(both - both.mean(axis=1, keepdims=True))
+    joined = np.concatenate(parts, axis=1) if parts else np.zeros((2, 1))
+    power = float(np.linalg.norm(joined[0]) * np.linalg.norm(joined[1]))
+    return power > 0 and float(joined[0] @ joined[1]) > _TOGETHER * power
 
 
 def compare_joints(

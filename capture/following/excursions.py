@@ -63,6 +63,12 @@ FEWEST = 12
 AS_USUAL = 0.97
 """Share of the usual explained share above which a window follows as usual."""
 
+MANY = 4 * BLOCKS
+"""Windows of a departure that is a state of its own, with a beginning and an end."""
+
+TRANSITION = 0.3
+"""Share of its windows in which it begins or ends."""
+
 TURN = 2 * np.pi
 
 
@@ -184,7 +190,6 @@ def departures(
         found: All its departures.
         alone: Of each, whether no other joint departs at the same time.
         loaded: Whether its neighbours are held back by a load: then it may be, for a while.
-        loaded: Whether its neighbours are held back by a load: then it may be, for a while.
 
     Returns:
         One symptom a kind of departure.
@@ -195,8 +200,10 @@ def departures(
     texts: dict[str, str] = {}
     for span, own in zip(found.spans_s, alone, strict=True):
         kind, text = _described(found, span, end, response.period_s)
-        if kind in ("astray", "opposite") and (span[1] < settled or not own):
-            continue  # the start of the motion, or something that happened to the body
+        if kind in ("astray", "opposite") and not own:
+            continue  # something that happened to the body
+        if kind in ("astray", "opposite", "held") and span[1] < settled:
+            continue  # the start of the motion
         if kind in ("astray", "noisy") and _coherent(response, span):
             continue  # it follows there, with another gain or lag
         if kind == "held" and loaded:
@@ -222,7 +229,9 @@ def _coherent(response: Response, span: Span) -> bool:
     if not near.any():
         return False
     usual = float(np.median(response.explained[response.valid]))
-    return float(np.min(response.explained[near])) > AS_USUAL * usual
+    # Where it changes from the one to the other, a cycle of either side is in the windows.
+    passing = TRANSITION if np.count_nonzero(near) >= MANY else 0.0
+    return float(np.quantile(response.explained[near], passing)) > AS_USUAL * usual
 
 
 def _lasting(spans: Sequence[Span], period_s: float) -> bool:

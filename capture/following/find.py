@@ -131,6 +131,10 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     ]
     own = [own_response(each) for each in responses]
     common = common_response(own)
+    # What noise makes of a joint that stands still is no response for its neighbours.
+    own = [
+        each if each is not None and abs(each) > NO_RESPONSE * abs(common) else None for each in own
+    ]
     judged = [
         judge(each, r, common_response(neighbours(own, k)))
         for k, (each, r) in enumerate(zip(driven, responses, strict=True))
@@ -155,8 +159,9 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     for name, departed in _from_residuals(judged, symptoms).items():
         symptoms[name] += departed
     for name, lacking in record_faults(motions).items():
-        standing = {each.name for each in symptoms[name]} & {"still", "held"}
-        symptoms[name] += [] if standing else lacking
+        known = {each.name for each in symptoms[name]}
+        if not known & {"still", "held", "wrapped"}:
+            symptoms[name] += [each for each in lacking if each.name not in known]
     by_name: Mapping[str, Judged] = {each.motion.name: each for each in judged}
     usual_effort = _usual_effort(judged)
     return tuple(

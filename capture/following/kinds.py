@@ -36,6 +36,9 @@ CONSTANT = 0.1
 MOSTLY = 0.5
 """Share of exact repeats above which a sensor may be frozen."""
 
+AGAIN = 3
+"""Times that a joint stands at one place, which is no chance."""
+
 LIMIT_SHARE = 0.02
 """Nearer to a limit than this share of the range is at it."""
 
@@ -181,7 +184,7 @@ def _by_effort(
     kinds = list(_KINDS[main.name])
     if not _repeats(motion, spans):  # new noise in each sample: the sensor measures
         kinds.remove("frozen_sensor")
-    at_limit = _at_limit(motion, spans)
+    at_limit = _at_limit(motion, spans) or _at_one_end(motion, main.spans_s)
     if at_limit:
         kinds = ["at_limit", *kinds]
     if motion.effort is None:
@@ -294,6 +297,21 @@ def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     lower, upper = motion.limits
     slack = LIMIT_SHARE * (upper - lower)
     return level <= lower + slack or level >= upper - slack
+
+
+def _at_one_end(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
+    """Whether the joint stands again and again at the same end of its motion."""
+    if len(spans) < AGAIN:
+        return False
+    values = motion.position.values
+    levels = [
+        float(np.median(values[inside]))
+        for span in spans
+        if (inside := _inside(motion.position.t_s, (span,))).any()
+    ]
+    slack = 2 * LIMIT_SHARE * motion.position.range
+    low, high = float(values.min()), float(values.max())
+    return bool(levels) and (max(levels) <= low + slack or min(levels) >= high - slack)
 
 
 def _inside(t_s: FloatArray, spans: tuple[Span, ...]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from .fault import Span
 from .kinds import Symptom
@@ -42,6 +43,18 @@ FAST = 0.5
 AROUND = 4
 """Samples on either side over which its motion is taken."""
 
+SPIKE = 8.0
+"""Robust standard deviations of the noise about the running median that make a spike."""
+
+SPIKE_STEPS = 3.0
+"""A spike is also larger than so many of the command's largest steps: the median may be late."""
+
+SPIKE_SHARE = 0.1
+"""A spike is also larger than this share of the command's range."""
+
+SPIKES = 0.003
+"""Share of the samples that may be spikes beyond what the joints have in common."""
+
 
 def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     """Find joints whose positions are missing or repeated more than the others'.
@@ -56,10 +69,15 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     result: dict[str, list[Symptom]] = {}
     lost = [_lost(each) for each in sampled]
     stale = [_repeats(each) for each in sampled]
-    usual_lost = float(np.median(lost)) if lost else 0.0
-    usual_stale = float(np.median(stale)) if stale else 0.0
-    for each, missing, repeated in zip(sampled, lost, stale, strict=True):
+    spikes = [_spikes(each) for each in sampled]
+    usual_lost, usual_stale, usual_spikes = (
+        float(np.median(values)) if values else 0.0 for values in (lost, stale, spikes)
+    )
+    for each, missing, repeated, spiky in zip(sampled, lost, stale, spikes, strict=True):
         symptoms: list[Symptom] = []
+        if spiky > SPIKES + 2 * usual_spikes:
+            text = f"{100 * spiky:.2g} % of its samples are far from those around them"
+            symptoms.append(Symptom("noisy", (), text))
         if missing > LOST_SHARE + 2 * usual_lost:
             text = f"{100 * missing:.2g} % of its samples missing"
             symptoms.append(Symptom("lost", _silences(each, missing), text))
@@ -117,6 +135,18 @@ def _lost(each: JointMotion) -> float:
     edges += max(0.0, each.command.t_s[-1] - samples.t_s[-1]) if each.command.t_s.size else 0.0
     absent += max(0.0, edges / usual - 2.0)
     return absent / (samples.t_s.size + absent)
+
+
+def _spikes(each: JointMotion) -> float:
+    """Share of the samples that lie alone, far from the running median of five."""
+    values = each.position.values
+    if values.size < 4 * AROUND:
+        return 0.0
+    away = np.abs(values - median_filter(values, size=5, mode="nearest"))
+    noise = 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / 6**0.5
+    step = float(np.abs(np.diff(each.command.at(each.position.t_s))).max())
+    far = away > max(SPIKE * noise, SPIKE_STEPS * step, SPIKE_SHARE * each.command.range)
+    return float(np.count_nonzero(far)) / values.size
 
 
 def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:

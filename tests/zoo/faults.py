@@ -673,6 +673,8 @@ def _(robot, rng, j):
     acts = (t >= start) & (t < start + rng.uniform(0.25, 0.4) * robot.duration_s)
     change = Change(j, position=_hold(robot.moved(j), acts))
     kinds = standing(robot.channels, "pushing") | PAUSED
+    if "frozen_sensor" in kinds:  # that comes back: values that are old by then
+        kinds |= {"stale_sensor"}
     names = frozenset({"jammed", "stalled", "intermittent"})
     return (change,), Truth((JointTruth(j, names, kinds, since_s=start),))
 

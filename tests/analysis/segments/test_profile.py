@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.segments.family import Member, Scatter, critical_value
-from analysis.segments.profile import Profile, contrasts, family_of, standing_out
+from analysis.segments.outliers import standing_out
+from analysis.segments.profile import Profile, contrasts, family_of
 
 SIGMA, COLUMNS = 1e-3, 24
 

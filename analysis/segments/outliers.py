@@ -1,0 +1,332 @@
+"""Joints that stand out of their chain's profile.
+
+Two searches find which joints belong to the profile: forward selection of joints and shapes, the
+largest studentised one first, and least trimmed squares (Rousseeuw, J. Am. Stat. Assoc. 79, 1984)
+about a parabola, since two joints that stand out hide each other from the first and a profile of
+another shape hides its joints from the second. A joint that stands out leaves the profile, so it
+moves no reference of the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from math import comb
+
+import numpy as np
+from scipy.stats import t
+
+from capture.arrays import BoolArray, FloatArray, IntArray
+
+from .profile import (
+    ENDS,
+    MIDDLE,
+    MIN_JOINTS,
+    Profile,
+    coefficient_weights,
+    deviation_weights,
+    everyone,
+)
+
+ROBUST = 3.5
+"""Robust standard deviations of the others' residuals beyond which a joint stands out."""
+
+MIRRORED = 0.5
+"""Share of a joint's deviation, or its inverse, that its mirror joint shows, too, in a shape."""
+
+LOCAL = 0.5
+"""Share of a deviation that a joint shows beside its neighbours at least, out of a profile."""
+
+CHANCE = 0.01
+"""Chance that of joints of equal scatter one is taken to stand out."""
+
+ROUGH = 2.0
+"""Residuals of the rest so many times their standard error are a profile of its own."""
+
+MAX_DEGREE = 4
+"""Degree of the polynomials that a sound chain's profile may have."""
+
+SUBSETS = 400
+"""Subsets of joints that the trimmed search begins from at most."""
+
+TRIMMED = 3
+"""One of so many joints may stand out of a trimmed fit."""
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """One joint's deviation from the prediction of the others.
+
+    Attributes:
+        joint: Index into the profile.
+        value: In the unit of the profile.
+        error: Its standard error.
+    """
+
+    joint: int
+    value: float
+    error: float
+
+
+@dataclass
+class State:
+    """The model while it grows.
+
+    Attributes:
+        active: Joints that take part, shape (m,).
+        shapes: Columns of the smooth shapes in it, shape (m,) each.
+        outside: Joints that stand out, as found.
+    """
+
+    active: BoolArray
+    shapes: list[FloatArray] = field(default_factory=list[FloatArray])
+    outside: list[int] = field(default_factory=list[int])
+
+
+def standing_out(profile: Profile, critical: float) -> list[Deviation]:
+    """Find the joints that stand out.
+
+    Args:
+        profile: The profile, of ``MIN_JOINTS`` joints or more.
+        critical: Factor on the standard error of simultaneous intervals.
+
+    Returns:
+        Their deviations from the prediction of the rest, the largest first.
+    """
+    grown, trimmed = _grown(profile, critical), _trimmed(profile, critical)
+    found = [
+        [each for joint in state.outside if (each := _kept(profile, state, joint, critical))]
+        for state in (trimmed, grown)
+    ]
+    # Two that stand out hide each other from the one search, a profile its joints from the other.
+    return sorted(max(found, key=len), key=lambda each: -abs(each.value))
+
+
+def _kept(profile: Profile, state: State, joint: int, critical: float) -> Deviation | None:
+    one = _deviation_of(profile, state, joint)
+    return one if _stands_out(profile, state, one, critical) else None
+
+
+def _grown(profile: Profile, critical: float) -> State:
+    """Forward selection of joints and shapes, the largest studentised one first."""
+    state = State(everyone(profile))
+    columns = _smooth_columns(profile)
+    most_shapes = min(len(columns), max(0, (profile.values.size - MIN_JOINTS) // 2))
+    while True:
+        joint, score = _worst(profile, state, critical)
+        column, shape_score = _steepest(profile, state, columns)
+        if joint is not None and score >= shape_score:
+            state.active[joint] = False
+            state.outside.append(joint)
+        elif column is not None and shape_score > critical and len(state.shapes) < most_shapes:
+            state.shapes.append(column)
+            state.active[state.outside] = True  # judged again beside the shape
+            state.outside.clear()
+        elif joint is not None:
+            state.active[joint] = False
+            state.outside.append(joint)
+        else:
+            break
+        if np.count_nonzero(state.active) < max(MIN_JOINTS - 1, profile.values.size // 2):
+            break
+    return state
+
+
+def _trimmed(profile: Profile, critical: float) -> State:
+    """Least trimmed squares, then all joints that its scatter allows, the nearest first."""
+    m = profile.values.size
+    columns = _smooth_columns(profile)[: 2 if m >= 7 else 1 if m >= 5 else 0]
+    state = State(_core(profile, columns), columns)
+    while not state.active.all():
+        outside = np.flatnonzero(~state.active)
+        ratio = [_excess(profile, state, int(joint), critical) for joint in outside]
+        k = int(np.argmin(ratio))
+        if ratio[k] > 1:
+            break
+        state.active[outside[k]] = True
+    if np.count_nonzero(~state.active) <= max(1, m // TRIMMED):
+        state.outside.extend(np.flatnonzero(~state.active).tolist())
+    return state
+
+
+def _core(profile: Profile, columns: Sequence[FloatArray]) -> BoolArray:
+    """The half of the joints whose squared residuals from one fit have the least sum."""
+    m, p = profile.values.size, 1 + len(columns)
+    half = (m + p + 1) // 2
+    design = np.stack([np.ones(m), *columns], axis=1)
+    subsets = np.array(
+        list(combinations(range(m), p))
+        if comb(m, p) <= SUBSETS
+        else [np.random.default_rng(k).permutation(m)[:p] for k in range(SUBSETS)]
+    )
+    best, least = everyone(profile), np.inf
+    for subset in subsets:
+        chosen = subset
+        for _ in range(3):  # concentration (Rousseeuw and Van Driessen, 2006)
+            square = _squares(design, profile.values, chosen)
+            chosen = np.argpartition(square, half - 1)[:half]
+        total = float(np.sum(_squares(design, profile.values, chosen)[chosen]))
+        if total < least:
+            best, least = np.isin(np.arange(m), chosen), total
+    return best
+
+
+def _squares(design: FloatArray, values: FloatArray, chosen: IntArray) -> FloatArray:
+    """Squared residuals of all joints from the fit to some of them, shape (m,)."""
+    fit = np.linalg.lstsq(design[chosen], values[chosen], rcond=None)[0]
+    return np.asarray((values - design @ fit) ** 2, dtype=np.float64)
+
+
+def _excess(profile: Profile, state: State, joint: int, critical: float) -> float:
+    """A joint's deviation, in the largest that noise and scatter of the present rest explain."""
+    rows = deviation_weights(profile, state.active, state.shapes)
+    value, error = (
+        float(rows[joint] @ profile.values),
+        float(profile.scatter.variance(rows[[joint]])[0]) ** 0.5,
+    )
+    index = np.flatnonzero(state.active)
+    reach = np.sqrt(np.sum(rows**2, axis=1))
+    spare = index.size - 1 - len(state.shapes)
+    if spare < 1:
+        return 0.0
+    limit = _scatter_limit(
+        (rows @ profile.values / reach)[index], rows, index, spare, profile.values.size
+    )
+    return abs(value) / max(critical * error, limit * float(reach[joint]), 1e-300)
+
+
+def _deviation_of(profile: Profile, state: State, joint: int) -> Deviation:
+    """A joint's deviation from the prediction of those that are left."""
+    row = deviation_weights(profile, state.active, state.shapes)[joint]
+    variance = float(profile.scatter.variance(row[None, :])[0])
+    return Deviation(joint, float(row @ profile.values), variance**0.5)
+
+
+def _worst(profile: Profile, state: State, critical: float) -> tuple[int | None, float]:
+    """The joint that stands out most beside the present model, and its studentised deviation."""
+    rows = deviation_weights(profile, state.active, state.shapes)
+    value = rows @ profile.values
+    error = np.sqrt(profile.scatter.variance(rows))
+    score = np.where(state.active, np.abs(value) / np.maximum(error, 1e-300), 0.0)
+    for joint in np.argsort(-score).tolist():
+        if score[joint] <= critical:
+            break
+        one = Deviation(joint, float(value[joint]), float(error[joint]))
+        if _stands_out(profile, state, one, critical):
+            return joint, float(score[joint])
+    return None, 0.0
+
+
+def _steepest(
+    profile: Profile, state: State, columns: Sequence[FloatArray]
+) -> tuple[FloatArray | None, float]:
+    """The shape that the present model lacks most, and its studentised coefficient."""
+    best: FloatArray | None = None
+    largest = 0.0
+    basis = [np.ones(profile.values.size), *state.shapes]
+    weight = np.where(state.active, profile.precision, 0.0)
+    for column in columns:
+        if any(column is shape for shape in state.shapes):
+            continue
+        row = coefficient_weights(column, basis, weight)
+        if row is None:
+            continue
+        error = float(profile.scatter.variance(row[None, :])[0]) ** 0.5
+        score = abs(float(row @ profile.values)) / max(error, 1e-300)
+        if score > largest:
+            best, largest = column, score
+    return best, largest
+
+
+def _smooth_columns(profile: Profile) -> list[FloatArray]:
+    """Polynomials along the chain, and the two ends: shapes that a sound chain may have."""
+    x = profile.along
+    columns = [np.asarray(x**degree) for degree in range(1, MAX_DEGREE + 1)]
+    if profile.count >= ENDS + MIDDLE:
+        columns.append((np.abs(x) > 1 - 1e-9).astype(np.float64))
+    return columns
+
+
+def _stands_out(profile: Profile, state: State, one: Deviation, critical: float) -> bool:
+    """Whether a deviation exceeds its interval, the margin and the others' residuals."""
+    if abs(one.value) <= max(critical * one.error, profile.margin):
+        return False
+    others = state.active.copy()
+    others[one.joint] = False
+    index = np.flatnonzero(others)
+    rows = deviation_weights(profile, others, state.shapes)
+    # Of equal scatter, a deviation has that of its weights: more at an end, where a shape leads on.
+    reach = np.sqrt(np.sum(rows**2, axis=1))
+    residual = (rows @ profile.values / reach)[index]
+    spare = index.size - 1 - len(state.shapes)
+    centred = np.abs(residual - np.median(residual))
+    robust = 1.4826 * float(np.median(centred)) * (index.size / max(spare, 1)) ** 0.5
+    size = abs(one.value) / float(reach[one.joint])
+    if size <= ROBUST * robust:
+        return False
+    typical = float(np.median(np.sqrt(profile.scatter.variance(rows[index]))))
+    if robust <= ROUGH * typical and not state.shapes:
+        return True
+    if spare < 1 or size <= _scatter_limit(residual, rows, index, spare, profile.values.size):
+        return False
+    return _out_of_profile(profile, index, one, rows)
+
+
+def _scatter_limit(
+    residual: FloatArray, rows: FloatArray, others: IntArray, spare: int, joints: int
+) -> float:
+    """What a joint of equal scatter exceeds in one of a hundred chains, by Student's t.
+
+    The leave-one-out residuals are e / (1 - h) with weights of norm (1 - h)^-1/2.
+    """
+    norm = np.sqrt(np.sum(rows[others] ** 2, axis=1))
+    own = residual / norm
+    scatter = float(np.sqrt(np.sum(own**2) / spare))
+    return float(t.isf(CHANCE / (2 * joints), spare)) * scatter
+
+
+def _out_of_profile(profile: Profile, others: IntArray, one: Deviation, rows: FloatArray) -> bool:
+    """Whether a joint stands out of a rest that has a profile of its own.
+
+    It stands out beside its neighbours, too; at an end, where its prediction is an extrapolation,
+    it leaves the others' range; and its mirror joint does not show half of the same.
+    """
+    reach = float(np.ptp(profile.values[others]))
+    beside = _beside_neighbours(profile, others, one.joint)
+    extrapolated = _at_an_end(profile, others, one.joint) and abs(one.value) <= reach
+    if extrapolated or min(each / one.value for each in beside) < LOCAL:
+        return False
+    mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])
+    if not mirror.size or mirror[0] == one.joint:
+        return True
+    partner = int(mirror[0])
+    by_model = float(rows[partner] @ profile.values)
+    beside = _beside_neighbours(profile, others[others != partner], partner)
+    shown = [abs(each / one.value) for each in (by_model, *beside)]
+    return not any(MIRRORED <= share <= 1 / MIRRORED for share in shown)
+
+
+def _at_an_end(profile: Profile, others: IntArray, joint: int) -> bool:
+    """Whether all other joints are on one side of a joint."""
+    place = profile.place
+    return bool(place[joint] < place[others].min() or place[joint] > place[others].max())
+
+
+def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:
+    """A joint's deviation from the line of its neighbours; at an end also from the nearest."""
+    place, values = profile.place, profile.values
+    own = float(place[joint])
+    below = others[place[others] < own]
+    above = others[place[others] > own]
+    if below.size and above.size:
+        left, right = int(below[-1]), int(above[0])
+        share = (own - place[left]) / (place[right] - place[left])
+        return (float(values[joint] - (1 - share) * values[left] - share * values[right]),)
+    near = (above if above.size else below[::-1])[:2]
+    flat = float(values[joint] - values[near[0]])
+    if near.size < 2:
+        return (flat,)
+    slope = (values[near[0]] - values[near[1]]) / (place[near[0]] - place[near[1]])
+    line = flat - float(slope * (own - place[near[0]]))
+    return flat, line
