@@ -52,7 +52,7 @@ from ..sweep.runs import (
     command_tones,
     find_sweep,
 )
-from .answer import experiment_answer
+from .answer import broken_first, experiment_answer
 from .indices import experiment_indices
 from .pooling import PooledResponse, pool_runs
 from .runs import (
@@ -129,6 +129,7 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
     if pooled is not None:
         own = [examined[k].analysis for k in roles]
         joints = own[0].answer if len(own) == 1 else pooled_answer(robot, pooled, own)
+    analyses = [one.analysis for one in examined]
     reversal = None
     if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
         reversal = _reversal(names, (forward, reverse), chosen, ways)
@@ -137,11 +138,13 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
     coupling = (
         one_gait_coupling(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
     )
+    answer = (
+        kick_answer(coupling) if only_kicks else experiment_answer(reversal, roles, pooled, joints)
+    )
     return Experiment(
-        answer=kick_answer(coupling)
-        if only_kicks
-        else experiment_answer(reversal, roles, pooled, joints),
-        sessions=tuple(one.analysis for one in examined),
+        # The answer on the runs of one direction has these joints in it.
+        answer=answer if joints is not None else broken_first(analyses, answer),
+        sessions=tuple(analyses),
         runs=tuple(
             _run(one.analysis, run, told.get(k), why.get(k))
             for k, (one, run) in enumerate(zip(examined, runs, strict=True))
@@ -150,7 +153,7 @@ def analyse_experiment(sessions: Iterable[Session], options: Options | None = No
         reversal=reversal,
         coupling=coupling,
         warnings=tuple(warnings),
-        provenance=_provenance([one.analysis for one in examined], options),
+        provenance=_provenance(analyses, options),
         oscillators=body_oscillators(coupling) if isinstance(coupling, LocalCoupling) else None,
         pooled=None if pooled is None else _pooled(pooled),
     )
@@ -174,7 +177,7 @@ def _of_sweep(
     coupling = sweep_coupling(sweep, commanded, paths, options, warnings.append)
     none = np.zeros((0, 0), dtype=np.complex128)
     return Experiment(
-        answer=sweep_answer(coupling),
+        answer=broken_first(analyses, sweep_answer(coupling)),
         sessions=tuple(analyses),
         runs=tuple(
             _run(one, run, *(("sweep", None) if k in sweep.index else (None, "is no run of it")))

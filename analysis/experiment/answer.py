@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from ..results.answer import Answer
+from ..results.analysis import Analysis
+from ..results.answer import Answer, NotFollowing
 from ..results.experiment import OrderedPair, Reversal
 from ..reversal.modules import SIGNIFICANT
 from ..text import formats
+from ..text.answer import NAMED, fault_in_words
 from .pooling import PooledResponse
 from .runs import Role
 
@@ -39,6 +42,36 @@ def experiment_answer(
     if reversal is None:
         return "both directions, but not separable from these sessions"
     return _different(reversal) if reversal.p < SIGNIFICANT else _bounded(reversal)
+
+
+def broken_first(sessions: Sequence[Analysis], answer: str) -> str:
+    """Put the joints that do not follow their command before what an experiment shows.
+
+    Args:
+        sessions: Its sessions.
+        answer: What it shows.
+
+    Returns:
+        The answer, with a clause for each of these joints and where it was so.
+    """
+    found: dict[str, list[tuple[NotFollowing, str]]] = {}
+    for one in sessions:
+        for fault in one.answer.not_following:
+            if fault.kinds != ("lost_samples",):
+                found.setdefault(fault.joint, []).append((fault, Path(one.session.path).name))
+    clauses = [
+        f"{fault_in_words(where[0][0])} ({_sessions([name for _, name in where], len(sessions))})"
+        for where in list(found.values())[:NAMED]
+    ]
+    if len(found) > NAMED:
+        clauses.append(f"{len(found) - NAMED} more joints do not follow either")
+    return "; ".join([*clauses, answer])
+
+
+def _sessions(names: Sequence[str], count: int) -> str:
+    if len(names) == count:
+        return "all sessions"
+    return f"in {names[0]}" if len(names) == 1 else f"in {len(names)} of {count} sessions"
 
 
 def pair_order(pair: OrderedPair) -> str:

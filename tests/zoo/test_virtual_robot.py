@@ -178,8 +178,10 @@ def test_faults_on_the_bus_are_named_by_every_output(
     ("torque", "truth"),
     [
         (0.25, JointTruth(12, stands_out=RESPONSE, checked=False)),
+        # Without power its neighbours swing it: far from its command, at hardly any effort.
+        (1e-4, JointTruth(12, frozenset({"dead"}), frozenset({"dead"}))),
     ],
-    ids=["weak"],
+    ids=["weak", "dead"],
 )
 def test_a_servo_of_the_twin_is_named_by_every_output(tmp_path, healthy, torque, truth):
     path = tmp_path / "run.toml"
