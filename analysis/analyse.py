@@ -43,7 +43,13 @@ from .results.analysis import (
     Window,
 )
 from .results.artefact import flags_by_joint
-from .segments.session import commanded_joints, compare_joints, following, not_following
+from .segments.session import (
+    commanded_joints,
+    compare_joints,
+    following,
+    not_following,
+    stopped,
+)
 from .stretch import Options, choose_stretch, recorded
 from .text.answer import Facts, compose
 from .text.artefacts import warn_flags, within
@@ -159,12 +165,13 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
-    dead = dead_bands(columns, commands, sound, gait, origin_ns)
-    del commands
-    session.forget()
     span = _span(stretch, origin_ns, gait)
     follows = following(session, columns, whole)
     faulty = not_following(follows, held, columns.names, whole.duration_s)
+    broken = stopped(faulty)  # whose plateaus are no dead bands
+    moving = {name: one for name, one in sound.items() if name not in broken}
+    dead = dead_bands(columns, commands, moving, gait, origin_ns)
+    del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)

@@ -7,6 +7,7 @@ No script, no outside reference: style and figures are inside, and a content sec
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from importlib.resources import files
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -110,6 +111,7 @@ def _sessions(result: Analysis | Experiment | Comparison) -> int:
     return len(result.sessions) if isinstance(result, Experiment) else 1
 
 
+@cache
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("analysis.report"),

@@ -266,11 +266,13 @@ def _stands_out(profile: Profile, state: State, one: Deviation, critical: float)
     if size <= ROBUST * robust:
         return False
     typical = float(np.median(np.sqrt(profile.scatter.variance(rows[index]))))
-    if robust <= ROUGH * typical and not state.shapes:
+    smooth = robust <= ROUGH * typical  # the model explains the rest down to its noise
+    if smooth and not state.shapes:
         return True
-    if spare < 1 or size <= _scatter_limit(residual, rows, index, spare, profile.values.size):
-        return False
-    return _out_of_profile(profile, index, one, rows)
+    scatter = (
+        _scatter_limit(residual, rows, index, spare, profile.values.size) if spare > 0 else np.inf
+    )
+    return size > scatter and _out_of_profile(profile, index, one, rows, smooth=smooth)
 
 
 def _scatter_limit(
@@ -286,16 +288,19 @@ def _scatter_limit(
     return float(t.isf(CHANCE / (2 * joints), spare)) * scatter
 
 
-def _out_of_profile(profile: Profile, others: IntArray, one: Deviation, rows: FloatArray) -> bool:
+def _out_of_profile(
+    profile: Profile, others: IntArray, one: Deviation, rows: FloatArray, *, smooth: bool
+) -> bool:
     """Whether a joint stands out of a rest that has a profile of its own.
 
-    It stands out beside its neighbours, too; at an end, where its prediction is an extrapolation,
-    it leaves the others' range; and its mirror joint does not show half of the same.
+    It stands out beside its neighbours, too; at an end of a rest that is not smooth, where its
+    prediction is an extrapolation, it leaves the others' range; and its mirror joint does not show
+    about the same.
     """
     reach = float(np.ptp(profile.values[others]))
     beside = _beside_neighbours(profile, others, one.joint)
     extrapolated = _at_an_end(profile, others, one.joint) and abs(one.value) <= reach
-    if extrapolated or min(each / one.value for each in beside) < LOCAL:
+    if (extrapolated and not smooth) or min(each / one.value for each in beside) < LOCAL:
         return False
     mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])
     if not mirror.size or mirror[0] == one.joint:

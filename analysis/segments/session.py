@@ -37,6 +37,9 @@ _OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
 }
 """Artefacts that mean that a joint does not follow, or can't be seen to: kinds that fit."""
 
+_ZERO = frozenset({"slipped", "slipped_sensor", "drifting_sensor"})
+"""Kinds of a zero that moved."""
+
 _AGAIN = 3
 """Stalls that a limit causes, too, in each cycle."""
 
@@ -138,13 +141,28 @@ def not_following(
         kinds = _kinds_of(artefact, found_by_motion.motions.get(artefact.joint))
         lasted = sum(stop - start for start, stop in artefact.spans_s)
         share = lasted / duration_s if artefact.spans_s and duration_s > 0 else 1.0
-        if kinds and artefact.joint not in found and share >= _LASTING:
+        known = found.get(artefact.joint)
+        # A flat top moves the mean of the position, which by itself is a zero that moved.
+        new = known is None or (artefact.flag == "clipped" and _ZERO.issuperset(known.kinds))
+        if kinds and new and share >= _LASTING:
             since = artefact.spans_s[0][0] if artefact.spans_s else None
             until = artefact.spans_s[-1][1] if artefact.spans_s else None
             text = f"{artefact.quantity} {artefact.flag}"
             text += f" ({artefact.note})" if artefact.note else ""
             found[artefact.joint] = NotFollowing(artefact.joint, kinds, since, until, share, text)
     return tuple(found[name] for name in names if name in found)
+
+
+def stopped(faulty: Iterable[NotFollowing]) -> frozenset[str]:
+    """Joints that are not compared.
+
+    Args:
+        faulty: Joints that do not follow.
+
+    Returns:
+        Their names, without those of which samples are missing only.
+    """
+    return frozenset(each.joint for each in faulty if set(each.kinds) - _COMPARABLE)
 
 
 def _kinds_of(artefact: Artefact, motion: JointMotion | None) -> tuple[str, ...]:
@@ -195,7 +213,7 @@ def compare_joints(
     """
     if gait is None:
         return Findings()
-    out = {each.joint for each in faulty if set(each.kinds) - _COMPARABLE}
+    out = stopped(faulty)
     results = list(joints)
     sound = {j.name for j in results if j.lag_rad.value is not None and j.name not in out}
     old = {j.name for j in results if j.name in sound and "stale" in j.flags}

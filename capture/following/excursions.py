@@ -52,6 +52,9 @@ SETTLING = 1.5
 AGAIN = 3
 """Short departures that make a fault."""
 
+AT_TIMES = 0.03
+"""Share of the record that they last together: less is what collisions do."""
+
 DRIFT_SHARE = 0.15
 """Drift of the offset, as a share of the amplitude, that is no fault."""
 
@@ -208,6 +211,8 @@ def departures(
             continue  # it follows there, with another gain or lag
         if kind == "held" and loaded:
             continue
+        if kind == "stepped" and span[1] - span[0] < response.period_s / 2:
+            continue  # the last part of a cycle: too little to know a zero by
         if kind == "stepped" and span[0] < settled < span[1]:
             # The usual zero is that of the longer part: the step is where this part ends.
             by_kind.setdefault(kind, []).append((span[1], end))
@@ -215,7 +220,8 @@ def departures(
         else:
             by_kind.setdefault(kind, []).append(span)
         texts.setdefault(kind, text)
-    if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s):
+    length = float(np.ptp(found.t_s)) if found.t_s.size else 0.0
+    if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s, length):
         del by_kind["astray"]
     symptoms = [Symptom(kind, tuple(own), texts[kind]) for kind, own in by_kind.items()]
     if not found.spans_s and (drift := _drift(response, found)):
@@ -234,9 +240,11 @@ def _coherent(response: Response, span: Span) -> bool:
     return float(np.quantile(response.explained[near], passing)) > AS_USUAL * usual
 
 
-def _lasting(spans: Sequence[Span], period_s: float) -> bool:
+def _lasting(spans: Sequence[Span], period_s: float, length_s: float) -> bool:
     """Whether departures come again and again, or one of them lasts a cycle."""
-    return len(spans) >= AGAIN or any(stop - start > period_s for start, stop in spans)
+    together = sum(stop - start for start, stop in spans)
+    again = len(spans) >= AGAIN and together > AT_TIMES * length_s
+    return again or any(stop - start > period_s for start, stop in spans)
 
 
 def _described(found: Excursions, span: Span, end: float, period_s: float) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import BoolArray, FloatArray
 from .fault import Fault, Span
 from .motion import FEW_SAMPLES, JointMotion, Samples
 
@@ -32,6 +32,9 @@ PUSHING = 1.3
 
 CONSTANT = 0.1
 """Standard deviation over mean below which an effort is constant."""
+
+OF_SENSOR = 0.5
+"""Share of a shift that a second sensor lacks, above which it is the first sensor's."""
 
 MOSTLY = 0.5
 """Share of exact repeats above which a sensor may be frozen."""
@@ -245,15 +248,28 @@ def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list
     """Kinds of a zero that moved: by a second sensor, or by the velocity at a step."""
     sensor = {"stepped": "slipped_sensor", "drifting": "drifting_sensor"}[main.name]
     if motion.reference is not None and motion.reference.values.size > 8:
-        gap = motion.position.values - motion.reference.at(motion.position.t_s)
-        inside = _inside(motion.position.t_s, main.spans_s or (_record(motion),))
-        moved = float(np.ptp(gap)) if main.name == "drifting" else 0.0
-        if main.name == "stepped" and inside.any() and not inside.all():
-            moved = abs(float(np.median(gap[inside]) - np.median(gap[~inside])))
-        if moved > 0.1 * motion.position.range:
+        t_s = motion.position.t_s
+        gap = motion.position.values - motion.reference.at(t_s)
+        whole = motion.position.values - motion.command.at(t_s)
+        inside = _inside(t_s, main.spans_s or (_record(motion),))
+        shift = _trend if main.name == "drifting" else _step
+        if abs(shift(gap, t_s, inside)) > OF_SENSOR * abs(shift(whole, t_s, inside)):
             return [sensor], "the second sensor does not show it"
         return ["slipped"], "the second sensor shows it, too"
     return kinds, ""
+
+
+def _trend(values: FloatArray, t_s: FloatArray, _: BoolArray) -> float:
+    """Change over the record, by the regression line."""
+    centred = t_s - t_s.mean()
+    return float(centred @ values / (centred @ centred)) * float(np.ptp(t_s))
+
+
+def _step(values: FloatArray, _: FloatArray, inside: BoolArray) -> float:
+    """Mean inside a span less the mean outside it."""
+    if not inside.any() or inside.all():
+        return 0.0
+    return float(values[inside].mean() - values[~inside].mean())
 
 
 def _shows_motion(
@@ -314,7 +330,7 @@ def _at_one_end(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     return bool(levels) and (max(levels) <= low + slack or min(levels) >= high - slack)
 
 
-def _inside(t_s: FloatArray, spans: tuple[Span, ...]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _inside(t_s: FloatArray, spans: tuple[Span, ...]) -> BoolArray:
     marked = np.zeros(t_s.size, dtype=np.bool_)
     for start, stop in spans:
         i, j = np.searchsorted(t_s, (start, stop))

@@ -69,7 +69,10 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     result: dict[str, list[Symptom]] = {}
     lost = [_lost(each) for each in sampled]
     stale = [_repeats(each) for each in sampled]
-    spikes = [_spikes(each) for each in sampled]
+    largest = max((each.command.range for each in sampled), default=0.0)
+    spikes = [
+        _spikes(each) if each.command.range > SPIKE_SHARE * largest else 0.0 for each in sampled
+    ]
     usual_lost, usual_stale, usual_spikes = (
         float(np.median(values)) if values else 0.0 for values in (lost, stale, spikes)
     )
