@@ -34,6 +34,9 @@ _HINT = 0.15
 _CLEAR = 20.0
 """Gain in log likelihood, times two, over a joint without a dead band."""
 
+_ODD = (1, 3, 5, 7)
+"""Harmonics that hold seven tenths of what a square wave adds to its fundamental."""
+
 _CREEP = 0.1
 """A joint at rest moves by less than this share of what its command would have it move by."""
 
@@ -87,11 +90,12 @@ def _of_group(
     wave, ratio = _fundamentals(cycles, omega)
     amplitude, lag = np.abs(wave), -np.angle(ratio) % (2 * np.pi)
     resolution = np.array([_resolution(one) for one in cycles.measured])
-    linear = np.array([_without(cycles, j, float(lag[j])) for j in range(len(names))])
+    linear = np.array([_without(cycles, j, float(lag[j]), omega) for j in range(len(names))])
     hinted = (
         (np.abs(ratio) > _FOLLOWS)
         & (amplitude * np.abs(ratio) > RESOLVED * resolution)
         & (linear[:, 1] > _HINT * RESOLVED * resolution)
+        & (linear[:, 2] > 0.7 * _CLEAR)
     )
     chosen = np.flatnonzero(hinted)
     if chosen.size == 0:
@@ -136,11 +140,12 @@ def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexAr
     return np.array(waves), np.array(ratios)
 
 
-def _without(cycles: Cycles, joint: int, lag: float) -> tuple[float, float]:
-    """Misfit without a dead band [rad^2], and the width that the loop hints at [rad].
+def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[float, float, float]:
+    """Misfit without a dead band [rad^2], the width that the loop hints at [rad], what to gain.
 
     Position = offset + gain c + damping c' is exact for a linear joint and a sine; a dead band adds
-    a square wave that changes sign with the joint.
+    a square wave that changes sign with the joint. The gain in log likelihood, times two, is that
+    of free odd harmonics: no dead band has more but for what lies above them.
     """
     times = cycles.t_s[:, cycles.first :].ravel()
     command = cycles.commands[joint]
@@ -157,7 +162,13 @@ def _without(cycles: Cycles, joint: int, lag: float) -> tuple[float, float]:
     measured = cycles.measured[joint, :, cycles.first :].ravel()
     alone = np.linalg.lstsq(plain, measured, rcond=None)[0]
     both = np.linalg.lstsq(np.column_stack((plain, square)), measured, rcond=None)[0]
-    return float(np.square(measured - plain @ alone).sum()), 2 * abs(float(both[-1]))
+    left = measured - plain @ alone
+    angle = omega * np.outer(times, _ODD)
+    waves = np.hstack((np.ones((times.size, 1)), np.cos(angle), np.sin(angle)))
+    free = left - waves @ np.linalg.lstsq(waves, left, rcond=None)[0]
+    cost, least = float(left @ left), float(free @ free)
+    gain = times.size * float(np.log(cost / least)) if least > 0 else np.inf
+    return cost, 2 * abs(float(both[-1])), gain
 
 
 def _resolution(measured: FloatArray) -> float:
