@@ -186,7 +186,7 @@ def _excess(profile: Profile, state: State, joint: int, critical: float) -> floa
         float(profile.scatter.variance(rows[[joint]])[0]) ** 0.5,
     )
     index = np.flatnonzero(state.active)
-    reach = np.sqrt(np.sum(rows**2, axis=1))
+    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), 1e-300)
     spare = index.size - 1 - len(state.shapes)
     if spare < 1:
         return 0.0
@@ -257,7 +257,7 @@ def _stands_out(profile: Profile, state: State, one: Deviation, critical: float)
     index = np.flatnonzero(others)
     rows = deviation_weights(profile, others, state.shapes)
     # Of equal scatter, a deviation has that of its weights: more at an end, where a shape leads on.
-    reach = np.sqrt(np.sum(rows**2, axis=1))
+    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), 1e-300)
     residual = (rows @ profile.values / reach)[index]
     spare = index.size - 1 - len(state.shapes)
     centred = np.abs(residual - np.median(residual))

@@ -250,12 +250,17 @@ def _(robot, rng, j):
     )
 
 
+def _again(kinds):
+    """Kinds of a joint that stands and follows again; a sensor that does so repeats old values."""
+    return kinds | PAUSED | ({"stale_sensor"} if "frozen_sensor" in kinds else frozenset())
+
+
 @fault("intermittent, a fifth of the time")
 def _(robot, rng, j):
     """The position stands still for a part of a cycle, again and again; the effort is zero then."""
     acts = _bouts(robot, j, rng, 0.2)
     change = Change(j, position=_hold(robot.moved(j), acts), power=np.where(acts, 0.0, 1.0))
-    kinds = standing(robot.channels, "dead") | PAUSED
+    kinds = _again(standing(robot.channels, "dead"))
     return (change,), Truth((JointTruth(j, frozenset({"intermittent", "dead"}), kinds),))
 
 
@@ -672,9 +677,7 @@ def _(robot, rng, j):
     t = robot.t_s[:, j]
     acts = (t >= start) & (t < start + rng.uniform(0.25, 0.4) * robot.duration_s)
     change = Change(j, position=_hold(robot.moved(j), acts))
-    kinds = standing(robot.channels, "pushing") | PAUSED
-    if "frozen_sensor" in kinds:  # that comes back: values that are old by then
-        kinds |= {"stale_sensor"}
+    kinds = _again(standing(robot.channels, "pushing"))
     names = frozenset({"jammed", "stalled", "intermittent"})
     return (change,), Truth((JointTruth(j, names, kinds, since_s=start),))
 
