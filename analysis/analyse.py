@@ -49,6 +49,7 @@ from .segments.session import (
     following,
     not_following,
     stopped,
+    unrefuted,
 )
 from .stretch import Options, choose_stretch, recorded
 from .text.answer import Facts, compose
@@ -161,12 +162,13 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     responses = _series(columns.names, columns.position, stretch, origin_ns)
     _warn_dropped(commands, responses, warn)
     session.forget()
-    held = within(artefacts, session, stretch)
+    follows = following(session, columns, whole)
+    held = unrefuted(within(artefacts, session, stretch), follows)
+    session.forget()
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
     span = _span(stretch, origin_ns, gait)
-    follows = following(session, columns, whole)
     faulty = not_following(follows, held, columns.names, whole.duration_s)
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}

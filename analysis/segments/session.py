@@ -113,6 +113,27 @@ def _offsets(motion: JointMotion) -> FloatArray:
     return response.offset[::BLOCKS][response.valid[::BLOCKS]]
 
 
+def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefact, ...]:
+    """Leave out values that repeat for a moment where the joint follows its command all the same.
+
+    Args:
+        artefacts: Of the analysed window.
+        follows: How the joints follow in it.
+
+    Returns:
+        The others, in their order.
+    """
+    broken = {fault.joint for fault in follows.faults}
+    driven = {name for name, one in follows.motions.items() if one.command.range > 0}
+    return tuple(
+        one
+        for one in artefacts
+        if (one.quantity, one.flag) != ("position", "frozen")
+        or one.joint in broken
+        or one.joint not in driven
+    )
+
+
 def not_following(
     found_by_motion: Following,
     artefacts: Iterable[Artefact],
@@ -144,7 +165,7 @@ def not_following(
         known = found.get(artefact.joint)
         # A flat top moves the mean of the position, which by itself is a zero that moved.
         new = known is None or (artefact.flag == "clipped" and _ZERO.issuperset(known.kinds))
-        if kinds and new and share >= _LASTING:
+        if kinds and new and (share >= _LASTING or artefact.falsifies("position")):
             since = artefact.spans_s[0][0] if artefact.spans_s else None
             until = artefact.spans_s[-1][1] if artefact.spans_s else None
             text = f"{artefact.quantity} {artefact.flag}"

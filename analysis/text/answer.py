@@ -323,11 +323,10 @@ def _shape(shape: Shape, joints: str) -> str:
         verb = "lag" if lag else "have"
         tail = f"{text} {more}" if lag else f"{text} {more} gain"
         return f"the outer {joints} {verb} {tail} than the inner ones, alike on both sides"
-    name = formats.plain(shape.joint or "")
-    more = "more" if sign > 0 else "less"
+    # Which one it is most stands in the table: one of many sound joints always is.
     return (
-        f"each of the {joints} has a {shape.quantity} of its own, most so {name} "
-        f"with {text} {more} than the others"
+        f"each of the {joints} has a {shape.quantity} of its own, up to {text} "
+        f"{'more' if sign > 0 else 'less'} than the others"
     )
 
 

@@ -52,6 +52,9 @@ SETTLING = 1.5
 AGAIN = 3
 """Short departures that make a fault."""
 
+GROWN = 0.8
+"""Share of the command's later size below which it still grows."""
+
 AT_TIMES = 0.03
 """Share of the record that they last together: less is what collisions do."""
 
@@ -213,6 +216,8 @@ def departures(
             continue
         if kind == "stepped" and span[1] - span[0] < response.period_s / 2:
             continue  # the last part of a cycle: too little to know a zero by
+        if kind == "stepped" and _grows(response, span[0]):
+            continue
         if kind == "stepped" and span[0] < settled < span[1]:
             # The usual zero is that of the longer part: the step is where this part ends.
             by_kind.setdefault(kind, []).append((span[1], end))
@@ -238,6 +243,15 @@ def _coherent(response: Response, span: Span) -> bool:
     # Where it changes from the one to the other, a cycle of either side is in the windows.
     passing = TRANSITION if np.count_nonzero(near) >= MANY else 0.0
     return float(np.quantile(response.explained[near], passing)) > AS_USUAL * usual
+
+
+def _grows(response: Response, at_s: float) -> bool:
+    """Whether the command is larger after a time than before: so may be what limits the joint."""
+    before = response.asked[response.stop_s <= at_s + response.period_s / 2]
+    after = response.asked[response.start_s >= at_s]
+    if not before.size or not after.size:
+        return False
+    return float(np.median(before)) < GROWN * float(np.median(after))
 
 
 def _lasting(spans: Sequence[Span], period_s: float, length_s: float) -> bool:
@@ -301,6 +315,8 @@ def _drift(response: Response, found: Excursions) -> Symptom | None:
             return None
         # The windows around a step hold parts of both: it lies in their middle.
         at = float((t_s[split] + t_s[split + 1]) / 2)
+        if _grows(response, at):
+            return None
         return Symptom(
             "stepped", ((at, float(found.t_s[-1])),), f"off by {np.degrees(size):+.1f} degrees"
         )
