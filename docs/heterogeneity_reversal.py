@@ -165,12 +165,12 @@ def experiments(case, folder, *, balanced, count, scatter, seed):
     return rates
 
 
-def check_relation(folder):
+def check_relation(folder, tilts, directions):
     """Print how far runs of the reversed wave are from the relation."""
     checked = [Case(), Case(joint="joint05", share=-SHARE)]
-    for direction in DIRECTIONS:
+    for direction in directions:
         for heading in (0, 180):
-            checked += [Case(tilt, direction, heading) for tilt in TILTS_DEG]
+            checked += [Case(tilt, direction, heading) for tilt in tilts]
             checked.append(Case(2.0, direction, heading, "joint05", -SHARE))
     worst = max(
         float(np.abs(other_way(case, folder) - mirrored(case, folder)).max()) for case in checked
@@ -181,13 +181,13 @@ def check_relation(folder):
     )
 
 
-def check_cancelling(folder):
+def check_cancelling(folder, tilts, directions):
     """Print what a floor leaves of d with one heading and with both, identical modules."""
     print(
         "floor                 |d| in degrees: one heading, balanced; common/contrast, one heading"
     )
-    for tilt in TILTS_DEG:
-        for direction in DIRECTIONS:
+    for tilt in tilts:
+        for direction in directions:
             plus = [profile(Case(tilt, direction, one), folder) for one in (0, 180)]
             minus = [other_way(Case(tilt, direction, one), folder)[::-1] for one in (0, 180)]
             one, both = plus[0] - minus[0], (plus[0] + plus[1] - minus[0] - minus[1]) / 2
@@ -202,16 +202,20 @@ def main():
     parser.add_argument("--profiles", type=Path, help="folder that keeps the twin's profiles")
     parser.add_argument("--count", type=int, default=500, help="experiments a row")
     parser.add_argument("--scatter", type=float, default=0.1, help="of a run [degrees]")
+    parser.add_argument("--quick", action="store_true", help="one floor, one module, five draws")
     chosen = parser.parse_args()
-    count, scatter = chosen.count, math.radians(chosen.scatter)
+    count, scatter = 5 if chosen.quick else chosen.count, math.radians(chosen.scatter)
+    tilts = TILTS_DEG[-1:] if chosen.quick else TILTS_DEG
+    directions = tuple(DIRECTIONS)[:1] if chosen.quick else tuple(DIRECTIONS)
+    modules = ("joint05",) if chosen.quick else tuple(name for name in YAW if name != MIDDLE)
     with tempfile.TemporaryDirectory() as temporary:
         folder = chosen.profiles or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        check_relation(folder)
-        check_cancelling(folder)
+        check_relation(folder, tilts, directions)
+        check_cancelling(folder, tilts, directions)
         print(f"{count} experiments of 6 + 6 runs a row, scatter {chosen.scatter:g} degrees")
         print("                                        rejected stated named right, in %")
-        floors = [(0.0, "fore-aft"), *((t, d) for t in TILTS_DEG for d in DIRECTIONS)]
+        floors = [(0.0, "fore-aft"), *((t, d) for t in tilts for d in directions)]
         plans = {"one heading": False, "balanced": True}
         for plan, balanced in plans.items():
             for seed, (tilt, direction) in enumerate(floors):
@@ -223,12 +227,11 @@ def main():
             for tilt, direction, share in (
                 (0.0, "fore-aft", -SHARE),
                 (0.0, "fore-aft", SHARE),
-                *((2.0, direction, -SHARE) for direction in DIRECTIONS),
+                *((2.0, direction, -SHARE) for direction in directions),
             ):
                 rows = {}
-                for seed, joint in enumerate(YAW):
-                    if joint == MIDDLE:
-                        continue
+                for joint in modules:
+                    seed = YAW.index(joint)
                     case = Case(tilt, direction, joint=joint, share=share)
                     how = {"balanced": balanced, "count": count, "scatter": scatter, "seed": seed}
                     rows[joint] = experiments(case, folder, **how)
@@ -241,7 +244,7 @@ def main():
                     )
                 )
                 print(f"  {title} joint05       {rows['joint05'].text(count)}")
-                print(f"  {title} mean of 12    {mean.text(count)}")
+                print(f"  {title} mean of {len(rows):2d}    {mean.text(count)}")
                 print(f"  {title} worst {hardest} {rows[hardest].text(count)}", flush=True)
 
 

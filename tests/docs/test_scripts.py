@@ -17,7 +17,7 @@ RUN_ELSEWHERE = {"conf.py", "notebook_page.py"}
 PICTURES = {"pictures.py", "side_by_side.py"}
 """Need the viewer's driver."""
 
-OWN_TESTS = {"paper_figures.py", "oscillator_tables.py", "heterogeneity_reversal.py"}
+OWN_TESTS = {"paper_figures.py", "oscillator_tables.py"}
 TABLES = sorted(
     path.name for path in DOCS.glob("*.py") if path.name not in RUN_ELSEWHERE | PICTURES | OWN_TESTS
 )
