@@ -7,10 +7,15 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
+
+TESTS = str(Path(__file__).parent)
+if TESTS not in sys.path:  # test folders are no packages: the fault zoo is imported by its name
+    sys.path.append(TESTS)
 
 REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
+from zoo.bags import JOINT_STATE
 
 from capture import SessionWriter
 
@@ -15,21 +16,6 @@ chain = runpy.run_path(str(Path(__file__).with_name("linear_chain.py")))
 experiment = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["experiment"]
 
 EPOCH_NS = 1_735_689_600_123_456_789
-
-JOINT_STATE = """std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 
 
 class Bag:

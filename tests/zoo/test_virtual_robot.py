@@ -8,9 +8,9 @@ import time
 from contextlib import closing, contextmanager
 
 import pytest
-from zoo.faults import RESPONSE
 from zoo.judging import judge
 from zoo.outputs import OUTPUTS, statements
+from zoo.planting import RESPONSE
 from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
 
 import undulog
