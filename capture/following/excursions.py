@@ -279,7 +279,7 @@ def _described(found: Excursions, span: Span, end: float, period_s: float) -> tu
         if abs(turns) > 0.5 and abs(turns - round(turns)) < 0.05:
             return "wrapped", f"off by {round(turns)} turns"
         return "stepped", f"off by {np.degrees(mean):+.1f} degrees"
-    if rough > NOISY and residual.size >= 2 * FEW:
+    if rough > NOISY and residual.size >= 2 * FEW and spread > abs(mean):
         return "noisy", f"residual of {np.degrees(variance**0.5):.2g} degrees"
     if swing > 0.5 * found.amplitude and moved < HELD * swing:
         level = float(np.median(position))

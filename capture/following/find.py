@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span
-from .kinds import Symptom, fault_of
+from .kinds import Symptom, UsualEffort, fault_of
 from .motion import FEW_SAMPLES, JointMotion, Response, cycle_s, windowed_response
 from .records import record_faults, wraps
 from .swaps import swapped_pairs
@@ -163,9 +163,10 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
         if not known & {"still", "held", "wrapped"}:
             symptoms[name] += [each for each in lacking if each.name not in known]
     by_name: Mapping[str, Judged] = {each.motion.name: each for each in judged}
-    usual_effort = _usual_effort(judged)
+    stands = any(each.name in ("still", "held") for own in symptoms.values() for each in own)
+    usual = _usual_effort(judged if stands else ())
     return tuple(
-        fault_of(each, by_name.get(each.name), symptoms[each.name], usual_effort)
+        fault_of(each, by_name.get(each.name), symptoms[each.name], usual)
         for each in motions
         if symptoms[each.name]
     )
@@ -329,7 +330,9 @@ def _usual(each: Judged, values: FloatArray) -> float:
 
 def _unit_factor(each: Judged, gain: float) -> str | None:
     """The factor between degrees and radians that a gain shows, in words."""
-    if not each.follows.any() or gain <= 0:
+    if np.count_nonzero(each.follows) < MIN_SHARE * np.count_nonzero(each.response.valid):
+        return None
+    if gain <= 0:
         return None
     for factor, text in ((DEGREE, "180/pi"), (1 / DEGREE, "pi/180")):
         if abs(np.log(gain / factor)) < np.log(UNIT_SLACK):
@@ -396,12 +399,16 @@ def _median(values: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> complex:
     return complex(np.median(values.real), np.median(values.imag))
 
 
-def _usual_effort(judged: Sequence[Judged]) -> FloatArray:
-    """Median absolute effort of each joint that follows, shape (k,)."""
-    return np.array(
-        [
-            float(np.median(np.abs(each.motion.effort.values)))
-            for each in judged
-            if each.motion.effort is not None and each.motion.effort.values.size and each.has_usual
-        ]
-    )
+def _usual_effort(judged: Sequence[Judged]) -> UsualEffort:
+    """Effort of each joint that follows."""
+    size: list[float] = []
+    ratio: list[complex] = []
+    for each in judged:
+        effort = each.motion.effort
+        if effort is None or not effort.values.size or not each.has_usual:
+            continue
+        r = windowed_response(each.motion.command, effort, each.response.period_s)
+        size.append(float(np.median(np.abs(effort.values))))
+        if r.valid.any():
+            ratio.append(_median(r.ratio[r.valid]))
+    return UsualEffort(np.array(size, dtype=np.float64), np.array(ratio, dtype=np.complex128))

@@ -7,13 +7,14 @@ another quantity that was recorded; otherwise all kinds that fit are named.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, ComplexArray, FloatArray
 from .fault import Fault, Span
-from .motion import FEW_SAMPLES, JointMotion, Samples
+from .motion import BLOCKS, FEW_SAMPLES, JointMotion, Samples, windowed_response
 
 if TYPE_CHECKING:
     from .find import Judged
@@ -26,6 +27,9 @@ AT_REST = 0.3
 
 NO_EFFORT = 0.15
 """Share of the usual effort below which a motor does not push."""
+
+SAME = 0.35
+"""Change of an effort, as a share of the usual one, up to which it is the usual one."""
 
 PUSHING = 1.3
 """Share of the usual effort above which a motor pushes against something."""
@@ -100,11 +104,32 @@ class Symptom:
     text: str
 
 
+@dataclass(frozen=True)
+class UsualEffort:
+    """Effort of the joints that follow.
+
+    Attributes:
+        size: Median absolute effort of each, shape (k,).
+        ratio: Response of the effort to the command of each, shape (k,).
+    """
+
+    size: FloatArray
+    ratio: ComplexArray
+
+    def size_of(self, motion: JointMotion, main: Symptom) -> float:
+        """Usual absolute effort of a joint: its own where it does not stand, else the others'."""
+        if motion.effort is not None and main.spans_s:
+            outside = motion.effort.values[~_inside(motion.effort.t_s, main.spans_s)]
+            if outside.size >= FEW_SAMPLES:
+                return float(np.median(np.abs(outside)))
+        return float(np.median(self.size)) if self.size.size else 0.0
+
+
 def fault_of(
     motion: JointMotion,
     judged: Judged | None,
     symptoms: list[Symptom],
-    usual_effort: FloatArray,
+    usual: UsualEffort,
 ) -> Fault:
     """Turn the symptoms of one joint into its fault.
 
@@ -112,7 +137,7 @@ def fault_of(
         motion: The joint.
         judged: Its judged windows; None where it could not be judged.
         symptoms: What it shows, at least one.
-        usual_effort: Median absolute effort of the joints that follow, shape (k,).
+        usual: Effort of the joints that follow.
 
     Returns:
         The fault.
@@ -124,8 +149,8 @@ def fault_of(
     kinds: list[str] = list(_KINDS[main.name])
     decided = ""
     if main.name in ("still", "held") and judged is not None:
-        kinds, decided = _standing(motion, judged, main, usual_effort)
-        if main.name == "held" and _again(main, begin, end):
+        kinds, decided = _standing(motion, judged, main, usual)
+        if main.name == "held" and _again(main, end - begin, end, judged.response.period_s):
             mechanical = [kind for kind in kinds if kind not in _SENSOR]
             first = ["intermittent"] if mechanical else []
             late = ["stale_sensor"] if "frozen_sensor" in kinds else []
@@ -149,17 +174,19 @@ def fault_of(
     return Fault(motion.name, tuple(kinds), spans, since, until, share, evidence)
 
 
-def _again(main: Symptom, begin: float, end: float) -> bool:
-    """Whether a joint starts to follow again after it stood still."""
-    last = max((stop for _, stop in main.spans_s), default=end)
-    return len(main.spans_s) > 1 or end - last > 0.1 * (end - begin)
+def _again(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
+    """Whether a joint follows again, for a cycle or more, after it stood still."""
+    spans = sorted(main.spans_s)
+    between = [after[0] - before[1] for before, after in pairwise(spans)]
+    last = spans[-1][1] if spans else end
+    return any(gap > cycle_s for gap in between) or end - last > 0.1 * length
 
 
 def _standing(
     motion: JointMotion,
     judged: Judged,
     main: Symptom,
-    usual_effort: FloatArray,
+    usual: UsualEffort,
 ) -> tuple[list[str], str]:
     """Kinds of a joint that stands still, by what else was recorded."""
     spans = main.spans_s or (_record(motion),)
@@ -171,51 +198,81 @@ def _standing(
         if shown is True:
             return ["frozen_sensor"], f"the {name} shows that it moves"
         if shown is False and not speed:  # a velocity may be the position's own derivative
-            kinds, why = _by_effort(motion, spans, main, usual_effort)
+            kinds, why = _by_effort(motion, judged, main, usual)
             kept = [kind for kind in kinds if kind != "frozen_sensor"]
             return kept, f"the second sensor stands still, too{'; ' + why if why else ''}"
-    return _by_effort(motion, spans, main, usual_effort)
+    return _by_effort(motion, judged, main, usual)
 
 
 def _by_effort(
-    motion: JointMotion,
-    spans: tuple[Span, ...],
-    main: Symptom,
-    usual_effort: FloatArray,
+    motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
 ) -> tuple[list[str], str]:
     """Kinds of a joint that stands still, by its noise and its effort."""
     kinds = list(_KINDS[main.name])
-    if not _repeats(motion, spans):  # new noise in each sample: the sensor measures
+    spans = main.spans_s or (_record(motion),)
+    repeats = _repeats(motion, spans)
+    if not repeats:  # new noise in each sample: the sensor measures
         kinds.remove("frozen_sensor")
-    at_limit = _at_limit(motion, spans) or _at_one_end(motion, main.spans_s)
-    if at_limit:
-        kinds = ["at_limit", *kinds]
+    limit = ["at_limit"] if _at_limit(motion, spans) or _at_one_end(motion, main.spans_s) else []
     if motion.effort is None:
-        return kinds, ""
-    inside = _inside(motion.effort.t_s, spans)
-    here, outside = motion.effort.values[inside], motion.effort.values[~inside]
-    own = main.spans_s and outside.size >= FEW_SAMPLES
-    usual = float(np.median(np.abs(outside))) if own else _typical(usual_effort)
-    if here.size < FEW_SAMPLES or not usual > 0:
-        return kinds, ""
-    size = float(np.median(np.abs(here)))  # of a sine as large as its root mean square
+        return [*limit, *kinds], ""
+    here = motion.effort.values[_inside(motion.effort.t_s, spans)]
+    known = _effort_there(motion, judged, main, usual)
+    if known is None:
+        return [*limit, *kinds], ""
+    size, change = known
     mean, spread = float(np.mean(here)), float(np.std(here))
-    decided: tuple[list[str], str] = (kinds, "")
-    repeats = "frozen_sensor" in kinds
-    if repeats and np.count_nonzero(np.diff(here) == 0) > MOSTLY * here.size:
-        return [*kinds, "stale_sensor"], "its effort is constant to the bit, too"
-    if size < NO_EFFORT * usual:
-        decided = ["dead"], "its effort is near zero"
-    elif abs(mean) > 0.5 * usual and spread < CONSTANT * abs(mean):
-        decided = ["stalled", "jammed"], "it pushes with constant effort"
-    elif size > PUSHING * usual:
-        text = f"its effort is {size / usual:.1f} times the usual one"
-        decided = ["jammed", "stalled"], text
-    elif repeats and size > 0.5 * usual:
-        decided = ["frozen_sensor"], "its effort goes on as usual"
-    if at_limit and decided[1]:
-        decided = ["at_limit", *decided[0]], decided[1]
-    return decided
+    held = repeats and np.count_nonzero(np.diff(here) == 0) > MOSTLY * here.size
+    constant = spread < CONSTANT * abs(mean) and abs(mean) > 0.5 * usual.size_of(motion, main)
+    unusual, works = change > SAME, size > 0.5
+    rules = (
+        (held, [*kinds, "stale_sensor"], "its effort is constant to the bit, too"),
+        (constant, ["stalled", "jammed"], "it pushes with constant effort"),
+        (size < NO_EFFORT, ["dead"], "its effort is near zero"),
+        (
+            size > PUSHING and unusual,
+            ["jammed", "stalled"],
+            f"its effort is {size:.1f} times the usual one",
+        ),
+        (works and unusual, ["jammed", "stalled"], "its effort is not the usual one"),
+        (works and repeats, ["frozen_sensor"], "its effort goes on as usual"),
+    )
+    chosen, why = next(((fit, text) for holds, fit, text in rules if holds), (kinds, ""))
+    return [*limit, *chosen], why
+
+
+def _effort_there(
+    motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
+) -> tuple[float, float] | None:
+    """Size of the effort where a joint stands, and its change, both in the usual one.
+
+    The effort's response to the command in windows of one cycle: a joint that is blocked pushes
+    in step with its command, one that moves in step with its own lag behind it.
+    """
+    if motion.effort is None:
+        return None
+    spans = main.spans_s or (_record(motion),)
+    r = windowed_response(motion.command, motion.effort, judged.response.period_s)
+    slack = r.period_s / BLOCKS / 2
+    within, beside = np.zeros_like(r.valid), np.ones_like(r.valid)
+    for start, stop in spans:
+        within |= (r.start_s >= start - slack) & (r.stop_s <= stop + slack)
+        beside &= (r.start_s >= stop) | (r.stop_s <= start)
+    ratio = r.ratio[within & r.valid]
+    own = r.ratio[beside & r.valid]
+    reference = own if main.spans_s and own.size >= BLOCKS else usual.ratio
+    if ratio.size and reference.size:
+        here, there = (complex(np.median(x.real), np.median(x.imag)) for x in (ratio, reference))
+        scattered = float(np.median(np.abs(reference - there))) > SAME * abs(there)
+        if abs(there) > 0 and not scattered:
+            return abs(here / there), abs(here / there - 1)
+    # Too short for a window, or no usual response: by its size alone.
+    inside = _inside(motion.effort.t_s, spans)
+    values, level = motion.effort.values[inside], usual.size_of(motion, main)
+    if values.size < FEW_SAMPLES or not level > 0:
+        return None
+    size = float(np.median(np.abs(values))) / level  # of a sine as large as its root mean square
+    return size, size - 1 if size > PUSHING else 0.0
 
 
 def _repeats(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
@@ -223,10 +280,6 @@ def _repeats(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     inside = motion.position.values[_inside(motion.position.t_s, spans)]
     repeated = int(np.count_nonzero(np.diff(inside) == 0))
     return inside.size < 2 or repeated > MOSTLY * (inside.size - 1)
-
-
-def _typical(usual_effort: FloatArray) -> float:
-    return float(np.median(usual_effort)) if usual_effort.size else 0.0
 
 
 def _opposite(motion: JointMotion) -> tuple[list[str], str]:

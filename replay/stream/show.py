@@ -8,6 +8,7 @@ was sent before it, so one that is slow, or stands still, costs no memory.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -125,9 +126,33 @@ class _Sink:
             UndulogError: If the viewer doesn't start.
         """
         self.viewer.wait_until_it_listens()
-        rec.connect_grpc(self.viewer.address, default_blueprint=layout)
+        self._attended(lambda: rec.connect_grpc(self.viewer.address, default_blueprint=layout))
         # The default alone would give way to the last one; an active one is the user's own.
         rec.send_blueprint(layout)
+
+    def _attended(self, call: Callable[[], None]) -> None:
+        """Make a call of Rerun's that never returns where the viewer fails meanwhile."""
+        failed: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                call()
+            except BaseException as error:  # noqa: BLE001  it is raised again, by who waits
+                failed.append(error)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        while thread.is_alive():
+            thread.join(_TAKE_S)
+            try:
+                self.look()
+            except BaseException:
+                if thread.is_alive():  # so would be whoever waits for the streams' end
+                    self.streams.clear()
+                    rr.unregister_shutdown()
+                raise
+        if failed:
+            raise failed[0]
 
     def look(self) -> None:
         """Whether it is still wanted.
