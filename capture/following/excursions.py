@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .fault import Span
-from .kinds import Symptom
+from .fault import Span, Symptom
 from .motion import BLOCKS, JointMotion, Response, predicted
 
 FAR = 6.0

@@ -56,3 +56,18 @@ class Fault:
     def about(self) -> str:
         """``mechanics``, ``wiring``, ``sensor`` or ``record``; several joined by ``or``."""
         return " or ".join(dict.fromkeys(KINDS[kind][0] for kind in self.kinds))
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """What a joint's position shows.
+
+    Attributes:
+        name: A key of the table of symptoms in ``kinds``.
+        spans_s: When [s]; empty for the whole record.
+        text: Its size in words; may be empty.
+    """
+
+    name: str
+    spans_s: tuple[Span, ...]
+    text: str

@@ -6,18 +6,18 @@ another quantity that was recorded; otherwise all kinds that fit are named.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import BoolArray, ComplexArray, FloatArray
-from .fault import Fault, Span
-from .motion import BLOCKS, FEW_SAMPLES, JointMotion, Samples, windowed_response
+from ..arrays import BoolArray, FloatArray
+from .effort import PUSHING, SAME, UsualEffort, effort_there
+from .fault import Fault, Span, Symptom
+from .motion import JointMotion, Samples, record_span, within
 
 if TYPE_CHECKING:
-    from .find import Judged
+    from .windows import Judged
 
 MOVING = 0.5
 """Correlation of a velocity or second sensor with the command that shows motion."""
@@ -27,12 +27,6 @@ AT_REST = 0.3
 
 NO_EFFORT = 0.15
 """Share of the usual effort below which a motor does not push."""
-
-SAME = 0.35
-"""Change of an effort, as a share of the usual one, up to which it is the usual one."""
-
-PUSHING = 1.3
-"""Share of the usual effort above which a motor pushes against something."""
 
 CONSTANT = 0.1
 """Standard deviation over mean below which an effort is constant."""
@@ -89,42 +83,6 @@ _PHRASES = {
 }
 
 
-@dataclass(frozen=True)
-class Symptom:
-    """What a joint's position shows.
-
-    Attributes:
-        name: One of the keys above.
-        spans_s: When [s]; empty for the whole record.
-        text: Its size in words; may be empty.
-    """
-
-    name: str
-    spans_s: tuple[Span, ...]
-    text: str
-
-
-@dataclass(frozen=True)
-class UsualEffort:
-    """Effort of the joints that follow.
-
-    Attributes:
-        size: Median absolute effort of each, shape (k,).
-        ratio: Response of the effort to the command of each, shape (k,).
-    """
-
-    size: FloatArray
-    ratio: ComplexArray
-
-    def size_of(self, motion: JointMotion, main: Symptom) -> float:
-        """Usual absolute effort of a joint: its own where it does not stand, else the others'."""
-        if motion.effort is not None and main.spans_s:
-            outside = motion.effort.values[~_inside(motion.effort.t_s, main.spans_s)]
-            if outside.size >= FEW_SAMPLES:
-                return float(np.median(np.abs(outside)))
-        return float(np.median(self.size)) if self.size.size else 0.0
-
-
 def fault_of(
     motion: JointMotion,
     judged: Judged | None,
@@ -143,7 +101,7 @@ def fault_of(
         The fault.
     """
     main = symptoms[0]
-    begin, end = _record(motion)
+    begin, end = record_span(motion)
     spans = tuple(sorted(span for each in symptoms for span in each.spans_s))
     whole = any(not each.spans_s for each in symptoms)
     kinds: list[str] = list(_KINDS[main.name])
@@ -189,7 +147,7 @@ def _standing(
     usual: UsualEffort,
 ) -> tuple[list[str], str]:
     """Kinds of a joint that stands still, by what else was recorded."""
-    spans = main.spans_s or (_record(motion),)
+    spans = main.spans_s or (record_span(motion),)
     for samples, name in ((motion.reference, "second sensor"), (motion.velocity, "velocity")):
         if samples is None:
             continue
@@ -209,26 +167,28 @@ def _by_effort(
 ) -> tuple[list[str], str]:
     """Kinds of a joint that stands still, by its noise and its effort."""
     kinds = list(_KINDS[main.name])
-    spans = main.spans_s or (_record(motion),)
+    spans = main.spans_s or (record_span(motion),)
     repeats = _repeats(motion, spans)
     if not repeats:  # new noise in each sample: the sensor measures
         kinds.remove("frozen_sensor")
     limit = ["at_limit"] if _at_limit(motion, spans) or _at_one_end(motion, main.spans_s) else []
     if motion.effort is None:
         return [*limit, *kinds], ""
-    here = motion.effort.values[_inside(motion.effort.t_s, spans)]
-    known = _effort_there(motion, judged, main, usual)
+    here = motion.effort.values[within(motion.effort.t_s, spans)]
+    known = effort_there(motion, judged, main, usual)
     if known is None:
         return [*limit, *kinds], ""
     size, change = known
-    mean, spread = float(np.mean(here)), float(np.std(here))
+    level = float(np.median(here))  # robust: a span may begin a moment early
+    spread = 1.4826 * float(np.median(np.abs(here - level)))
     held = repeats and np.count_nonzero(np.diff(here) == 0) > MOSTLY * here.size
-    constant = spread < CONSTANT * abs(mean) and abs(mean) > 0.5 * usual.size_of(motion, main)
+    pushes = abs(level) > 0.5 * usual.size_of(motion, main)
+    constant = pushes and spread < CONSTANT * abs(level)
     unusual, works = change > SAME, size > 0.5
     rules = (
         (held, [*kinds, "stale_sensor"], "its effort is constant to the bit, too"),
         (constant, ["stalled", "jammed"], "it pushes with constant effort"),
-        (size < NO_EFFORT, ["dead"], "its effort is near zero"),
+        (size < NO_EFFORT and not pushes, ["dead"], "its effort is near zero"),
         (
             size > PUSHING and unusual,
             ["jammed", "stalled"],
@@ -241,43 +201,9 @@ def _by_effort(
     return [*limit, *chosen], why
 
 
-def _effort_there(
-    motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
-) -> tuple[float, float] | None:
-    """Size of the effort where a joint stands, and its change, both in the usual one.
-
-    The effort's response to the command in windows of one cycle: a joint that is blocked pushes
-    in step with its command, one that moves in step with its own lag behind it.
-    """
-    if motion.effort is None:
-        return None
-    spans = main.spans_s or (_record(motion),)
-    r = windowed_response(motion.command, motion.effort, judged.response.period_s)
-    slack = r.period_s / BLOCKS / 2
-    within, beside = np.zeros_like(r.valid), np.ones_like(r.valid)
-    for start, stop in spans:
-        within |= (r.start_s >= start - slack) & (r.stop_s <= stop + slack)
-        beside &= (r.start_s >= stop) | (r.stop_s <= start)
-    ratio = r.ratio[within & r.valid]
-    own = r.ratio[beside & r.valid]
-    reference = own if main.spans_s and own.size >= BLOCKS else usual.ratio
-    if ratio.size and reference.size:
-        here, there = (complex(np.median(x.real), np.median(x.imag)) for x in (ratio, reference))
-        scattered = float(np.median(np.abs(reference - there))) > SAME * abs(there)
-        if abs(there) > 0 and not scattered:
-            return abs(here / there), abs(here / there - 1)
-    # Too short for a window, or no usual response: by its size alone.
-    inside = _inside(motion.effort.t_s, spans)
-    values, level = motion.effort.values[inside], usual.size_of(motion, main)
-    if values.size < FEW_SAMPLES or not level > 0:
-        return None
-    size = float(np.median(np.abs(values))) / level  # of a sine as large as its root mean square
-    return size, size - 1 if size > PUSHING else 0.0
-
-
 def _repeats(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     """Whether most positions are, to the bit, the one before."""
-    inside = motion.position.values[_inside(motion.position.t_s, spans)]
+    inside = motion.position.values[within(motion.position.t_s, spans)]
     repeated = int(np.count_nonzero(np.diff(inside) == 0))
     return inside.size < 2 or repeated > MOSTLY * (inside.size - 1)
 
@@ -304,7 +230,7 @@ def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list
         t_s = motion.position.t_s
         gap = motion.position.values - motion.reference.at(t_s)
         whole = motion.position.values - motion.command.at(t_s)
-        inside = _inside(t_s, main.spans_s or (_record(motion),))
+        inside = within(t_s, main.spans_s or (record_span(motion),))
         shift = _trend if main.name == "drifting" else _step
         if abs(shift(gap, t_s, inside)) > OF_SENSOR * abs(shift(whole, t_s, inside)):
             return [sensor], "the second sensor does not show it"
@@ -334,7 +260,7 @@ def _shows_motion(
     speed: bool,
 ) -> bool | None:
     """Whether another quantity shows motion (True) or rest (False); None where it is unclear."""
-    inside = _inside(samples.t_s, spans)
+    inside = within(samples.t_s, spans)
     t_s, values = samples.t_s[inside], samples.values[inside]
     if t_s.size < 8:
         return None
@@ -359,7 +285,7 @@ def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     """Whether the joint stands at a limit of its description."""
     if motion.limits is None:
         return False
-    inside = _inside(motion.position.t_s, spans)
+    inside = within(motion.position.t_s, spans)
     if not inside.any():
         return False
     level = float(np.median(motion.position.values[inside]))
@@ -376,24 +302,11 @@ def _at_one_end(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     levels = [
         float(np.median(values[inside]))
         for span in spans
-        if (inside := _inside(motion.position.t_s, (span,))).any()
+        if (inside := within(motion.position.t_s, (span,))).any()
     ]
     slack = 2 * LIMIT_SHARE * motion.position.range
     low, high = float(values.min()), float(values.max())
     return bool(levels) and (max(levels) <= low + slack or min(levels) >= high - slack)
-
-
-def _inside(t_s: FloatArray, spans: tuple[Span, ...]) -> BoolArray:
-    marked = np.zeros(t_s.size, dtype=np.bool_)
-    for start, stop in spans:
-        i, j = np.searchsorted(t_s, (start, stop))
-        marked[i : j + 1] = True
-    return marked
-
-
-def _record(motion: JointMotion) -> Span:
-    t_s = motion.position.t_s if motion.position.t_s.size else motion.command.t_s
-    return (float(t_s[0]), float(t_s[-1])) if t_s.size else (0.0, 0.0)
 
 
 def _correlation(first: FloatArray, second: FloatArray) -> float:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from .fault import Span
 
 BLOCKS = 4
 """Blocks a cycle: windows of one cycle start at every quarter of it."""
@@ -226,3 +227,33 @@ def predicted(
     c, d = motion.command.at(t_s), motion.command.at(t_s - period_s / BLOCKS)
     level = float(np.mean(c)) if c.size else 0.0
     return level + offset + ratio.real * (c - level) - ratio.imag * (d - level)
+
+
+def within(t_s: FloatArray, spans: tuple[Span, ...]) -> BoolArray:
+    """Find the times that lie in any of some spans.
+
+    Args:
+        t_s: Times, increasing [s], shape (n,).
+        spans: The spans, each with the first sample after it.
+
+    Returns:
+        Marks, shape (n,).
+    """
+    marked = np.zeros(t_s.size, dtype=np.bool_)
+    for start, stop in spans:
+        i, j = np.searchsorted(t_s, (start, stop))
+        marked[i : j + 1] = True
+    return marked
+
+
+def record_span(motion: JointMotion) -> Span:
+    """The span of a joint's record.
+
+    Args:
+        motion: The joint.
+
+    Returns:
+        First and last time of its positions, or else of its commands [s].
+    """
+    t_s = motion.position.t_s if motion.position.t_s.size else motion.command.t_s
+    return (float(t_s[0]), float(t_s[-1])) if t_s.size else (0.0, 0.0)

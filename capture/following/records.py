@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import median_filter
 
-from .fault import Span
-from .kinds import Symptom
+from .fault import Span, Symptom
 from .motion import JointMotion, Samples
 
 LOST_SHARE = 0.01

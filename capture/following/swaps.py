@@ -10,7 +10,7 @@ import numpy as np
 from .motion import windowed_response
 
 if TYPE_CHECKING:
-    from .find import Judged
+    from .windows import Judged
 
 OFF = 0.3
 """Relative deviation of H from the common response that makes a joint a candidate."""
