@@ -95,13 +95,16 @@ def standing_out(profile: Profile, critical: float) -> list[Deviation]:
     Returns:
         Their deviations from the prediction of the rest, the largest first.
     """
-    grown, trimmed = _grown(profile, critical), _trimmed(profile, critical)
-    found = [
-        [each for joint in state.outside if (each := _kept(profile, state, joint, critical))]
-        for state in (trimmed, grown)
-    ]
+    searches = (_trimmed(profile, critical), _grown(profile, critical))
+    trimmed, grown = (
+        [one for joint in state.outside if (one := _kept(profile, state, joint, critical))]
+        for state in searches
+    )
     # Two that stand out hide each other from the one search, a profile its joints from the other.
-    return sorted(max(found, key=len), key=lambda each: -abs(each.value))
+    # Where both agree, the shapes that the data ask for predict more closely than a parabola.
+    agree = {one.joint for one in trimmed} == {one.joint for one in grown}
+    found = grown if agree or len(grown) > len(trimmed) else trimmed
+    return sorted(found, key=lambda one: -abs(one.value))
 
 
 def _kept(profile: Profile, state: State, joint: int, critical: float) -> Deviation | None:
