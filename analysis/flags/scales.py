@@ -132,8 +132,11 @@ def compare(first: Series, second: Series, edges_s: FloatArray) -> Compared:
     nothing = np.full(starts.size, np.nan)
     ratio = np.sqrt(np.divide(xx, yy, out=nothing.copy(), where=usable))
     correlation = np.divide(xy, np.sqrt(xx * yy), out=nothing, where=usable)
-    # Of two noisy copies of one signal (delta method): var(ln ratio) = (1 - r^2) / n.
+    # Of two noisy copies of one signal (delta method): var(ln ratio) = (1 - r^2) / n, with as many
+    # independent samples as noise of that autocorrelation leaves.
     error = np.sqrt(np.maximum(1 - correlation**2, 0.0) / np.maximum(count, 1))
+    power = float(y @ y)
+    error *= _correlated(x - y * (float(x @ y) / power if power > 0 else 0.0))
     return Compared(first.t_s[starts], stops, ratio, correlation, error)
 
 
@@ -206,6 +209,14 @@ def _hole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
     step[one.gaps + 1] = one.t_s[one.gaps + 1] - one.t_s[one.gaps]
     lost = np.cumsum(step)
     return np.interp(stop_s, one.t_s, lost) - np.interp(start_s, one.t_s, lost)
+
+
+def _correlated(residual: FloatArray) -> float:
+    """By how much autocorrelated noise widens the error of a mean, from its first lag (AR(1))."""
+    power = float(residual @ residual)
+    first = float(residual[1:] @ residual[:-1]) / power if power > 0 else 0.0
+    first = min(max(first, 0.0), 0.99)
+    return float(((1 + first) / (1 - first)) ** 0.5)
 
 
 def _smoothed(ratio: FloatArray) -> FloatArray:
