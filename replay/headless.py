@@ -43,7 +43,7 @@ class HeadlessViewer:
         try:
             self._client = client_of(self._viewer.address, lambda: self._viewer.ended)
             self._let_greetings_pass()
-        except (ConnectionError, RuntimeError, TimeoutError) as error:
+        except (OSError, RuntimeError) as error:
             self.close()
             raise _not_started() from error  # it may answer before it asks for a driver
         except BaseException:
