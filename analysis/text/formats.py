@@ -345,7 +345,7 @@ def capital(text: str) -> str:
         The text.
     """
     first = text.partition(" ")[0]
-    if any(c in "._/\\" or c.isdigit() for c in first):
+    if first.endswith(":") or any(c in "._/\\" or c.isdigit() for c in first):
         return text
     return text[:1].upper() + text[1:]
 
