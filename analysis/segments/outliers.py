@@ -38,9 +38,9 @@ MIRRORED = 0.5
 LOCAL = 0.5
 """Share of a deviation that a joint shows beside its neighbours at least, out of a profile."""
 
-CHANCE = 0.002
+CHANCE = 0.005
 """Chance that of joints of equal scatter one is taken to stand out, before the searches choose the
-rest that it is held against: with that it is 0.2 to 1 % for 4 to 30 joints."""
+rest that it is held against: with that it is 0.6 to 2 % for 6 to 13 joints."""
 
 ROUGH = 2.0
 """Residuals of the rest so many times their standard error are a profile of its own."""
