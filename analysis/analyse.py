@@ -51,7 +51,7 @@ from .segments.session import (
     stopped,
     unrefuted,
 )
-from .stretch import Options, choose_stretch, recorded
+from .stretch import Options, choose_stretch, recorded, without_breaks
 from .text.answer import Facts, compose
 from .text.artefacts import warn_flags, within
 from .windows import Stretch, whole_cycles
@@ -152,6 +152,7 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         warn,
         reference_topic=options.reference_topic,
     )
+    columns, left_out = without_breaks(session, columns, options, warn)
     session.forget()  # what each step has looked at need not stay in memory beside the next one's
     artefacts = find_artefacts(session, columns)
     stretch = choose_stretch(session, columns, options, warn)
@@ -228,7 +229,10 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
         oscillators=session_couplings(session, options.start_s, options.stop_s),
         notes=warn.notes,
     )
-    answer = compose(Facts(analysis.gait, joints, commanded, faulty, findings, analysis.warnings))
+    facts = Facts(
+        analysis.gait, joints, commanded, faulty, findings, analysis.warnings, left_out=left_out
+    )
+    answer = compose(facts)
     analysis = dataclasses.replace(analysis, answer=answer)
     return Measured(analysis, gait, sound, energies, span, follows.offsets)
 
@@ -296,12 +300,15 @@ def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Str
 
 def _provenance(session: Session, options: Options) -> Provenance:
     """What makes the same numbers again."""
-    with session.path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    for path in session.files:  # one, or the parts of a split session
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
     return Provenance(
         command=shlex.join(["undulog", "analyse", str(session.path), *options.arguments()]),
         versions=base_versions(),
-        inputs={str(session.path): digest},
+        inputs={str(session.path): digest.hexdigest()},
         options={
             **asdict(options),
             "confidence": CONFIDENCE,

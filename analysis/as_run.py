@@ -7,11 +7,11 @@ A session of the twin carries its scenario, and a scenario may change the robot'
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from typing import Any, cast
 
 from capture import Session
 from capture.robot import Joint, Link, Robot, Servo
+from capture.strict_table import read_toml
 
 _SERVO_FIELDS = frozenset(field.name for field in dataclasses.fields(Servo))
 
@@ -29,7 +29,7 @@ def scenario_of(session: Session) -> dict[str, Any] | None:
     if text is None:
         return None
     try:
-        return tomllib.loads(text.decode())
+        return read_toml(text.decode())
     except ValueError:
         return None
 

@@ -12,6 +12,7 @@ import numpy as np
 from capture import Session
 from capture.arrays import BoolArray, ComplexArray, FloatArray
 from capture.errors import DataError, LogError
+from capture.threads import in_threads
 
 from .estimators.demodulation import (
     Cycles,
@@ -20,7 +21,6 @@ from .estimators.demodulation import (
     demodulate,
 )
 from .estimators.series import GAP_FACTOR, Series, clean
-from .estimators.threads import in_threads
 from .reading import Columns, Warn, planes_of, settle_time_s
 from .remarks import Note
 from .response import t_factor

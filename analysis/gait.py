@@ -42,6 +42,9 @@ _SCOUTS = 4
 
 _PADDING = 4
 
+_SPARSEST = 16
+"""Mean sampling interval, in median ones, beyond which channels are mostly gaps."""
+
 
 @dataclass(frozen=True)
 class Rhythm:
@@ -194,7 +197,7 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     start = max(one.t_s[0] for one in scouts)
     stop = min(one.t_s[-1] for one in scouts)
     count = int((stop - start) / step) + 1 if stop > start and step > 0 else 0
-    if count < 16:
+    if not 16 <= count <= _SPARSEST * max(one.count for one in scouts):
         return None
     grid = start + step * np.arange(count)
     length = 1 << int(np.ceil(np.log2(_PADDING * count)))

@@ -11,10 +11,10 @@ from capture import Session
 from capture.arrays import FloatArray
 from capture.log.power_topics import PowerTopic
 from capture.robot import Robot
+from capture.threads import in_threads
 
 from .energy.joint import Energy, add_up, integrate, power_of
 from .estimators.series import Series, clean, coverage
-from .estimators.threads import in_threads
 from .fitting import GaitFit
 from .reading import Columns, Warn, planes_of
 from .response import gain_estimate, lag_estimate

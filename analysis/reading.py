@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -12,6 +11,7 @@ from capture.errors import MissingChannelError
 from capture.log.power_topics import PowerTopic
 from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
+from capture.strict_table import read_toml
 
 from .body.null import DRAG_RATIO
 from .remarks import Lacking, Note
@@ -193,7 +193,7 @@ def drag_ratio(session: Session) -> float:
         mu_normal / mu_tangential of the attached scenario's ground, else the default.
     """
     try:
-        scenario: Any = tomllib.loads(session.attachments["scenario.toml"].decode())
+        scenario: Any = read_toml(session.attachments["scenario.toml"].decode())
         ground = cast("dict[str, float]", scenario["world"]["ground"])
         ratio = float(ground["mu_normal"]) / float(ground["mu_tangential"])
     except (KeyError, TypeError, ValueError, ZeroDivisionError):

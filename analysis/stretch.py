@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from capture import Session
+from capture.arrays import IntArray
 from capture.errors import DataError, LogError, UsageError
+from capture.log.signals import Signal
+from capture.log.unbroken import longest_unbroken
 
 from .estimators.series import clean
 from .gait import MIN_CYCLES
-from .reading import COMMAND_TOPIC, RESPONSE_TOPIC, Columns, Warn, settle_time_s
+from .reading import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns, Warn, settle_time_s
 from .soft_start import steady_part
 from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
 
@@ -49,6 +53,53 @@ class Options:
                 option = field.name.removesuffix("_s").replace("_", "-")
                 arguments += [f"--{option}", str(value)]
         return arguments
+
+
+def without_breaks(
+    session: Session, columns: Columns, options: Options, warn: Warn
+) -> tuple[Columns, str]:
+    """Leave out all but the longest stretch in which samples follow each other.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        options: What the user chose; only samples between his limits count.
+        warn: Takes one sentence where something is left out.
+
+    Returns:
+        The columns of that stretch, and what is left out; empty where that is nothing.
+
+    Raises:
+        DataError: If there are no samples at all, or commands and responses don't overlap.
+    """
+    times = [one.t_ns for kind in (columns.command, columns.position) for one in kind.values()]
+    every = longest_unbroken(times)
+    if every is None or not every.others:
+        return columns, ""
+    both = recorded(session, columns, options)
+    found = longest_unbroken(times, both.start_ns, both.stop_ns)
+    if found is None:
+        return columns, ""
+    if found.others:
+        warn(str(found))
+    parts: dict[int, tuple[slice, IntArray]] = {}
+
+    def part(one: Signal) -> Signal:
+        if id(one.t_ns) not in parts:  # signals that share their times go on sharing them
+            inside = slice(*np.searchsorted(one.t_ns, (found.start_ns, found.last_ns + 1)).tolist())
+            parts[id(one.t_ns)] = inside, one.t_ns[inside]
+        inside, t_ns = parts[id(one.t_ns)]
+        return Signal(one.name, one.unit, t_ns, one.values[inside])
+
+    def parts_of(signals: Mapping[str, Signal]) -> dict[str, Signal]:
+        return {name: part(one) for name, one in signals.items()}
+
+    kept = replace(
+        columns,
+        **{quantity: parts_of(columns.of(quantity)) for quantity in QUANTITIES},
+        powers={topic: parts_of(signals) for topic, signals in columns.powers.items()},
+    )
+    return kept, str(found) if found.others else ""
 
 
 def choose_stretch(session: Session, columns: Columns, options: Options, warn: Warn) -> Stretch:

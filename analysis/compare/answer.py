@@ -6,6 +6,8 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+from capture.console import plain
+
 from ..results.analysis import Estimate, leaves_out_zero
 from ..text import formats
 from .decisions import SIGNIFICANT, Decided
@@ -139,17 +141,17 @@ def _largest(decided: Decided) -> str:
         first = beyond_doubt[0]
         others = len(beyond_doubt) - 1
         more = f"; and {others} more" if others else ""
-        where = f"{formats.plain(first.place)}:" if first.size >= 1 else "one joint's"
+        where = f"{plain(first.place)}:" if first.size >= 1 else "one joint's"
         where = "the body's" if first.place == BODY else where
         return f"{where} {told(first)} ({formats.told_p(first.p_holm)}){more}"
     own = [one for one in beyond_doubt if one.place == named[0] and one.quantity != "energy_abs"]
     parts = ", ".join(told(one) for one in sorted(own, key=lambda one: one.quantity))
     smallest = min(one.p_holm for one in own)
-    others = [formats.plain(name) for name in named[1:]]
+    others = [plain(name) for name in named[1:]]
     listed = ", ".join(others[:MOST])
     listed += f" and {len(others) - MOST} more" if len(others) > MOST else ""
     more = f"; {listed} by less" if others else ""
-    return f"{formats.plain(named[0])} most, {parts} ({formats.told_p(smallest)}){more}"
+    return f"{plain(named[0])} most, {parts} ({formats.told_p(smallest)}){more}"
 
 
 def _not_shown(decided: Decided) -> str:

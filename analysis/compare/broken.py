@@ -7,9 +7,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from capture.console import plain
+
 from ..results.answer import Answer, NotFollowing, StandOut
 from ..segments.examine import OFFSET_RAD
-from ..text import formats
 from ..text.answer import deviation_in_words, fault_in_words
 from .result import BrokenJoint
 from .side import Seen
@@ -36,7 +37,7 @@ def broken_joints(a: Sequence[Seen], b: Sequence[Seen]) -> tuple[BrokenJoint, ..
         known = {each.name for each in found}
         for each in _first([each for answer in answers for each in _off(answer)]):
             if each.joint not in known | elsewhere and _moved(each.joint, own, other):
-                text = f"in {side} {formats.plain(each.joint)} has {deviation_in_words(each)}"
+                text = f"in {side} {plain(each.joint)} has {deviation_in_words(each)}"
                 found.append(BrokenJoint(each.joint, side, (), text))
     return tuple(sorted(found, key=lambda each: not each.kinds))
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from capture import Session
+from capture.strict_table import read_toml
 
 from .result import Change
 
@@ -41,8 +41,8 @@ def facts_of(session: Session) -> dict[str, str]:
         if data is None:
             continue
         try:
-            table = tomllib.loads(data.decode())
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+            table = read_toml(data.decode())
+        except ValueError:
             facts[f"{file}: text"] = repr(data)
             continue
         kept = {key: value for key, value in table.items() if key not in _TEXTS}

@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capture.console import plain
+
 from ..command_line import UNLIMITED
 from ..text import formats
 from ..text.table import put, sheet
@@ -42,7 +44,7 @@ def render_comparison(
     text, prose, wide = sheet(width, color=color)
     prose.print(f"{comparison.answer}.", style="bold", markup=False)
     for side, sessions in (("A", comparison.a), ("B", comparison.b)):
-        names = ", ".join(formats.plain(Path(one.path).name) for one in sessions)
+        names = ", ".join(plain(Path(one.path).name) for one in sessions)
         prose.print(f"{side}: {names}", markup=False)
     if comparison.partial is not None:
         prose.print(f"Partial: {comparison.partial}", markup=False)
@@ -57,7 +59,7 @@ def render_comparison(
     prose.print()
     prose.print(_equivalence(comparison), markup=False)
     for warning in comparison.warnings:
-        prose.print(f"Warning: {formats.plain(warning)}", markup=False)
+        prose.print(f"Warning: {plain(warning)}", markup=False)
     prose.print(f"Method: {method(comparison)}", style="dim", markup=False)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
 
@@ -92,7 +94,7 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
         a, b = (
             formats.short(value) if value is not None else "not set" for value in (one.a, one.b)
         )
-        lines.append(f"  {formats.plain(one.name)}: {a} -> {b}")
+        lines.append(f"  {plain(one.name)}: {a} -> {b}")
     rest = len(changed) - MOST_CHANGES
     return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
 
@@ -109,7 +111,7 @@ def _table(comparison: Comparison) -> Table:
     for one in comparison.differences:
         where = "the body" if one.place == BODY else one.place
         style = "bold" if one.p_holm < SIGNIFICANT else ""
-        table.add_row(escape(formats.plain(where)), WORDS[one.quantity], *cells(one), style=style)
+        table.add_row(escape(plain(where)), WORDS[one.quantity], *cells(one), style=style)
     return table
 
 
@@ -124,7 +126,7 @@ def _waveforms(comparison: Comparison) -> Table:
     for one in comparison.waveforms:
         estimate = formats.degrees(one.largest)
         table.add_row(
-            escape(formats.plain(one.name)),
+            escape(plain(one.name)),
             formats.number(math.degrees(one.rms_rad), 2),
             signed(estimate, ""),
             formats.number(math.degrees(one.largest_at_rad), 0),

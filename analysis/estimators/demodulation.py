@@ -31,6 +31,9 @@ from .series import Series
 MIN_SAMPLES = 12
 """Samples that a cycle needs."""
 
+MOST_CYCLES = 100
+"""Cycles for each sample of the phase, at most: a phase that runs faster is no phase."""
+
 MIN_EXPLAINED = 0.8
 """Share of a command's variance in a cycle that the phase must explain."""
 
@@ -73,11 +76,11 @@ class Phase:
 
         Returns:
             Half a cycle from its beginning to half a cycle from its end [s], so that each cycle
-            has its surroundings; shape (c + 1,), or empty.
+            has its surroundings; shape (c + 1,), or empty, also for a phase beyond all reason.
         """
         first, last = float(self.value[0]) + np.pi, float(self.value[-1]) - np.pi
         count = int(np.floor((last - first) / _TURN + 1e-6))
-        if count < 1:
+        if not 1 <= count <= MOST_CYCLES * self.t_s.size:
             return np.zeros(0)
         return np.interp(first + _TURN * np.arange(count + 1), self.value, self.t_s)
 

@@ -20,10 +20,10 @@ import numpy as np
 
 from capture.arrays import ComplexArray, FloatArray
 from capture.errors import DataError
+from capture.threads import in_threads
 
 from .harmonic_moments import HarmonicModel, Solved, solve
 from .series import Series, shared_times
-from .threads import in_threads
 
 MAX_STEPS = 30
 """Gauss-Newton steps; from a periodogram's peak three to five are enough."""

@@ -61,7 +61,7 @@ class Series:
         """
         if t_s is self.t_s:
             return self.values
-        return np.interp(t_s, self.t_s, self.values).astype(np.float64)
+        return np.interp(t_s, self.t_s, self.values).astype(np.float64, copy=False)
 
     def between(self, start_s: float, stop_s: float) -> Series:
         """The samples of a half-open window.

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from capture.threads import in_threads
 
 from .harmonic import HarmonicFit
 from .harmonic_moments import (
@@ -35,7 +36,6 @@ from .quantisation import (
     steady_noise,
 )
 from .series import Series, shared_times
-from .threads import in_threads
 
 BINS_PER_SIDE = 6
 """At most six bins on either side: 24 degrees of freedom, whose t factor is 5 % above normal."""

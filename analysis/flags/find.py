@@ -11,9 +11,9 @@ import numpy as np
 from capture import Session
 from capture.arrays import FloatArray
 from capture.log.signals import Signal
+from capture.threads import in_threads
 
 from ..estimators.series import Series, clean_together
-from ..estimators.threads import in_threads
 from ..gait import DRIVEN_SHARE
 from ..reading import QUANTITIES, Columns
 from ..results.artefact import FALSIFYING, Artefact, Span
@@ -168,13 +168,13 @@ def _of_scale(
             told.add(flag)
             yield "position", flag, spans, ""
     if second is not None:
-        by_second = compare(position, second, edges)
+        by_second = compare(position, second, edges, noisy=True)
         for flag, spans in against_witness(by_second, SAME_SCALE).items():
             told.add(flag)
             scale = float(np.nanmedian(by_second.ratio))
             yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
     if way is not None:
-        by_rate = against_witness(compare(position, way, edges), SAME_RATE)
+        by_rate = against_witness(compare(position, way, edges, noisy=True), SAME_RATE)
         # What the position is blamed for already is no fault of the velocity.
         for flag, spans in by_rate.items():
             if flag not in told:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -13,6 +12,7 @@ import numpy as np
 from capture import Session
 from capture.arrays import FloatArray
 from capture.robot import Joint, Servo
+from capture.strict_table import read_toml
 
 from ..estimators.series import Series
 from ..results.artefact import Span
@@ -107,7 +107,7 @@ def _limits(joint: Joint, changes: Mapping[str, Mapping[str, float]], known: boo
 def _servo_changes(session: Session) -> dict[str, Mapping[str, float]]:
     """Servo values of the attached scenario: of all joints under an empty name, and by name."""
     try:
-        scenario: Any = tomllib.loads(session.attachments["scenario.toml"].decode())
+        scenario: Any = read_toml(session.attachments["scenario.toml"].decode())
     except (KeyError, ValueError):
         return {}
     # A twin's servos are as they are described, whatever the robot's may be.
@@ -161,9 +161,10 @@ def stalled(
         return ()
     # Speed over a tenth of a second, so that an encoder's steps and noise are none.
     half = STALL_S / 4
-    rate = _moved(position, effort.t_s, half) / (2 * half)
-    marked = pushing & (np.abs(rate) < STANDING * usual_rate)
-    found = spans_of(effort.t_s, marked, join=2)
+    at = np.flatnonzero(pushing)
+    rate = _moved(position, effort.t_s[at], half) / (2 * half)
+    pushing[at[np.abs(rate) >= STANDING * usual_rate]] = False
+    found = spans_of(effort.t_s, pushing, join=2)
     long = STALL_S
     if most is None:
         edges = turns(asked)

@@ -106,7 +106,7 @@ def turns(one: Series) -> FloatArray:
     return one.t_s[at[1:][high[1:] & ~high[:-1]]]
 
 
-def compare(first: Series, second: Series, edges_s: FloatArray) -> Compared:
+def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool = False) -> Compared:
     """Compare two channels over each cycle.
 
     Args:
@@ -114,6 +114,7 @@ def compare(first: Series, second: Series, edges_s: FloatArray) -> Compared:
         second: Interpolated to them.
         edges_s: Edges of the cycles [s], shape (c + 1,); the first and the last cycle reach to the
             ends of ``first``; with fewer than two edges all of it is one.
+        noisy: Whether the error counts with the autocorrelation of what differs.
 
     Returns:
         The comparison.
@@ -135,8 +136,9 @@ def compare(first: Series, second: Series, edges_s: FloatArray) -> Compared:
     # Of two noisy copies of one signal (delta method): var(ln ratio) = (1 - r^2) / n, with as many
     # independent samples as noise of that autocorrelation leaves.
     error = np.sqrt(np.maximum(1 - correlation**2, 0.0) / np.maximum(count, 1))
-    power = float(y @ y)
-    error *= _correlated(x - y * (float(x @ y) / power if power > 0 else 0.0))
+    if noisy:
+        power = float(yy.sum())
+        error *= _correlated(x - y * (float(xy.sum()) / power if power > 0 else 0.0))
     return Compared(first.t_s[starts], stops, ratio, correlation, error)
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from capture import Session
 from capture.arrays import FloatArray
 from capture.following import Fault, JointMotion, joints_not_following
-from capture.following.motion import BLOCKS, Samples, cycle_s, windowed_response
+from capture.following.motion import BLOCKS, Samples
 from capture.following.session import motions_of
+from capture.following.windows import COHERENT
 from capture.robot import Robot
 
 from ..fitting import GaitFit
@@ -32,6 +33,7 @@ _OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("position", "wrong_unit"): ("scaled_sensor",),
     ("position", "scale_mismatch"): ("scaled_sensor",),
     ("position", "clipped"): ("at_limit", "clipped_sensor"),
+    ("position", "frozen"): ("frozen_sensor", "jammed", "dead"),
     ("effort", "stalled"): ("stalled", "jammed"),
     ("current", "stalled"): ("stalled", "jammed"),
 }
@@ -109,7 +111,7 @@ def following(session: Session, columns: Columns, window: Stretch) -> Following:
 
 def _offsets(motion: JointMotion) -> FloatArray:
     """Offset of each whole cycle that is judged [rad]."""
-    response = windowed_response(motion.command, motion.position, cycle_s(motion.command))
+    response = motion.response
     return response.offset[::BLOCKS][response.valid[::BLOCKS]]
 
 
@@ -124,18 +126,29 @@ def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefa
         The others, in their order.
     """
     broken = {fault.joint for fault in follows.faults}
-    driven = {name for name, one in follows.motions.items() if one.command.range > 0}
     return tuple(
         one
         for one in artefacts
         if (one.quantity, one.flag) != ("position", "frozen")
         or one.joint in broken
-        or one.joint not in driven
+        or not _follows_there(follows.motions.get(one.joint), one.spans_s)
     )
 
 
+def _follows_there(motion: JointMotion | None, spans_s: Iterable[tuple[float, float]]) -> bool:
+    """Whether a joint is driven and follows in every window that overlaps some spans."""
+    if motion is None or not motion.command.range > 0 or motion.position.t_s.size < 2:
+        return False
+    response = motion.response
+    there = np.zeros_like(response.valid)
+    for start, stop in spans_s:
+        there |= (response.start_s < stop) & (response.stop_s > start)
+    there &= response.valid
+    return bool(there.any() and (response.explained[there] > COHERENT).all())
+
+
 def not_following(
-    found_by_motion: Following,
+    follows: Following,
     artefacts: Iterable[Artefact],
     names: tuple[str, ...],
     duration_s: float,
@@ -143,7 +156,7 @@ def not_following(
     """Join faults with the artefacts that falsify a joint's position.
 
     Args:
-        found_by_motion: Of the analysed window.
+        follows: Of the analysed window.
         artefacts: Of the same.
         names: All joints, in chain order.
         duration_s: Length of the window [s].
@@ -155,11 +168,11 @@ def not_following(
         each.joint: NotFollowing(
             each.joint, each.kinds, each.since_s, each.until_s, each.share, each.evidence
         )
-        for each in found_by_motion.faults
+        for each in follows.faults
     }
     # A flat top changes the scale, too.
     for artefact in sorted(artefacts, key=lambda one: one.flag != "clipped"):
-        kinds = _kinds_of(artefact, found_by_motion.motions.get(artefact.joint))
+        kinds = _kinds_of(artefact, follows.motions.get(artefact.joint))
         lasted = sum(stop - start for start, stop in artefact.spans_s)
         share = lasted / duration_s if artefact.spans_s and duration_s > 0 else 1.0
         known = found.get(artefact.joint)

@@ -143,18 +143,27 @@ def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
     r = each.response
     if each.motion.effort is None or min(k, len(judged) - 1 - k) < ENDS:
         return []
-    usual = float(np.median([_usual(one, _control_error(one.response)) for one in near]))
-    far = _control_error(r) > np.maximum(ASTRAY * usual, r.asked / 2)
+    usual = _known_median([_usual(one, _control_error(one.response)) for one in near])
+    far = _control_error(r) > np.fmax(ASTRAY * usual, r.asked / 2)
     off = r.valid & ~each.still & far
     if not off.any():
         return []
-    effort, pushes = _effort_spread(each), max(_usual(one, _effort_spread(one)) for one in near)
+    known = [size for one in near if np.isfinite(size := _usual(one, _effort_spread(one)))]
+    if not known:
+        return []
+    effort, pushes = _effort_spread(each), max(known)
     light = off & (effort < POWERLESS * pushes)
     if np.count_nonzero(light) < max(MIN_WINDOWS, MIN_SHARE * np.count_nonzero(off)):
         return []
     share = 100 * float(np.median(effort[light])) / pushes
     text = f"moves with its neighbours, at {share:.0f} % of their largest effort"
     return [Symptom("powerless", whole_or(marked_spans(r, light), r), text)]
+
+
+def _known_median(values: Sequence[float]) -> float:
+    """Median of those that are known; NaN without any."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else float("nan")
 
 
 def _control_error(response: Response) -> FloatArray:

@@ -82,20 +82,20 @@ class Excursions:
     """Departures of one joint from its usual response.
 
     Attributes:
-        t_s: Sampling times [s], shape (n,).
+        t_s: Sampling times [s], shape (n,); empty without departures, as the next two.
         residual: Position less what the usual response gives [rad], shape (n,).
         expected: What the usual response gives [rad], shape (n,).
         amplitude: Usual amplitude of the response [rad].
-        threshold: Residuals beyond it are departures [rad].
         spans_s: The departures.
+        record_s: Start and end of what was searched [s].
     """
 
     t_s: FloatArray
     residual: FloatArray
     expected: FloatArray
     amplitude: float
-    threshold: float
     spans_s: tuple[Span, ...]
+    record_s: Span
 
 
 def find_holds(
@@ -167,8 +167,10 @@ def find_excursions(
     t_s, values = motion.position.t_s[i:j], motion.position.values[i:j]
     expected = predicted(motion, period_s, ratio, offset, t_s)
     residual = values - expected
+    none = np.zeros(0)
+    record = (float(t_s[0]), float(t_s[-1])) if t_s.size else (0.0, 0.0)
     if t_s.size < 2 * FEW:
-        return Excursions(t_s, residual, expected, 0.0, np.inf, ())
+        return Excursions(none, none, none, 0.0, (), record)
     centre = float(np.median(residual))
     scale = 1.4826 * float(np.median(np.abs(residual - centre)))
     amplitude = abs(ratio) * float(np.median(response.asked[follows])) * 2**0.5
@@ -182,7 +184,9 @@ def find_excursions(
         if b - a + step >= max(SHORT * period_s, (FEW - 1) * step)
         and np.count_nonzero(far[slice(*np.searchsorted(t_s, (a, b + step / 2)))]) >= FEW
     )
-    return Excursions(t_s, residual - centre, expected + centre, amplitude, threshold, long)
+    if not long:
+        return Excursions(none, none, none, amplitude, (), record)
+    return Excursions(t_s, residual - centre, expected + centre, amplitude, long, record)
 
 
 def departures(
@@ -199,8 +203,8 @@ def departures(
     Returns:
         One symptom a kind of departure.
     """
-    end = float(found.t_s[-1]) if found.t_s.size else 0.0
-    settled = (float(found.t_s[0]) if found.t_s.size else 0.0) + SETTLING * response.period_s
+    begin, end = found.record_s
+    settled = begin + SETTLING * response.period_s
     by_kind: dict[str, list[Span]] = {}
     texts: dict[str, str] = {}
     for span, own in zip(found.spans_s, alone, strict=True):
@@ -224,8 +228,7 @@ def departures(
         else:
             by_kind.setdefault(kind, []).append(span)
         texts.setdefault(kind, text)
-    length = float(np.ptp(found.t_s)) if found.t_s.size else 0.0
-    if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s, length):
+    if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s, end - begin):
         del by_kind["astray"]
     symptoms = [Symptom(kind, tuple(own), texts[kind]) for kind, own in by_kind.items()]
     if not found.spans_s and (drift := _drift(response, found)):
@@ -317,7 +320,7 @@ def _drift(response: Response, found: Excursions) -> Symptom | None:
         if _grows(response, at):
             return None
         return Symptom(
-            "stepped", ((at, float(found.t_s[-1])),), f"off by {np.degrees(size):+.1f} degrees"
+            "stepped", ((at, found.record_s[1]),), f"off by {np.degrees(size):+.1f} degrees"
         )
     total = slope * float(np.ptp(t_s))
     if abs(total) < least or by_ramp < DRIFT_EXPLAINED * power:

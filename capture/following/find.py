@@ -12,11 +12,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ..threads import in_threads
 from .effort import powerless, usual_effort
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom
 from .kinds import fault_of
-from .motion import FEW_SAMPLES, JointMotion, Response, cycle_s, windowed_response
+from .motion import FEW_SAMPLES, JointMotion, Response
 from .records import record_faults, wraps
 from .swaps import swapped_pairs
 from .windows import (
@@ -62,9 +63,8 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     largest = max((each.command.range for each in motions), default=0.0)
     least = max(DRIVEN_SHARE * largest, MIN_COMMAND_RAD)
     driven = [each for each in motions if each.command.range > least and _lasts(each)]
-    responses = [
-        windowed_response(each.command, each.position, cycle_s(each.command)) for each in driven
-    ]
+    samples = sum(each.command.t_s.size + each.position.t_s.size for each in motions)
+    responses = in_threads(lambda each: each.response, driven, samples)
     own = [own_response(each) for each in responses]
     common = common_response(own)
     # What noise makes of a joint that stands still is no response for its neighbours.
@@ -76,9 +76,8 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
         for k, (each, r) in enumerate(zip(driven, responses, strict=True))
     ]
     symptoms: dict[str, list[Symptom]] = {each.name: [] for each in motions}
-    for each in driven:
-        if (wrapped := wraps(each)) is not None:
-            symptoms[each.name].append(wrapped)
+    for each, wrapped in zip(driven, in_threads(wraps, driven, samples), strict=True):
+        symptoms[each.name] += [] if wrapped is None else [wrapped]
     explained = [_explained(each) for each in responses]
     for k, each in enumerate(judged):
         found = symptoms[each.motion.name]
@@ -165,14 +164,16 @@ def _from_residuals(
     judged: Sequence[Judged], symptoms: Mapping[str, Sequence[Symptom]]
 ) -> dict[str, list[Symptom]]:
     """Times at which a joint leaves its own usual response, and no other joint does."""
-    kept: list[tuple[Judged, Excursions]] = [
-        (each, find_excursions(each.motion, each.response, each.follows, each.ratio, each.offset))
-        for each in judged
-        if each.has_usual and not symptoms[each.motion.name]
-    ]
-    spans = [found.spans_s for _, found in kept]
+    kept = [each for each in judged if each.has_usual and not symptoms[each.motion.name]]
+    samples = sum(each.motion.position.t_s.size for each in kept)
+
+    def of_joint(each: Judged) -> Excursions:
+        return find_excursions(each.motion, each.response, each.follows, each.ratio, each.offset)
+
+    excursions = in_threads(of_joint, kept, samples)
+    spans = [found.spans_s for found in excursions]
     result: dict[str, list[Symptom]] = {}
-    for k, (each, found) in enumerate(kept):
+    for k, (each, found) in enumerate(zip(kept, excursions, strict=True)):
         alone = [not _shared(span, spans, k) for span in found.spans_s]
         result[each.motion.name] = departures(each.response, found, alone, loaded=each.loaded)
     return result

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from ..arrays import BoolArray, ComplexArray, FloatArray
 from .fault import Span
 
 BLOCKS = 4
@@ -42,7 +42,7 @@ class Samples:
         """Values at other times, interpolated linearly; the ends are held."""
         if t_s is self.t_s:
             return self.values
-        return np.interp(t_s, self.t_s, self.values).astype(np.float64)
+        return np.interp(t_s, self.t_s, self.values).astype(np.float64, copy=False)
 
     @property
     def range(self) -> float:
@@ -76,6 +76,17 @@ class JointMotion:
     effort: Samples | None = None
     reference: Samples | None = None
     limits: tuple[float, float] | None = None
+
+    @cached_property
+    def response(self) -> Response:
+        """Its position's response to its command, cycle by cycle; each has two samples or more."""
+        return windowed_response(self.command, self.position, cycle_s(self.command))
+
+    @cached_property
+    def largest_step(self) -> float:
+        """The most that the command moves from one sample of the position to the next [rad]."""
+        asked = self.command.at(self.position.t_s)
+        return float(np.abs(np.diff(asked)).max()) if asked.size > 1 else 0.0
 
 
 def cycle_s(command: Samples) -> float:
@@ -143,24 +154,23 @@ def windowed_response(command: Samples, position: Samples, period_s: float) -> R
     stop = min(command.t_s[-1], position.t_s[-1])
     block = period_s / BLOCKS
     count = int((stop - start) / block + 1e-9) if block > 0 else 0
+    if count > BLOCKS * position.t_s.size:  # hardly any window has a sample
+        count = 0
     windows = max(count - BLOCKS + 1, 0)
     i, j = np.searchsorted(position.t_s, (start, start + count * block))
     t_s, p = position.t_s[i:j], position.values[i:j]
-    index: IntArray = np.minimum(((t_s - start) / block).astype(np.int64), max(count - 1, 0))
     c, d = command.at(t_s), command.at(t_s - period_s / BLOCKS)
     middle = float(np.median(p)) if p.size else 0.0
     level = float(np.median(c)) if c.size else 0.0
     rows = np.stack([np.ones_like(c), c - level, d - level, p - middle])
-
-    def windowed(weights: FloatArray) -> FloatArray:
-        sums = np.bincount(index, weights, minlength=max(count, 1))[:count]
-        total = np.concatenate(([0.0], np.cumsum(sums)))
-        return total[BLOCKS : BLOCKS + windows] - total[:windows]
-
+    # Sums over each block, then over the blocks of each window.
+    edges: FloatArray = start + block * np.arange(count + 1, dtype=np.float64)
+    first = np.searchsorted(t_s, edges)
     moments = np.zeros((windows, 4, 4))
     for row in range(4):
         for column in range(row, 4):
-            moments[:, row, column] = windowed(rows[row] * rows[column])
+            total = np.concatenate(([0.0], np.cumsum(rows[row] * rows[column])))[first]
+            moments[:, row, column] = total[BLOCKS:][:windows] - total[:-BLOCKS][:windows]
             moments[:, column, row] = moments[:, row, column]
     return _solved(moments, start, block, period_s, middle - level)
 

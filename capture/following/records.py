@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import median_filter
 
+from ..threads import in_threads
 from .fault import Span, Symptom
 from .motion import JointMotion, Samples
 
@@ -66,16 +67,15 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     """
     sampled = [each for each in motions if each.position.t_s.size > 2]
     result: dict[str, list[Symptom]] = {}
-    lost = [_lost(each) for each in sampled]
-    stale = [_repeats(each) for each in sampled]
     largest = max((each.command.range for each in sampled), default=0.0)
-    spikes = [
-        _spikes(each) if each.command.range > SPIKE_SHARE * largest else 0.0 for each in sampled
-    ]
-    usual_lost, usual_stale, usual_spikes = (
-        float(np.median(values)) if values else 0.0 for values in (lost, stale, spikes)
-    )
-    for each, missing, repeated, spiky in zip(sampled, lost, stale, spikes, strict=True):
+
+    def shares(each: JointMotion) -> tuple[float, float, float]:
+        moves = each.command.range > SPIKE_SHARE * largest
+        return _lost(each), _repeats(each), _spikes(each) if moves else 0.0
+
+    found = in_threads(shares, sampled, sum(each.position.t_s.size for each in sampled))
+    usual_lost, usual_stale, usual_spikes = np.median(found or [(0.0, 0.0, 0.0)], axis=0).tolist()
+    for each, (missing, repeated, spiky) in zip(sampled, found, strict=True):
         symptoms: list[Symptom] = []
         if spiky > SPIKES + 2 * usual_spikes:
             text = f"{100 * spiky:.2g} % of its samples are far from those around them"
@@ -108,8 +108,7 @@ def wraps(each: JointMotion) -> Symptom | None:
     if samples.t_s.size < 16:
         return None
     step = np.diff(samples.values)
-    asked = float(np.abs(np.diff(each.command.at(samples.t_s))).max())
-    large = np.abs(step) > max(WRAP * asked, 0.5 * each.command.range)
+    large = np.abs(step) > max(WRAP * each.largest_step, 0.5 * each.command.range)
     sizes = np.abs(step[large])
     if not 2 <= sizes.size <= 0.2 * step.size:
         return None
@@ -146,8 +145,9 @@ def _spikes(each: JointMotion) -> float:
         return 0.0
     away = np.abs(values - median_filter(values, size=5, mode="nearest"))
     noise = 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / 6**0.5
-    step = float(np.abs(np.diff(each.command.at(each.position.t_s))).max())
-    far = away > max(SPIKE * noise, SPIKE_STEPS * step, SPIKE_SHARE * each.command.range)
+    far = away > max(
+        SPIKE * noise, SPIKE_STEPS * each.largest_step, SPIKE_SHARE * each.command.range
+    )
     return float(np.count_nonzero(far)) / values.size
 
 

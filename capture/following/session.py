@@ -6,41 +6,18 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from ..arrays import FloatArray, IntArray
 from ..errors import DataError, LogError, MissingChannelError
 from ..log.session import Session
 from ..log.signals import Signal
+from ..log.unbroken import longest_unbroken
 from .fault import Fault
 from .find import joints_not_following
 from .motion import JointMotion, Samples
 
 COMMANDS = "/joint_commands"
 STATES = "/joint_states"
-
-
-def samples_of(signal: Signal | None, origin_ns: int) -> Samples | None:
-    """Take a recorded signal as finite samples at increasing times.
-
-    Args:
-        signal: The signal, or None.
-        origin_ns: Unix time that becomes 0 s.
-
-    Returns:
-        The samples; None for no signal or one without finite values.
-    """
-    if signal is None or not signal.values.size:
-        return None
-    t_ns, values = signal.t_ns, signal.values
-    finite = np.isfinite(values)
-    if not finite.all():
-        t_ns, values = t_ns[finite], values[finite]
-    if t_ns.size > 1 and (np.diff(t_ns) <= 0).any():
-        order = np.argsort(t_ns, kind="stable")
-        t_ns, values = t_ns[order], values[order]
-        first = np.concatenate(([True], np.diff(t_ns) > 0))
-        t_ns, values = t_ns[first], values[first]
-    if not t_ns.size:
-        return None
-    return Samples((t_ns - np.int64(origin_ns)).astype(np.float64) * 1e-9, values)
+QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
 
 
 def faults_in_session(session: Session) -> tuple[Fault, ...]:
@@ -51,7 +28,7 @@ def faults_in_session(session: Session) -> tuple[Fault, ...]:
 
     Returns:
         The faults, in chain order, times from the session's start; none where the session lacks
-        commands or states.
+        commands or states. Of a session with breaks the longest unbroken stretch is looked at.
     """
     quantities = {
         "command": (COMMANDS, "position"),
@@ -71,7 +48,12 @@ def faults_in_session(session: Session) -> tuple[Fault, ...]:
         columns[quantity] = {name: signals.signal(name) for name in signals.names}
     if "command" not in columns or "position" not in columns:
         return ()
-    return joints_not_following(motions_of(session, columns, columns["command"]))
+    both = (*columns["command"].values(), *columns["position"].values())
+    whole = longest_unbroken(one.t_ns for one in both)
+    if whole is None:
+        return ()
+    window_ns = (whole.start_ns, whole.last_ns + 1) if whole.others else None
+    return joints_not_following(motions_of(session, columns, columns["command"], window_ns))
 
 
 def motions_of(
@@ -96,28 +78,53 @@ def motions_of(
     limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
     empty = Samples(np.zeros(0), np.zeros(0))
     motions: list[JointMotion] = []
-
-    def samples(quantity: str, name: str) -> Samples | None:
-        signal = columns.get(quantity, {}).get(name)
-        if signal is not None and window_ns is not None:
-            i, j = np.searchsorted(signal.t_ns, window_ns).tolist()
-            signal = Signal(signal.name, signal.unit, signal.t_ns[i:j], signal.values[i:j])
-        return samples_of(signal, session.start_ns)
-
     for name in names:
-        command = samples("command", name)
-        if command is None:
+        times = _Times(session.start_ns, window_ns)
+        found = {key: times.samples(columns.get(key, {}).get(name)) for key in QUANTITIES}
+        if (command := found["command"]) is None:
             continue
-        effort = samples("effort", name)
         motions.append(
             JointMotion(
                 name=name,
                 command=command,
-                position=samples("position", name) or empty,
-                velocity=samples("velocity", name),
-                effort=effort if effort is not None else samples("current", name),
-                reference=samples("reference", name),
+                position=found["position"] or empty,
+                velocity=found["velocity"],
+                effort=found["effort"] or found["current"],
+                reference=found["reference"],
                 limits=limits.get(name),
             )
         )
     return motions
+
+
+class _Times:
+    """The sampling times of one joint; those that several quantities share are converted once."""
+
+    def __init__(self, origin_ns: int, window_ns: tuple[int, int] | None) -> None:
+        self._origin_ns = np.int64(origin_ns)
+        self._window_ns = window_ns
+        self._known: dict[int, tuple[slice, IntArray, FloatArray]] = {}
+
+    def samples(self, signal: Signal | None) -> Samples | None:
+        """The finite samples at increasing times; None without any."""
+        if signal is None:
+            return None
+        part, t_ns, t_s = self._converted(signal.t_ns)
+        values = signal.values[part]
+        finite = np.isfinite(values)
+        if not finite.all():
+            t_ns, t_s, values = t_ns[finite], t_s[finite], values[finite]
+        if t_ns.size > 1 and (np.diff(t_ns) <= 0).any():
+            first = np.unique(t_ns, return_index=True)[1]
+            t_s, values = t_s[first], values[first]
+        return Samples(t_s, values) if t_s.size else None
+
+    def _converted(self, t_ns: IntArray) -> tuple[slice, IntArray, FloatArray]:
+        if id(t_ns) not in self._known:
+            part = slice(None)
+            if self._window_ns is not None:
+                part = slice(*np.searchsorted(t_ns, self._window_ns).tolist())
+            inside = t_ns[part]
+            t_s = (inside - self._origin_ns).astype(np.float64) * 1e-9
+            self._known[id(t_ns)] = part, inside, t_s
+        return self._known[id(t_ns)]

@@ -29,38 +29,23 @@ def _(robot, rng, j):
     )
 
 
+def _scaled(j):
+    kinds = frozenset({"scaled_sensor"})
+    return Truth((JointTruth(j, kinds, kinds, GAIN | OFFSET, checked=False),))
+
+
 @fault("sensor of wrong scale")
 def _(robot, rng, j):
     """The position has a gain of its own, in its constant part too."""
     size = relative(robot, j, rng, 0.5)
     scale = 1 - min(size, 0.6) if rng.random() < 0.5 else 1 + size
-    return (Change(j, reading=lambda read: scale * read),), Truth(
-        (
-            JointTruth(
-                j,
-                frozenset({"scaled_sensor"}),
-                frozenset({"scaled_sensor"}),
-                GAIN | OFFSET,
-                checked=False,
-            ),
-        )
-    )
+    return (Change(j, reading=lambda read: scale * read),), _scaled(j)
 
 
 @fault("sensor in degrees")
 def _(robot, rng, j):
     """The position is 180/pi times as large."""
-    return (Change(j, reading=np.degrees),), Truth(
-        (
-            JointTruth(
-                j,
-                frozenset({"scaled_sensor"}),
-                frozenset({"scaled_sensor"}),
-                GAIN | OFFSET,
-                checked=False,
-            ),
-        )
-    )
+    return (Change(j, reading=np.degrees),), _scaled(j)
 
 
 @fault("swapped cables")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from capture.log.read_ahead import threads_or_default
+from .log.read_ahead import threads_or_default
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
