@@ -5,17 +5,20 @@ Exit codes: 0 done, 1 the work failed, 2 wrong usage.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
 
 from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
 
+from capture.console import complain
 from capture.deferred import defer
-from capture.errors import MissingExtraError, UndulogError
+from capture.errors import MissingExtraError, UndulogError, UsageError
 
 VERBS: dict[str, tuple[str, str]] = {
     "record": ("capture.record_cli:record", "Record a robot, or its twin, into a session."),
@@ -88,6 +91,9 @@ _EXTRAS = {
 }
 """Optional package to the extra that installs it."""
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+"""What writing to a full or failing disk raises."""
+
 
 def build(arguments: Sequence[str] = ()) -> App:
     """The command with all its verbs, none of them imported.
@@ -102,7 +108,8 @@ def build(arguments: Sequence[str] = ()) -> App:
     app = App(
         name="undulog",
         help="Record, simulate, measure and replay undulating robots. "
-        "Every session is one MCAP file that explains itself.",
+        "Every session is one MCAP file that explains itself. "
+        "Every verb takes `--max-chunk-mib N`: larger chunks (256 MiB by default) are not read.",
         version=lambda: version("undulog"),
         help_format="markdown",
         help_epilogue="Example: `undulog sim run flat -o run.mcap && undulog analyse run.mcap`",
@@ -147,6 +154,7 @@ def run(arguments: Sequence[str]) -> int:
         The exit code: 0 done, 1 the work failed, 2 wrong usage.
     """
     try:
+        arguments = _without_chunk_limit(arguments)
         result = build(arguments)(arguments, exit_on_error=False, print_error=False)
     except UnknownCommandError:  # its own text would import every verb
         return _complain(_unknown(arguments), 2)
@@ -171,14 +179,58 @@ def main() -> None:
         code = run(sys.argv[1:])
         sys.stdout.flush()
     except BrokenPipeError:  # the reader (head, less) has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
+        code = 1
+    except OSError as error:
+        if error.errno not in _FULL or error.filename is not None:
+            raise
+        _discard_output()
+        with suppress(OSError):  # the error output may be on the same disk
+            _complain(f"the output can't be written: {error.strerror}", 1)
         code = 1
     sys.exit(code)
+
+
+def _discard_output() -> None:
+    """Send what is still to be printed nowhere, so that the end of the process can't fail."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(nowhere, stream.fileno())
+
+
+def _without_chunk_limit(arguments: Sequence[str]) -> list[str]:
+    """Take ``--max-chunk-mib``, an option of every verb, to the environment of all that it starts.
+
+    Raises:
+        UsageError: If its value is no positive whole number.
+    """
+    option, left, rest = "--max-chunk-mib", list[str](), iter(arguments)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if name == option:
+            from capture.log.chunk import LARGEST_CHUNK_VARIABLE, largest_chunk
+
+            os.environ[LARGEST_CHUNK_VARIABLE] = value if equals else next(rest, "")
+            try:
+                largest_chunk()
+            except UsageError:
+                wrong = os.environ.pop(LARGEST_CHUNK_VARIABLE)
+                raise UsageError(f"{option} {wrong}: give a whole number of MiB above 0") from None
+        else:
+            left.append(word)
+    return left
 
 
 def _unknown(arguments: Sequence[str]) -> str:
     words = [word for word in arguments if not word.startswith("-")][:2]
     typed = " ".join(words if words and words[0] in _GROUPS else words[:1])
+    options = [word for word in arguments if word.startswith("-")]
+    if options and (arguments[0] in options or typed in _GROUPS):
+        place = f" of 'undulog {typed}'" if typed in _GROUPS else " in front of a verb"
+        return f"there is no option '{options[0]}'{place}. Try 'undulog --help'."
     near = get_close_matches(typed, VERBS, n=1)
     hint = f"Did you mean '{near[0]}'? " if near else ""
     return f"there is no verb '{typed}'. {hint}There are: {', '.join(VERBS)}."
@@ -197,7 +249,7 @@ def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtra
 
 
 def _complain(message: str, code: int) -> int:
-    sys.stderr.write(f"error: {message}\n")
+    complain(f"error: {message}")
     return code
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.console import Progress, refuse_existing
+from capture.console import Progress, refuse_existing, say
 from capture.errors import UsageError
 
 if TYPE_CHECKING:
@@ -100,6 +100,6 @@ def show(render: Callable[[int, bool], str], output: Path | None) -> None:
     """
     terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if terminal else UNLIMITED
-    print(render(width, terminal), end="")
+    sys.stdout.write(render(width, terminal))  # its names are escaped; the rest are styles
     if output is not None:
-        print(f"Result: {output}")
+        say(f"Result: {output}")

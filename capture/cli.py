@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from .console import emit_json
+from .console import emit_json, say
 from .errors import ImportFormatError, UsageError
 
 if TYPE_CHECKING:
@@ -137,9 +137,9 @@ def export_log(
         facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
         emit_json(facts)
         return
-    print(f"{output}: {what}")
+    say(f"{output}: {what}")
     for warning in warnings:
-        print(f"  warning: {warning}")
+        say(f"  warning: {warning}")
 
 
 def _column_map(
@@ -171,16 +171,16 @@ def _require_mcap(output: Path) -> None:
 
 def _print_import(report: ImportReport) -> None:
     frames = f"{report.frames} CAN frames, " if report.frames is not None else ""
-    print(
+    say(
         f"{report.output}: {report.duration_s:.1f} s of {report.robot}, {frames}"
         f"verdict {report.verdict}"
     )
     if not report.complete:
-        print("stopped on request; the file is complete up to there")
+        say("stopped on request; the file is complete up to there")
     width = max(map(len, report.samples), default=0)
     for topic, count in sorted(report.samples.items()):
-        print(f"  {topic:<{width}}  {count} messages")
+        say(f"  {topic:<{width}}  {count} messages")
     for problem in report.problems:
-        print(f"  problem: {problem}")
+        say(f"  problem: {problem}")
     for note in report.notes:
-        print(f"  note: {note}")
+        say(f"  note: {note}")

@@ -1,15 +1,66 @@
-"""What every verb says in the same way: progress, JSON, and the refusal to overwrite."""
+"""What every verb prints in the same way: lines, errors, progress and JSON.
+
+All text for a terminal passes :func:`plain`: names in a log are untrusted, and a terminal obeys the
+control characters in them.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+import unicodedata
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 from .errors import OutputExistsError, UsageError
+
+_UNSAFE = ("Cc", "Cf", "Cs", "Cn", "Co", "Zl", "Zp")
+"""Unicode categories: control, format (also text direction), surrogate, unassigned, private, line
+and paragraph ends. All characters that XML forbids are among them."""
+
+
+def plain(text: str) -> str:
+    r"""Return text that a terminal shows and doesn't obey.
+
+    Args:
+        text: Any text, e.g. with names from a log.
+
+    Returns:
+        One line: control and format characters, line breaks and lone surrogates as escapes, e.g.
+        ``\x1b``, ``\n``, ``\u202e``; the rest unchanged.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        c.encode("unicode_escape").decode("ascii") if unicodedata.category(c) in _UNSAFE else c
+        for c in text
+    )
+
+
+def say(*lines: str) -> None:
+    """Print lines on stdout.
+
+    Args:
+        lines: Any text; what would end a line or control a terminal is escaped (:func:`plain`).
+    """
+    sys.stdout.write("".join(f"{plain(line)}\n" for line in lines))
+    sys.stdout.flush()
+
+
+def complain(message: str) -> None:
+    """Print an error or a warning on stderr.
+
+    Args:
+        message: Any text, escaped as by :func:`plain` except for line feeds; a line behind the
+            first is indented, so that a name with a line feed can't pass for another message.
+    """
+    first, *rest = (plain(line) for line in message.split("\n"))
+    indented = (line if line.startswith("  ") else f"  {line}" for line in rest)
+    sys.stdout.flush()
+    sys.stderr.write("".join(f"{line}\n" for line in (first, *indented)))
+    sys.stderr.flush()
 
 
 class Progress(Protocol):
@@ -49,18 +100,18 @@ def progress(description: str, total: float) -> Generator[Progress]:
     from rich.progress import Progress as Bars
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task(description, total=total, note="")
+        task = bars.add_task(plain(description), total=total, note="")
 
         class _Bar:
             def update(self, done: float, note: str = "") -> None:
-                bars.update(task, completed=done, note=note)
+                bars.update(task, completed=done, note=plain(note))
 
         yield _Bar()
 

@@ -17,6 +17,7 @@
     |- DataError (ValueError)               samples unfit for what was asked
     |- SourceError                          a source that can't be opened or used
     |- ControlError                         a running recorder that can't be reached, or refuses
+    |  `- SocketInUseError                  another recorder listens at a control socket
     `- LogError                             a log that cannot be read or written
        |- NotALogError                      not an MCAP file, or none of it readable
        |- MissingChannelError (KeyError)    the topic is not there; lists those that are
@@ -236,6 +237,10 @@ class SourceError(UndulogError):
 
 class ControlError(UndulogError):
     """A running recorder can't be reached, or refuses what it was asked."""
+
+
+class SocketInUseError(ControlError):
+    """Another recorder listens at a control socket."""
 
 
 class ImportFormatError(LogError, ValueError):

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from .console import emit_json
+from .console import emit_json, say
 from .errors import DataError
 from .log.frames import FD_TOPIC_PREFIX
 from .log.session import Session
@@ -110,31 +110,31 @@ def _print_facts(facts: dict[str, Any]) -> None:
         if session["start_utc"]
         else "no messages"
     )
-    print(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
+    say(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
     for warning in facts["warnings"]:
-        print(f"warning: {warning}")
+        say(f"warning: {warning}")
     foreign = Counter(topic["encoding"] or "no encoding" for topic in _foreign(facts))
     if foreign:
         order = sorted(foreign.items(), key=lambda item: (-item[1], item[0]))
         listed = ", ".join(f"{encoding} {count}" for encoding, count in order)
         topics = "1 topic is" if foreign.total() == 1 else f"{foreign.total()} topics are"
-        print(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
+        say(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
     names = [_type(topic) for topic in facts["topics"]]
     width = max([len(topic["topic"]) for topic in facts["topics"]] + [5])
     kinds = max([len(name) for name in names] + [4])
-    print(f"\n{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
+    say("", f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
     for topic, name in zip(facts["topics"], names, strict=True):
         rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
         held = f"{topic['frames']} frames" if topic["frames"] is not None else topic["unit"] or ""
-        print(
+        say(
             f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}  "
             f"{rate}  {held}".rstrip()
         )
     if facts["attachments"]:
         listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())
-        print(f"\nattached: {', '.join(listed)}")
+        say("", f"attached: {', '.join(listed)}")
     writer = session["library"] or "an unnamed program"
-    print(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
+    say(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
 
 
 def _foreign(facts: dict[str, Any]) -> list[dict[str, Any]]:

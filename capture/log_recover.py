@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from .console import emit_json
+from .console import emit_json, say
 from .interruption import interruptible
 
 if TYPE_CHECKING:
@@ -53,11 +53,11 @@ def _tell(report: RecoverReport) -> None:
     messages = sum(report.messages.values())
     missing = {None: "how many are missing can't be told", 0: "none is missing"}
     lost = missing.get(report.missing, f"{report.missing} are missing")
-    print(
+    say(
         f"{report.output}: {messages} messages over {report.duration_s:.2f} s, "
         f"{report.from_wal} of them from the write-ahead log; {lost}"
     )
     for warning in report.warnings:
-        print(f"warning: {warning}")
+        say(f"warning: {warning}")
     for note in report.notes:
-        print(f"note: {note}")
+        say(f"note: {note}")

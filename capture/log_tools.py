@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from .console import emit_json
+from .console import emit_json, say
 from .interruption import interruptible
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ def log_merge(
     *files: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     robot: str | None = None,
+    apart: bool = False,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -78,6 +79,9 @@ def log_merge(
     becomes one; if its types or units differ, nothing is merged. Message bytes, sequence numbers
     and times stay as they are. Of attachments and metadata the same is kept once and the different
     under a name of its own; the record `undulog.edit` lists the session ids and hashes of all logs.
+    Logs of different robots are refused unless --robot names the one that the session is of, and
+    logs with more than a day between them unless --apart is given; both are warned of then, and so
+    are logs that have no joint in common or more than a minute between them.
 
     Example: `undulog log merge robot.mcap tracking.mcap -o both.mcap`
 
@@ -85,13 +89,14 @@ def log_merge(
         files: MCAP files, of any make; of a damaged one, what can be read.
         output: The log to write, `.mcap`.
         robot: Where the logs are of different robots, the one that the merged session is of.
+        apart: Merge logs with more than a day between them, too.
         force: Replace an existing output.
         json: Report as one JSON object.
     """
     from .log.merge import merge_logs
 
     with interruptible() as request:
-        report = merge_logs(files, output, robot=robot, force=force, stop=request)
+        report = merge_logs(files, output, robot=robot, apart=apart, force=force, stop=request)
     _tell(report, as_json=json)
 
 
@@ -101,14 +106,14 @@ def _tell(report: EditReport, *, as_json: bool) -> None:
         return
     messages = sum(report.messages.values())
     origin = ", ".join(dict.fromkeys(source["session_id"] for source in report.sources))
-    print(
+    say(
         f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, "
         f"{report.output.stat().st_size / 1e6:.1f} MB"
     )
     for warning in report.warnings:
-        print(f"warning: {warning}")
+        say(f"warning: {warning}")
     for note in report.notes:
-        print(f"note: {note}")
+        say(f"note: {note}")
     width = max(map(len, report.messages), default=0)
     for topic, count in report.messages.items():
-        print(f"  {topic:<{width}}  {count} messages")
+        say(f"  {topic:<{width}}  {count} messages")

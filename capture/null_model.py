@@ -158,7 +158,7 @@ def read_null_model(path: Path) -> NullModel:
     """
     try:
         values: Any = json.loads(read_input(path).decode("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise NullModelError(path, [Fault("syntax", str(error), "JSON in UTF-8")]) from error
     if not isinstance(values, dict) or cast("dict[str, Any]", values).get("format") != FORMAT:
         found = "no such format"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from .console import emit_json
+from .console import complain, emit_json, say
 from .errors import UndulogError
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def record(
     elif not resolved.quiet:
         _print_report(report)
     if report.ending.failed:
-        sys.stderr.write(f"error: {report.ending.reason}\n")
+        complain(f"error: {report.ending.reason}")
     return int(report.ending.failed)
 
 
@@ -174,11 +174,11 @@ def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
 def _print_report(report: RecordReport) -> None:
     names = ", ".join(str(file) for file in report.files[:3])
     names += f" and {len(report.files) - 3} more" if len(report.files) > 3 else ""
-    print(
+    say(
         f"{names or 'nothing written'}: {report.duration_s:.1f} s of {report.robot or 'raw data'}, "
         f"{report.messages} messages, {report.size / 1e6:.1f} MB, verdict {report.verdict}"
     )
-    print(f"  ended: {report.ending.reason}")
+    say(f"  ended: {report.ending.reason}")
     for name, counts in report.sources.items():
         parts = [f"{counts['frames']} frames"]
         dropped = counts["dropped"]
@@ -190,6 +190,6 @@ def _print_report(report: RecordReport) -> None:
         ):
             if counts[key]:
                 parts.append(f"{counts[key]} {what}")
-        print(f"  {name}: {', '.join(parts)}")
+        say(f"  {name}: {', '.join(parts)}")
     for reason in report.reasons:
-        print(f"  reason: {reason}")
+        say(f"  reason: {reason}")

@@ -6,14 +6,13 @@ They speak to running recorders by their control sockets.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from .console import emit_json
+from .console import complain, emit_json, say
 from .errors import ControlError, UsageError
 
 if TYPE_CHECKING:
@@ -44,9 +43,9 @@ def status(*, socket: Path | None = None, json: bool = False) -> int:
     if json:
         emit_json({"recordings": found, "silent": silent})
     for recording in [] if json else found:
-        print(_summary(recording))
+        say(_summary(recording))
     for error in silent:
-        sys.stderr.write(f"error: {error}\n")
+        complain(f"error: {error}")
     return int(bool(silent))
 
 
@@ -119,9 +118,9 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
         _tell("stopping", reply, as_json=json)
     else:
         files = ", ".join(str(file) for file in reply.get("files", []))
-        print(f"{files or 'nothing written'}: {_facts(reply)}")
+        say(f"{files or 'nothing written'}: {_facts(reply)}")
         for reason in reply.get("reasons", []):
-            print(f"  reason: {reason}")
+            say(f"  reason: {reason}")
     return int(bool(reply.get("failed", False)))
 
 
@@ -135,11 +134,11 @@ def unit() -> None:
     from .daemon.unit import hidden_folder, installed_program, unit_text
 
     program = installed_program()
-    print(unit_text(program), end="")
+    say(*unit_text(program).splitlines())
     if (folder := hidden_folder(program)) is not None:
-        sys.stderr.write(
+        complain(
             f"warning: {program} lies below {folder}, which this unit hides from the service; "
-            "install undulog elsewhere, e.g. in /opt/undulog\n"
+            "install undulog elsewhere, e.g. in /opt/undulog"
         )
 
 
@@ -220,7 +219,7 @@ def _tell(done: str, reply: Mapping[str, Any], *, as_json: bool) -> None:
     if as_json:
         emit_json(dict(reply))
     else:
-        print(": ".join([done, *([_plain(reply)] if reply else [])]))
+        say(": ".join([done, *([_plain(reply)] if reply else [])]))
 
 
 def _plain(reply: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Any, TypeVar, cast
@@ -21,6 +22,46 @@ _Choice = TypeVar("_Choice", bound=StrEnum)
 
 NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 """What a name of a robot, link, joint or sensor looks like: it becomes part of topics and files."""
+
+
+_DEEPEST = 64
+"""Tables and arrays in each other; deeper ones would end what walks them by a full stack."""
+_INTEGERS = range(-(2**63), 2**63)
+_LARGEST = 1e15
+_SMALLEST = 1e-30
+"""No quantity in SI units is beyond; powers and quotients of those within don't overflow."""
+
+
+def read_toml(text: str) -> dict[str, Any]:
+    """Read a TOML text of any origin.
+
+    Args:
+        text: The text.
+
+    Returns:
+        Its tables: at most 64 of them, or arrays, in each other, and integers of 64 bits.
+
+    Raises:
+        ValueError: If it is no such TOML; says what is wrong.
+    """
+    try:
+        values = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(f"nested more than {_DEEPEST} deep") from None
+    level: list[object] = [values]
+    for _ in range(_DEEPEST):
+        inner: list[object] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += cast("dict[str, object]", value).values()
+            elif isinstance(value, list):
+                inner += cast("list[object]", value)
+            elif isinstance(value, int) and value not in _INTEGERS:
+                raise ValueError("an integer of more than 64 bits")
+        if not inner:
+            return values
+        level = inner
+    raise ValueError(f"nested more than {_DEEPEST} deep")
 
 
 def shown(value: object) -> str:
@@ -236,6 +277,7 @@ class Table:
             and (at_least is None or number >= at_least)
             and (at_most is None or number <= at_most)
             and not (nonzero and number == 0)
+            and _is_usual(number)
         )
         if number is None or not fits:
             bounds = [
@@ -244,6 +286,8 @@ class Table:
                 *([f"<= {at_most:g}"] if at_most is not None else []),
                 *(["other than 0"] if nonzero else []),
             ]
+            if number is not None and not _is_usual(number):
+                bounds.append(_USUAL)
             self.fault(key, " ".join(["a finite number", " and ".join(bounds)]).strip())
             return math.nan
         return number
@@ -328,10 +372,12 @@ class Table:
         """An array of finite numbers; NaN after a fault."""
         value = self.look(key)[1]
         entries = cast("list[object]", value) if isinstance(value, list) else []
-        numbers = [number for number in map(finite_number, entries) if number is not None]
+        numbers = [n for n in map(finite_number, entries) if n is not None and _is_usual(n)]
         bad = above is not None and any(number <= above for number in numbers)
         if len(entries) != count or len(numbers) != count or bad:
             bound = f", each > {above:g}" if above is not None else ""
+            if any(not _is_usual(n) for n in map(finite_number, entries) if n is not None):
+                bound += f", each {_USUAL}"
             self.fault(key, f"an array of {count} finite numbers{bound}")
             return [math.nan] * count
         return numbers
@@ -412,6 +458,13 @@ class Table:
             if key not in self._asked:
                 near = listed(self._asked, key)
                 self._faults.add(self.key(key), "an unknown key", near)
+
+
+_USUAL = f"0 or of a size from {_SMALLEST:g} to {_LARGEST:g}"
+
+
+def _is_usual(number: float) -> bool:
+    return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
 
 
 def finite_number(value: object) -> float | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import UsageError
 
 from .beside.options import BesideOptions
@@ -178,12 +178,12 @@ def _report(recording: Recording, duration_s: float, *, json: bool) -> None:
     if json:
         emit_json(_facts(recording, duration_s, size))
         return
-    print(
+    say(
         f"{recording.path}: {duration_s:.1f} s, {size / 1e6:.1f} MB; open it with: rerun "
         f"{recording.path}"
     )
     for warning in recording.warnings:
-        print(f"note: {warning}")
+        say(f"note: {warning}")
 
 
 def _facts(recording: Recording, duration_s: float, size: int) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from .plots import gait, joints, power
 from .plots.other_topics import log_others, log_words
 from .plots.response import charts, log_charts, log_current
 from .plots.write import Plots
+from .samples.quantities import SIGNALS, topic_entity
 from .samples.stretches import Span, Stretch
 from .samples.survey import GAIT, Survey, survey
 from .samples.timeline import Clock
@@ -290,7 +291,9 @@ class Drawing:
     def _signals(self) -> tuple[Signal, ...]:
         """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
         found: list[Signal] = []
-        for topic, series in self._plots.signals.items():
+        topics = {topic_entity(SIGNALS, one): one for one in self._sources.session.channels}
+        for entity, series in self._plots.signals.items():
+            topic = topics[entity]
             unit = self._sources.session.channels[topic].metadata.get("unit", "rad")
             of_joints = any(name in self._palette for one in series for name in one.names)
             found.append(Signal(signal_title(topic, unit), series, of_joints))

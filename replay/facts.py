@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 import rerun as rr
@@ -10,12 +11,39 @@ import rerun as rr
 from analysis.results.analysis import Analysis, GroupFacts
 from analysis.text.formats import utc
 from capture import Session
+from capture.console import plain
 
 from .content import Content
 from .layer import Named
 from .samples.timeline import ENSEMBLE_CYCLE
 
 FACTS = "/session"
+
+_MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
+
+
+def escaped(text: str) -> str:
+    """Text with names from a log, as part of Markdown.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        One line of Markdown that shows it and marks nothing up.
+    """
+    return _MARKUP.sub(r"\\\1", plain(text))
+
+
+def code(text: str) -> str:
+    """A name from a log as code in Markdown, in a table too.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        A code span of one line; the text itself where it has a backtick.
+    """
+    return escaped(text) if "`" in text else f"`{plain(text)}`".replace("|", r"\|")
 
 
 def markdown(
@@ -45,7 +73,7 @@ def markdown(
         Markdown.
     """
     facts = (
-        f"`{session.session_id}`",
+        code(session.session_id),
         _robot(session),
         f"{session.duration_s:.1f} s",
         utc(session.start_ns),
@@ -53,14 +81,14 @@ def markdown(
         *_health(session.metadata),
         *_versions(session.metadata),
     )
-    parts = [f"**{_told_first(analysis, awaited=awaited)}**"]
+    parts = [f"**{escaped(_told_first(analysis, awaited=awaited))}**"]
     if named:
-        told = ", ".join(f"{one.joint} ({one.why})" for one in named)
+        told = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
         parts.append(f"**Named, pink in the pictures:** {told}")
     parts.append(" · ".join(facts))
     told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
     if told:
-        parts.append("\n".join(f"- {note}" for note in told))
+        parts.append("\n".join(f"- {escaped(note)}" for note in told))
     legend = _legend(colors, content, has_cycles=has_cycles)
     if legend:
         parts.append(legend)
@@ -135,9 +163,9 @@ def _group(group: GroupFacts) -> str:
 
 def _health(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
     verdict = metadata.get("undulog.health", {}).get("verdict")
-    return [f"verdict {verdict}"] if verdict else []
+    return [f"verdict {escaped(verdict)}"] if verdict else []
 
 
 def _versions(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
     recorded = metadata.get("undulog", {}).get("undulog")
-    return [f"recorded by undulog {recorded}"] if recorded else []
+    return [f"recorded by undulog {escaped(recorded)}"] if recorded else []

@@ -6,9 +6,11 @@ same recording id, so that a rebuilt recording takes the old one's place in the 
 
 from __future__ import annotations
 
+import traceback
 import uuid
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +32,7 @@ from .samples.stretches import stretches
 
 APPLICATION = "undulog"
 
+_RERUN = Path(rr.__file__).parent
 _NAMESPACE = uuid.UUID("8f4b6f0e-6f0a-5d3f-9a53-5d1f7a3f2c11")
 
 
@@ -95,10 +98,10 @@ def write_recording(
     sources = Sources.of(session)
     clock = clock_of(session)
     identity = recording_id(session.session_id)
-    with part_file(path) as draft:
+    with part_file(path) as draft, rerun_writes(path):
         rec = open_recording(identity)
         try:
-            _save(rec, draft, path)
+            rec.save(draft)
             send_properties(rec, session)
             drawing = Drawing(rec, clock, sources, layer.named)
             session.forget()
@@ -144,10 +147,22 @@ def send_properties(rec: rr.RecordingStream, session: Session) -> None:
     rec.send_recording_start_time_nanos(session.start_ns)
 
 
-def _save(rec: rr.RecordingStream, draft: Path, path: Path) -> None:
+@contextmanager
+def rerun_writes(path: Path) -> Generator[None]:
+    """Report what Rerun raises where it can't write, e.g. on a full disk, with the file's name.
+
+    Args:
+        path: What the file will be called.
+
+    Raises:
+        LogWriteError: For a ``RuntimeError`` of Rerun's.
+    """
     try:
-        rec.save(draft)
-    except (RuntimeError, OSError) as error:
+        yield
+    except RuntimeError as error:
+        raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+        if _RERUN not in raised_in.parents:
+            raise
         raise LogWriteError(path, f"can't be written: {error}") from error
 
 

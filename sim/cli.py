@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import UsageError
 from capture.interruption import interruptible
 
@@ -39,7 +39,7 @@ def list_scenarios(*, json: bool = False) -> None:
         emit_json([_described(scenario) for scenario in scenarios])
         return
     columns = get_terminal_size().columns if sys.stdout.isatty() else _UNWRAPPED
-    print("\n".join(_listed(scenarios, columns)))
+    say(*_listed(scenarios, columns))
 
 
 def run(
@@ -102,7 +102,7 @@ def run(
     if json:
         emit_json(_reported(chosen, recording, factor))
     else:
-        print("\n".join(_told(chosen, recording, factor)))
+        say(*_told(chosen, recording, factor))
     return 0 if recording.complete else 1
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import UsageError
 
 
@@ -73,12 +73,12 @@ def null(
             }
         )
         return
-    print(
+    say(
         f"{output}: {len(model.joints)} driven joints of {model.robot} at {model.frequency_hz:g} "
         f"Hz; off the twin by at most {model.error:.2g} in ln gain and lag within its reach"
     )
     for one in model.parameters:
-        print(
+        say(
             f"{one.name.replace('_', ' ')} {one.value:g} {one.unit}, by a factor "
             f"exp(±{one.reach:g})"
         )

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from types import TracebackType
 
-from capture.errors import SimulationError
+from capture.console import refuse_existing
+from capture.errors import LogWriteError, SimulationError
 from capture.interruption import StopRequest
+from capture.log.mcap_sink import write_error
 from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain
 
@@ -83,7 +87,9 @@ def open_session(
     kernels: Kernels = Kernels.NUMPY,
     force: bool = False,
 ) -> Generator[SessionWriter]:
-    """Create the session of a run, and finalise it after the block.
+    """Create the session of a run, and finalise it after the block, however that is left.
+
+    It appears under its name then; until then it is ``PATH.part``, which only a kill leaves behind.
 
     Args:
         scenario: What is run.
@@ -99,21 +105,45 @@ def open_session(
         OutputExistsError: If the file is there and ``force`` is not given.
         LogWriteError: If the file can't be written.
     """
-    with SessionWriter(
-        path,
-        session_id=_session_id(scenario, driver, kernels),
-        epoch_ns=scenario.epoch_ns,
-        robot=scenario.robot,
-        clock={"twin": ClockDomain.SIMULATED},
-        metadata={
-            **session_facts(scenario, kernels),
-            **(driver.facts if driver is not None else {}),
-        },
-        force=force,
-    ) as writer:
+    output = Path(path)
+    refuse_existing(output, force=force)
+    part = output.with_name(f"{output.name}.part")
+    with ExitStack() as stack:
+        stack.callback(part.unlink, missing_ok=True)
+        stack.push(partial(_name, part, output))
+        writer = stack.enter_context(
+            SessionWriter(
+                part,
+                session_id=_session_id(scenario, driver, kernels),
+                epoch_ns=scenario.epoch_ns,
+                robot=scenario.robot,
+                clock={"twin": ClockDomain.SIMULATED},
+                metadata={
+                    **session_facts(scenario, kernels),
+                    **(driver.facts if driver is not None else {}),
+                },
+                force=True,
+            )
+        )
         if driver is not None:
             writer.explain(driver.attachments, driver.records)
         yield writer
+
+
+def _name(
+    part: Path,
+    output: Path,
+    _kind: type[BaseException] | None,
+    error: BaseException | None,
+    _trace: TracebackType | None,
+) -> None:
+    """Give a session its name, unless it could not be written."""
+    if isinstance(error, LogWriteError):
+        return
+    try:
+        part.replace(output)
+    except OSError as found:
+        raise write_error(output, found) from found
 
 
 def _session_id(scenario: Scenario, driver: Driver | None, kernels: Kernels) -> str:

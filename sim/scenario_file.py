@@ -87,7 +87,6 @@ frequency and lag (``delay_s`` of delay blocks).
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -96,7 +95,7 @@ from capture.errors import Fault, ScenarioError, UsageError
 from capture.robot import Plane, Robot
 from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
-from capture.strict_table import NAME_PATTERN, Faults, Table, listed
+from capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 
 from .control.toml import read_controller
 from .gait.toml import read_gait
@@ -163,8 +162,8 @@ def parse_scenario(
     """
     source = Path(source)
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        values = read_toml(text)
+    except ValueError as error:
         raise ScenarioError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
     for key, value in (changes or {}).items():
@@ -224,8 +223,8 @@ def read_changes(words: Sequence[str]) -> dict[str, Any]:
         if not (equals and key and text) or not all(key.split(".")):
             raise UsageError(f"--set {word}: expected KEY=VALUE, e.g. servo.stall_torque=0.2")
         try:
-            changes[key] = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
+            changes[key] = read_toml(f"value = {text}")["value"]
+        except ValueError:
             changes[key] = text
     return changes
 

@@ -196,3 +196,24 @@ def webgl_browser(chromium, tmp_path):
     started = Browser(chromium, tmp_path / "chromium", patience_s=120.0, flags=flags)
     yield started
     started.close()
+
+
+@pytest.fixture
+def disk_of(tmp_path):
+    """Mounts a file system of a size, e.g. ``4m``; skips where that is not permitted."""
+    place = tmp_path / "disk"
+
+    def mount(size):
+        place.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except OSError as error:
+            pytest.skip(f"no mount: {error}")
+        if done.returncode:
+            pytest.skip(f"mounting is not permitted here: {done.stderr.strip()}")
+        return place
+
+    yield mount
+    if place.is_mount():
+        subprocess.run(["umount", str(place)], check=True)

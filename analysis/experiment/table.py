@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capture.console import plain
+
 from ..command_line import UNLIMITED
 from ..kicks.answer import kick_detail
 from ..oscillators.text import body_detail
@@ -168,7 +170,7 @@ def _run_table(experiment: Experiment) -> Table:
     table.add_column("role", no_wrap=True)
     for run, session in zip(experiment.runs, experiment.sessions, strict=True):
         table.add_row(
-            escape(formats.plain(Path(run.path).name)),
+            escape(plain(Path(run.path).name)),
             run.wave or formats.MISSING,
             formats.number(session.gait.frequency_hz.value, 3),
             run.role or "left out",

@@ -113,7 +113,7 @@ def load(path: Path | str) -> Shown:
     path = Path(path)
     try:
         data: Any = json.loads(read_input(path).decode("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not JSON: {error}") from error
     for kind in _KINDS:
         if isinstance(data, dict) and _required(kind) <= set(cast("dict[str, Any]", data)):

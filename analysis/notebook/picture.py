@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capture.console import plain
 from capture.part_file import write_text
 
 from ..command_line import check_output
@@ -35,7 +36,7 @@ class Picture:
 
     def __repr__(self) -> str:
         """The caption."""
-        return f"<Picture: {self.caption}>"
+        return f"<Picture: {plain(self.caption)}>"
 
     def _repr_html_(self) -> str:
         """The figure on paper, whatever the notebook's theme, and its caption."""

@@ -26,9 +26,11 @@ class Shown:
 
     def __repr__(self) -> str:
         """The answer in one line."""
+        from capture.console import plain
+
         from .text import headline_of
 
-        return f"<{type(self).__name__}: {headline_of(self)}>"
+        return f"<{type(self).__name__}: {plain(headline_of(self))}>"
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the answer, and the first table."""

@@ -7,6 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from capture.console import plain
+
 from ..compare.result import Comparison
 from ..compare.table import render_comparison
 from ..experiment.answer import pair_order
@@ -115,22 +117,22 @@ def _(result: Comparison) -> str:
 
 @text_of.register
 def _(result: Reversal) -> str:
-    return "\n".join([headline_of(result), *reversal_detail(result)])
+    return "\n".join(map(plain, [headline_of(result), *reversal_detail(result)]))
 
 
 @text_of.register
 def _(result: Coupling) -> str:
-    return headline_of(result)
+    return plain(headline_of(result))
 
 
 @text_of.register
 def _(result: LocalCoupling) -> str:
-    return "\n".join([headline_of(result), *kick_detail(result)])
+    return "\n".join(map(plain, [headline_of(result), *kick_detail(result)]))
 
 
 @text_of.register
 def _(result: LinearCoupling) -> str:
-    return "\n".join([headline_of(result), *sweep_detail(result)])
+    return "\n".join(map(plain, [headline_of(result), *sweep_detail(result)]))
 
 
 def html_of(result: Any) -> str:
@@ -142,7 +144,7 @@ def html_of(result: Any) -> str:
     Returns:
         The answer, the first table, and the warnings; names from logs are escaped.
     """
-    told = escape(formats.plain(headline_of(result)))
+    told = escape(plain(headline_of(result)))
     name, frame = next(iter(result.frames().items()))
     clean = frame.head(MOST_ROWS).map(_readable)
     shown = clean.to_html(float_format="{:.4g}".format, index=False, na_rep="–")
@@ -150,12 +152,10 @@ def html_of(result: Any) -> str:
     more = f", {left} more rows in frames()[{name!r}]" if left > 0 else ""
     said = ""
     for kind in ("warnings", "notes"):
-        items = "".join(
-            f"<li>{escape(formats.plain(text))}</li>" for text in getattr(result, kind, ())
-        )
+        items = "".join(f"<li>{escape(plain(text))}</li>" for text in getattr(result, kind, ()))
         said += f"<details><summary>{kind}</summary><ul>{items}</ul></details>" if items else ""
     return f"<p><strong>{told}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{said}"
 
 
 def _readable(cell: object) -> object:
-    return formats.plain(cell) if isinstance(cell, str) else cell
+    return plain(cell) if isinstance(cell, str) else cell

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from capture.console import emit_json
+from capture.console import emit_json, say
 from capture.errors import UsageError
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def reversal(
 
     _plan("reversal", like, output, design, (runs, settle, measure), as_json=json)
     if not json:
-        print(
+        say(
             "Before each file whose name ends in -180, put the robot down turned by 180 degrees; "
             "before the others, as in the first"
         )
@@ -149,11 +149,11 @@ def announce(
     if as_json:
         emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
         return
-    print(
+    say(
         f"{folder}: {plan}, {len(files)} runs of {settle_s + measure_s:g} s, "
         f"{len(files) * (settle_s + measure_s) / 60:.1f} min in all"
     )
-    print(
+    say(
         "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
         f"--start {settle_s:g} of all recordings"
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
+from capture.console import say
 from capture.errors import UsageError
 
 from .cli import announce
@@ -157,12 +158,12 @@ def _plan(
     if as_json:
         return
     if facts:
-        print(
+        say(
             f"The slowest body mode without contact has {facts['mode_hz']} Hz and dies away with "
             f"{facts['mode_tau_s']} s"
         )
     if settle_s < needed_s:
-        print(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
+        say(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
 
 
 def settling(base: BaseGait, session: Session) -> tuple[float, dict[str, str]]:

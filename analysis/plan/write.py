@@ -11,7 +11,8 @@ import numpy as np
 
 from capture import Session, SessionWriter
 from capture.arrays import FloatArray
-from capture.errors import UsageError
+from capture.errors import LogWriteError, UsageError
+from capture.part_file import part_file
 
 from .designs import PlannedRun
 from .gait_base import BaseGait
@@ -50,14 +51,18 @@ def write_plan(
     Raises:
         UsageError: If a command would leave the robot's joint limits, or a file is there already;
             nothing is written then.
-        LogWriteError: If a file can't be written.
+        LogWriteError: If the folder or a file can't be written.
     """
     _check_limits(base, runs, like)
     files = [folder / f"run{k:03d}-{run.label}.mcap" for k, run in enumerate(runs)]
-    for file in files:
-        if file.exists():
-            raise UsageError(f"{file} exists already; name another folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        there = [file for file in files if file.exists()]
+    except OSError as error:
+        reason = error.strerror or error
+        raise LogWriteError(folder, f"no folder for the plan can be made: {reason}") from error
+    if there:
+        raise UsageError(f"{there[0]} exists already; name another folder")
     plan_id, epoch_ns = uuid.uuid4().hex, time.time_ns()
     length_ns = round((settle_s + measure_s) * 1e9)
     t_ns = np.arange(0, length_ns + 1, 1_000_000_000 // RATE_HZ, dtype=np.int64)
@@ -65,13 +70,17 @@ def write_plan(
     for k, (file, run) in enumerate(zip(files, runs, strict=True)):
         start_ns = epoch_ns + k * length_ns
         values = commands(base, run, t_s, min(RAMP_S, settle_s))
-        with SessionWriter(
-            file,
-            session_id=uuid.uuid4().hex,
-            epoch_ns=start_ns,
-            robot=like.robot,
-            metadata={"settle_s": f"{settle_s:g}"},
-        ) as writer:
+        with (
+            part_file(file) as part,
+            SessionWriter(
+                part,
+                session_id=uuid.uuid4().hex,
+                epoch_ns=start_ns,
+                robot=like.robot,
+                metadata={"settle_s": f"{settle_s:g}"},
+                force=True,
+            ) as writer,
+        ):
             told = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
             told |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
             writer.note("undulog.plan", told | dict(facts or {}) | run.facts)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
+from capture.console import plain
+
 from ..results.analysis import Analysis, JointResult
 from ..results.artefact import KINDS, Artefact, Span
 from ..text import formats
@@ -79,7 +81,7 @@ def flagged_joints(joints: Sequence[JointResult]) -> tuple[tuple[str, str], ...]
     found: dict[str, list[str]] = {}
     for joint in joints:
         for flag in joint.flags:
-            found.setdefault(flag, []).append(formats.plain(joint.name))
+            found.setdefault(flag, []).append(plain(joint.name))
     return tuple((flag, _named(names, len(joints))) for flag, names in found.items())
 
 
@@ -114,7 +116,7 @@ def told_times(spans: tuple[Span, ...]) -> str:
 def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
     one = same[0]
     about, text = KINDS[one.flag]
-    names = [formats.plain(each.joint) for each in same]
+    names = [plain(each.joint) for each in same]
     return ArtefactRow(
         joints=_named(names, len(analysis.joints)),
         where=f"{one.quantity} on {one.topic}" if one.topic else one.quantity,

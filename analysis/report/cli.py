@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress
+from capture.console import emit_json, progress, say
 from capture.errors import UsageError
 from capture.part_file import write_text
 
@@ -59,9 +59,9 @@ def report(
     if json:
         emit_json({"page": str(output), "bytes": size, **told})
         return
-    print(told["answer"])
+    say(told["answer"])
     said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
-    print(f"{output}: {size / 1e3:.0f} kB{said}")
+    say(f"{output}: {size / 1e3:.0f} kB{said}")
 
 
 def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:

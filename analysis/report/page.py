@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from capture import Session
+from capture.console import plain
 from capture.errors import UsageError
 from capture.palette import joint_hex
 
@@ -111,11 +112,19 @@ def _sessions(result: Analysis | Experiment | Comparison) -> int:
     return len(result.sessions) if isinstance(result, Experiment) else 1
 
 
+def _shown(value: object) -> object:
+    """A value of a template; text that isn't markup yet without control characters."""
+    if isinstance(value, Markup) or not isinstance(value, str):
+        return value
+    return "\n".join(plain(line) for line in value.split("\n"))
+
+
 @cache
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("analysis.report"),
         autoescape=True,
+        finalize=_shown,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -124,7 +133,7 @@ def _environment() -> Environment:
     filters: dict[str, Callable[..., object]] = {
         "number": formats.number,
         "utc": formats.utc,
-        "plain": formats.plain,
+        "plain": plain,
         "filename": formats.filename,
         "p_value": formats.p_value,
         "degrees": formats.degrees,
@@ -147,7 +156,7 @@ def _environment() -> Environment:
 
 def _commands_to_make_it_again(provenance: Provenance) -> str:
     """The numbers again, and this page again; compare is one verb for both."""
-    command = formats.plain(provenance.command)
+    command = plain(provenance.command)
     numbers = "undulog analyse "
     if not command.startswith(numbers):
         return f"{command} -o comparison.html"

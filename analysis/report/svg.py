@@ -19,7 +19,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as _Figure
 
-from ..text.formats import plain
+from capture.console import plain
 
 Figure: TypeAlias = Any
 Axes: TypeAlias = Any

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from capture.console import plain
+
 from ..results.analysis import Analysis, Estimate, JointResult
 from ..text import formats
 from .driven import is_driven
@@ -139,7 +141,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
     )
     if joints:
         least = min(joints, key=lambda j: j.coverage)
-        where = formats.plain(least.name) if least.coverage < 0.9995 else "every joint"
+        where = plain(least.name) if least.coverage < 0.9995 else "every joint"
         facts.append(Fact("Lowest coverage", formats.coverage(least.coverage), where))
     points = analysis.body.observed if analysis.body is not None else ()
     sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
@@ -147,7 +149,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
         Fact(
             "Body amplitude",
             " / ".join(sizes) + " mm" if sizes else formats.MISSING,
-            formats.plain(" / ".join(p.place for p in points)),
+            plain(" / ".join(p.place for p in points)),
         )
     )
     return facts
@@ -158,9 +160,9 @@ def _range(name: str, values: Sequence[tuple[float, str]], decimals: int, unit: 
         return Fact(name, formats.MISSING)
     (low, first), (high, last) = min(values), max(values)
     if len(values) == 1:
-        return Fact(name, formats.number(low, decimals) + unit, formats.plain(first))
+        return Fact(name, formats.number(low, decimals) + unit, plain(first))
     text = f"{formats.number(low, decimals)}{unit} to {formats.number(high, decimals)}{unit}"
-    return Fact(name, text, formats.plain(f"{first}, {last}"))
+    return Fact(name, text, plain(f"{first}, {last}"))
 
 
 def _analysed(analysis: Analysis) -> str:
@@ -175,6 +177,6 @@ def _analysed(analysis: Analysis) -> str:
 
 def _lag_per_joint(analysis: Analysis) -> str:
     return ", ".join(
-        f"{formats.number(math.degrees(lag), 1)}° a joint, {formats.plain(plane)}"
+        f"{formats.number(math.degrees(lag), 1)}° a joint, {plain(plane)}"
         for plane, lag in analysis.gait.lag_per_joint_rad.items()
     )

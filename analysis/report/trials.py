@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from capture.console import plain
+
 from ..results.analysis import Coupling, Estimate, Index
 from ..results.coupling import LocalCoupling, RowCheck
 from ..results.experiment import Experiment, Reversal
@@ -196,4 +198,4 @@ def _worst(rows: tuple[RowCheck, ...]) -> str:
     worst = max(rows, key=lambda row: abs((row.total.value or 0.0) - row.expected))
     off = abs((worst.total.value or 0.0) - worst.expected)
     digits = formats.decimals_for_values([off], 2)
-    return f"{formats.number(off, digits)} ({formats.plain(worst.name)})"
+    return f"{formats.number(off, digits)} ({plain(worst.name)})"

@@ -6,6 +6,8 @@ import re
 
 from markupsafe import Markup, escape
 
+from capture.console import plain
+
 from ..text import formats
 
 NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -24,7 +26,7 @@ def typeset(text: str) -> str:
     Returns:
         The same words; no line ends between a number and its unit, and ``H^-1`` is raised.
     """
-    known = _UNIT.sub(NO_BREAK, formats.plain(text).replace("^-1", _INVERSE))
+    known = _UNIT.sub(NO_BREAK, plain(text).replace("^-1", _INVERSE))
     return _P.sub(rf"p{NO_BREAK}\1{NO_BREAK}", known)
 
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from capture.console import plain
 from capture.following import KINDS as FAULT_KINDS
 
 from ..results.analysis import Estimate, GaitFacts, Index, JointResult
@@ -59,6 +60,7 @@ class Facts:
         not_following: Joints that do not follow, in chain order.
         findings: Joints that stand out, and the shape of the rest.
         warnings: Of the analysis: they hold the reason where there is no answer.
+        left_out: What of a session with a break is analysed; empty without a break.
     """
 
     gait: GaitFacts
@@ -67,6 +69,7 @@ class Facts:
     not_following: tuple[NotFollowing, ...]
     findings: Findings
     warnings: tuple[str, ...]
+    left_out: str = ""
 
 
 def compose(facts: Facts) -> Answer:
@@ -80,6 +83,7 @@ def compose(facts: Facts) -> Answer:
     """
     known = [joint for joint in facts.joints if joint.gain.value is not None]
     first = _named(facts)
+    broken = f"{facts.left_out[:1].upper()}{facts.left_out[1:]}." if facts.left_out else ""
     verdict, rest, detail = _rest(facts, known)
     if first:
         verdict = Verdict.UNLIKE
@@ -94,7 +98,7 @@ def compose(facts: Facts) -> Answer:
         alike = True
     return Answer(
         verdict=verdict,
-        sentence=" ".join(part for part in (first, rest, _left_out(facts)) if part),
+        sentence=" ".join(part for part in (first, rest, _left_out(facts), broken) if part),
         detail=detail,
         not_following=facts.not_following,
         stand_out=findings.stand_out,
@@ -149,7 +153,7 @@ def fault_in_words(fault: NotFollowing) -> str:
         For example ``joint04 does not follow its command from 7.4 s on: jammed or dead``.
     """
     if fault.kinds == ("lost_samples",):
-        return f"{formats.plain(fault.joint)} {fault.evidence}"
+        return f"{plain(fault.joint)} {fault.evidence}"
     when = ""
     if fault.since_s is not None and fault.until_s is None:
         when = f" from {fault.since_s:.1f} s on"
@@ -158,26 +162,23 @@ def fault_in_words(fault: NotFollowing) -> str:
     elif fault.since_s is not None and fault.until_s is not None:
         share = max(1.0, 100 * fault.share)
         when = f" for {share:.0f} % of the time from {fault.since_s:.1f} to {fault.until_s:.1f} s"
-    return (
-        f"{formats.plain(fault.joint)} does not follow its command{when}: "
-        f"{kinds_in_words(fault.kinds)}"
-    )
+    return f"{plain(fault.joint)} does not follow its command{when}: {kinds_in_words(fault.kinds)}"
 
 
 def _named(facts: Facts) -> str:
     """The joints that do not follow, then those that stand out; empty for none."""
     clauses = [fault_in_words(each) for each in facts.not_following[:NAMED]]
     if len(facts.not_following) > NAMED:
-        names = [formats.plain(each.joint) for each in facts.not_following[NAMED:]]
+        names = [plain(each.joint) for each in facts.not_following[NAMED:]]
         clauses.append(f"{', '.join(names)} do not follow either")
     by_joint: dict[str, list[StandOut]] = {}
     for each in facts.findings.stand_out:
         by_joint.setdefault(each.joint, []).append(each)
     for joint, several in list(by_joint.items())[:NAMED]:
         sizes = " and ".join(deviation_in_words(each) for each in several)
-        clauses.append(f"{formats.plain(joint)} responds differently from the others, {sizes}")
+        clauses.append(f"{plain(joint)} responds differently from the others, {sizes}")
     if len(by_joint) > NAMED:
-        names = [formats.plain(joint) for joint in list(by_joint)[NAMED:]]
+        names = [plain(joint) for joint in list(by_joint)[NAMED:]]
         clauses.append(f"{', '.join(names)} respond differently, too")
     undecided = _undecided(facts.findings, facts)
     if undecided:
@@ -189,7 +190,7 @@ def _named(facts: Facts) -> str:
 def _left_out(facts: Facts) -> str:
     """Driven joints that are neither compared nor named; empty where nothing was compared."""
     known = {*facts.findings.compared, *(each.joint for each in facts.not_following)}
-    names = [formats.plain(name) for name in facts.commanded if name not in known]
+    names = [plain(name) for name in facts.commanded if name not in known]
     if not names or not facts.findings.compared:
         return ""
     listed = ", ".join(names[:NAMED])
@@ -352,11 +353,11 @@ def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
         first = min(lags, key=lambda joint: joint.lag_rad.value or 0.0)
         last = max(lags, key=lambda joint: joint.lag_rad.value or 0.0)
         text += "; lag runs from " + " to ".join(
-            f"{formats.number(math.degrees(j.lag_rad.value or 0.0), 1)}° ({formats.plain(j.name)})"
+            f"{formats.number(math.degrees(j.lag_rad.value or 0.0), 1)}° ({plain(j.name)})"
             for j in (first, last)
         )
     evidence = [
-        f" {formats.plain(each.joint)} {each.evidence}."
+        f" {plain(each.joint)} {each.evidence}."
         for each in facts.not_following[:NAMED]
         if each.kinds != ("lost_samples",)
     ]
@@ -364,7 +365,7 @@ def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
 
 
 def _caveat(joints: Sequence[JointResult]) -> str:
-    named = [f"{formats.plain(j.name)} ({', '.join(j.flags)})" for j in joints if j.flags]
+    named = [f"{plain(j.name)} ({', '.join(j.flags)})" for j in joints if j.flags]
     if not named:
         return ""
     more = f" and {len(named) - _FLAGGED} more" if len(named) > _FLAGGED else ""

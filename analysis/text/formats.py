@@ -11,6 +11,8 @@ import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
 
+from capture.console import plain
+
 from ..results.analysis import Estimate, GaitFacts, Interval
 
 MISSING = "\N{EN DASH}"
@@ -279,22 +281,6 @@ def utc(time_ns: int) -> str:
     return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
 
 
-def plain(text: str) -> str:
-    """Text without characters that neither XML nor a reader can do anything with.
-
-    Args:
-        text: From a log: joint names, link names, warnings.
-
-    Returns:
-        Control characters and lone surrogates become the replacement character; escaping is
-        left to whoever writes the markup.
-    """
-    return "".join(
-        c if c in "\t\n" or (c >= " " and not _forbidden(ord(c))) else "\N{REPLACEMENT CHARACTER}"
-        for c in text
-    )
-
-
 def short(text: str, most: int = 40) -> str:
     """Text that has to fit into a figure.
 
@@ -348,8 +334,3 @@ def capital(text: str) -> str:
     if first.endswith(":") or any(c in "._/\\" or c.isdigit() for c in first):
         return text
     return text[:1].upper() + text[1:]
-
-
-def _forbidden(code: int) -> bool:
-    """Code points outside the Char production of XML 1.0, and the C1 controls."""
-    return 0x7F <= code <= 0x9F or 0xD800 <= code <= 0xDFFF or code in (0xFFFE, 0xFFFF)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from capture.console import plain
+
 from ..results.analysis import Analysis, Estimate
 from ..results.energy import EnergyResult
 from . import formats
@@ -39,7 +41,7 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
         times = ", ".join(spans) + (f" and {more} more" if more > 0 else "")
         note = f" ({one.note})" if one.note else ""
         where = f"{one.quantity} on {one.topic}" if one.topic else one.quantity
-        about = f"{formats.plain(one.joint)}, {where}: {one.flag}{note}"
+        about = f"{plain(one.joint)}, {where}: {one.flag}{note}"
         yield f"{_ABOUT[one.about]}: {about}{': ' if times else ''}{times}"
 
 
@@ -59,7 +61,7 @@ def _dead_bands(analysis: Analysis) -> Iterator[str]:
         where = "both reversals" if len(ends) == 1 else "its upper and lower reversal"
         lag = math.degrees(band.lag_change_rad)
         yield (
-            f"Dead band: {formats.plain(joint.name)}, {band.kind} ({band.evidence}): at {where} "
+            f"Dead band: {plain(joint.name)}, {band.kind} ({band.evidence}): at {where} "
             f"the command travels {widths} before the joint moves and catches up by {steps}; "
             f"of gain and lag the dead band alone makes {band.gain_change:.3f} and {lag:.1f}°"
         )

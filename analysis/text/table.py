@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from capture.console import plain
 
 from ..command_line import UNLIMITED
 from ..null_model.result import ModelledAnalysis, told_null
@@ -45,9 +47,15 @@ def sheet(width: int, *, color: bool) -> tuple[StringIO, Console, Console]:
 
     text = StringIO()
 
+    class Sheet(Console):
+        """A console for sentences and tables with names from logs, each sentence one line."""
+
+        def print(self, *objects: Any, **how: Any) -> None:
+            super().print(*(plain(o) if isinstance(o, str) else o for o in objects), **how)
+
     def console(columns: int) -> Console:
         system = "standard" if color else None
-        return Console(
+        return Sheet(
             file=text, width=columns, color_system=system, force_terminal=color, highlight=False
         )
 
@@ -66,6 +74,7 @@ def put(prose: Console, wide: Console, table: Table, spare: Sequence[tuple[str, 
     from rich.measure import Measurement
 
     left: list[str] = []
+    table = _without(table, ())  # with its names escaped
     for names in spare:
         if Measurement.get(wide, wide.options, table).maximum <= prose.width:
             break
@@ -78,15 +87,15 @@ def put(prose: Console, wide: Console, table: Table, spare: Sequence[tuple[str, 
 
 
 def _without(table: Table, names: tuple[str, ...]) -> Table:
-    """A table without the columns of those headings."""
+    """A table without the columns of those headings, its names fit for a terminal."""
     from rich.table import Table
 
     fewer = Table(box=None, pad_edge=False, header_style="bold")
     kept = [column for column in table.columns if column.header not in names]
     for column in kept:
-        fewer.add_column(column.header, justify=column.justify, no_wrap=column.no_wrap)
+        fewer.add_column(plain(str(column.header)), justify=column.justify, no_wrap=column.no_wrap)
     for row, *cells in zip(table.rows, *(column.cells for column in kept), strict=True):
-        fewer.add_row(*cells, style=row.style)
+        fewer.add_row(*(plain(str(cell)) for cell in cells), style=row.style)
     return fewer
 
 

@@ -10,6 +10,7 @@ from textwrap import wrap
 
 from rich.text import Text
 
+from ..console import plain
 from ..log.diagnostics import ERROR, OK
 from ..log.health import has_rhythm
 from .amounts import format_size
@@ -110,7 +111,7 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
         parts.append(snapshot.trouble)
     if snapshot.reasons:
         parts.append(snapshot.reasons[0] + _more(len(snapshot.reasons) - 1))
-    return "; ".join(parts)
+    return plain("; ".join(parts))
 
 
 def event_line(event: EventLine) -> str:
@@ -119,7 +120,7 @@ def event_line(event: EventLine) -> str:
     Args:
         event: The event.
     """
-    return f"{event.level}: {event.name}: {event.text}"
+    return plain(f"{event.level}: {event.name}: {event.text}")
 
 
 def clock_time(time_s: float) -> str:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from rich.text import Text
 
+from ..console import plain
+
 Cells = list[tuple[str, str]]
 """Text and style of each cell of a row."""
 
@@ -85,11 +87,11 @@ def fit(text: str, width: int) -> str:
 
 
 def cut(text: str, width: int) -> str:
-    """Text without control characters, no longer than there is room.
+    """Text with control characters escaped, no longer than there is room.
 
     Args:
         text: Any text; a device may have put anything into it.
         width: Characters.
     """
-    clean = "".join(letter if letter.isprintable() else "?" for letter in text)
+    clean = "".join(c if c.isprintable() else " " for c in plain(text))  # odd spaces
     return clean if len(clean) <= width else clean[: max(width - 1, 0)] + "…"

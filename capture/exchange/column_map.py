@@ -22,7 +22,6 @@ or the same as options, ``time=time:s`` and
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +31,7 @@ from ..errors import Fault, FaultyFileError, UsageError
 from ..input_file import read_input
 from ..robot import Quantity, Robot
 from ..robot.bus_map import JOINT_QUANTITIES
-from ..strict_table import Faults, Table, listed
+from ..strict_table import Faults, Table, listed, read_toml
 from ..units import TIME_UNITS, unit_for, valid_units
 
 _DELIMITERS = (",", ";", "\t", " ")
@@ -108,8 +107,8 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
         FaultyFileError: If it has faults; lists all of them.
     """
     try:
-        values = tomllib.loads(read_input(path).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        values = read_toml(read_input(path).decode("utf-8"))
+    except ValueError as error:
         raise FaultyFileError(path, [Fault("syntax", str(error), "TOML 1.0")]) from error
     column_map, faults = _parse(values, robot)
     if faults:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import UsageError
 from capture.interruption import interruptible
 
@@ -114,12 +114,12 @@ def replay(
     if json:
         emit_json(_reported(again, changes))
     else:
-        print("\n".join(_told(again)))
+        say(*_told(again))
         comparison = again.comparison
         if comparison is not None and not (again.same and again.same.exact):
             _show(comparison)
         comparable = comparison is not None
-        print(what_next(file, again.recording.path, comparable=comparable))
+        say(what_next(file, again.recording.path, comparable=comparable))
     return 0
 
 
@@ -128,7 +128,7 @@ def _show(comparison: Comparison) -> None:
     from analysis.command_line import show
     from analysis.compare.table import render_comparison
 
-    print()
+    say("")
     show(lambda width, color: render_comparison(comparison, width=width, color=color), None)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from analysis.compare.result import Comparison
 from capture import Session, load_robot
-from capture.console import emit_json
+from capture.console import emit_json, say
 from capture.errors import UsageError
 from sim.drive.bus_cli import drive_armed, drive_on_bus
 from sim.drive.driven import find_driven
@@ -86,10 +86,10 @@ def replay_on_bus(
         told = None if comparison is None else comparison.to_dict()
         emit_json({"original": str(file), **run.facts(), "comparison": told, "not_compared": why})
     else:
-        print("\n".join(run.lines()))
+        say(*run.lines())
         if comparison is not None:
             show(comparison)
         elif run.complete:
-            print(f"Not compared: {why}")
-        print(what_next(file, run.plan.output, comparable=comparison is not None))
+            say(f"Not compared: {why}")
+        say(what_next(file, run.plan.output, comparable=comparison is not None))
     return run.complain()

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from capture.console import emit_json, progress
+from capture.console import emit_json, progress, say
 from capture.interruption import interruptible
 
 from .. import viewer
@@ -58,7 +58,7 @@ def view_beside(
             )
         _report(beside, how, place, saved=save is not None, json=json)
         if web:
-            viewer.serve(path, lambda address: print(address, flush=True))
+            viewer.serve(path, say)
         elif save is None:
             viewer.show(path)
 
@@ -76,11 +76,11 @@ def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool
         return
     first, *others = [one.side for one in beside.shown]
     for other in others:
-        print(f"{words.answer(first, other, beside.found[other.name])}.")
+        say(f"{words.answer(first, other, beside.found[other.name])}.")
     if saved:
-        print(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
+        say(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
     for warning in beside.warnings:
-        print(f"note: {warning}")
+        say(f"note: {warning}")
 
 
 def _facts(beside: Beside, how: Align, place: Place, size: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from analysis.compare.changes import changes
 from analysis.compare.result import Change, Comparison
 from analysis.text.formats import short, utc
 
+from ..facts import code, escaped
 from .alignment import Align
 from .side import COMPARED, Side
 
@@ -98,12 +99,14 @@ def markdown(
         Markdown.
     """
     first, *others = sides
-    parts = [f"**{answer(first, other, found[other.name])}.**" for other in others]
+    parts = [f"**{escaped(answer(first, other, found[other.name]))}.**" for other in others]
     parts.append(_table(sides))
     parts += [_changes(first, other, found[other.name].changed) for other in others]
     told = dict.fromkeys(notes)
     if told:
-        parts.append("\n".join(["Placed and assumed:", "", *(f"- {note}" for note in told)]))
+        parts.append(
+            "\n".join(["Placed and assumed:", "", *(f"- {escaped(note)}" for note in told)])
+        )
     drawn = [_ALIGNED[how], legend]
     if has_cycles:
         drawn.append("On `gait_cycle` one second is one cycle of the gait, for all sessions alike.")
@@ -121,19 +124,20 @@ def _table(sides: Sequence[Side]) -> str:
         lasts = f"{(side.end_ns - side.start_ns) * 1e-9:.1f} s"
         recorded, verdict = utc(side.start_ns), side.verdict or "none"
         rows.append(
-            f"| {side.name} | `{side.session_id}` | {robot}, {len(side.joints)} joints | {lasts} | "
-            f"{recorded} | {verdict} |"
+            f"| {escaped(side.name)} | {code(side.session_id)} "
+            f"| {robot}, {len(side.joints)} joints | {lasts} | {recorded} | {escaped(verdict)} |"
         )
     return "\n".join(rows)
 
 
 def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
     if not changed:
-        return f"{other.name} says of itself what {first.name} does: nothing was changed."
-    lines = [f"What was changed ({first.name}, then {other.name}):", ""]
+        said = f"{other.name} says of itself what {first.name} does: nothing was changed."
+        return escaped(said)
+    lines = [escaped(f"What was changed ({first.name}, then {other.name}):"), ""]
     for one in changed[:_CHANGES]:
         before, after = ("not set" if side is None else side for side in (one.a, one.b))
-        lines.append(f"- {one.name}: {before} → {after}")
+        lines.append("- " + escaped(f"{one.name}: {before} → {after}"))
     if len(changed) > _CHANGES:
         lines.append(f"- and {len(changed) - _CHANGES} more, which `undulog compare` lists")
     return "\n".join(lines)

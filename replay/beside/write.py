@@ -14,12 +14,12 @@ from rerun.chunk import LazyChunkStream
 
 from analysis.compare.compare import Choices, compare_seen
 from analysis.compare.side import Seen
-from capture.errors import LogWriteError, UndulogError
+from capture.errors import UndulogError
 from capture.interruption import StopRequest
 from capture.part_file import check_stop, part_file
 
 from ..plots.joints import log_scalars
-from ..rrd import APPLICATION, Recording, recording_id, require_whole
+from ..rrd import APPLICATION, Recording, recording_id, require_whole, rerun_writes
 from ..samples.sampling import decimate
 from ..samples.tracks import Track
 from ..views import body_title
@@ -125,15 +125,12 @@ def write_beside(
     placements = _placements(sessions, how, place, told)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
-    with part_file(path) as draft:
+    with part_file(path) as draft, rerun_writes(path):
         rec = rr.RecordingStream(APPLICATION, recording_id=identity, send_properties=False)
         try:
             rec.set_log_time_enabled(False)
             rec.set_log_tick_enabled(False)
-            try:
-                rec.save(draft)
-            except (RuntimeError, OSError) as error:
-                raise LogWriteError(path, f"can't be written: {error}") from error
+            rec.save(draft)
             rec.send_recording_name(", ".join(names))
             rec.send_recording_start_time_nanos(sides[0].start_ns)
             check_stop(path, stop)

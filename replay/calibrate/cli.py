@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import UsageError
 from capture.interruption import interruptible
 from capture.part_file import check_stop
@@ -91,12 +91,12 @@ def fit(
         paths = {"robot": str(output), "scenario": None if scenario is None else str(scenario)}
         emit_json({**reported(calibration), "written": paths})
         return 0
-    print("\n".join(told(calibration)))
-    print(f"{output}: the robot with the fitted servo")
+    say(*told(calibration))
+    say(f"{output}: the robot with the fitted servo")
     if scenario is not None:
-        print(f"{scenario}: the scenario with the fitted ground, on that robot")
+        say(f"{scenario}: the scenario with the fitted ground, on that robot")
     elif calibration.scenario.world.ground is not None:
-        print("The ground's friction belongs to a scenario: --scenario FILE writes one.")
+        say("The ground's friction belongs to a scenario: --scenario FILE writes one.")
     return 0
 
 

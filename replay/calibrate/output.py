@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import tomlkit
 
+from capture.console import plain
 from capture.errors import DataError
 from capture.part_file import part_file, write_text
 from capture.robot import Robot
@@ -51,7 +52,7 @@ def robot_text(calibration: Calibration) -> str:
     for key, value in vars(shared).items():
         if servo.get(key) != value:  # what was not fitted stays as it was written
             servo[key] = value
-    head = [f"# {robot.name}, its servo fitted to {Path(calibration.session).name}."]
+    head = [f"# {robot.name}, its servo fitted to {plain(Path(calibration.session).name)}."]
     if calibration.lack.found:
         head.append("# The twin does not fit that session: what follows has no interval.")
     for one in calibration.parameters:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import MissingExtraError, UsageError
 from capture.interruption import interruptible
 
@@ -133,9 +133,9 @@ def _report(clip: Path, shot: Shot, frames: int, recording: Recording, *, json: 
     if json:
         emit_json(facts)
         return
-    print(
+    say(
         f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {shot.size[0]}x{shot.size[1]}, "
         f"{facts['bytes'] / 1e6:.2f} MB"
     )
     for warning in recording.warnings:
-        print(f"note: {warning}")
+        say(f"note: {warning}")

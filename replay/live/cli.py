@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from capture.console import emit_json
+from capture.console import complain, emit_json, say
 
 if TYPE_CHECKING:
     from .relay import RelayReport
@@ -41,7 +40,7 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
     elif connect is not None:
         report = relay_to_viewer(path, None, connect)
     elif web:
-        with open_server(lambda address: print(address, flush=True)) as server:
+        with open_server(say) as server:
             report = relay_to_viewer(path, server, server.address)
     else:
         with open_window() as window:
@@ -56,18 +55,16 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
 
 def _leave(complaint: str) -> NoReturn:
     """End the process at once: Rerun would wait at its end for a viewer that takes nothing."""
-    sys.stdout.flush()
-    sys.stderr.write(f"error: {complaint}\n")
-    sys.stderr.flush()
+    complain(f"error: {complaint}")
     os._exit(1)
 
 
 def _tell(report: RelayReport, save: Path | None) -> None:
     where = f"{save}: " if save is not None else ""
     late = "" if report.lag_s is None else f", {report.lag_s[0] * 1e3:.0f} ms late (median)"
-    print(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")
+    say(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")
     if report.unread:
-        print(f"note: {report.unread} messages could not be read")
+        say(f"note: {report.unread} messages could not be read")
 
 
 def _facts(report: RelayReport, save: Path | None) -> dict[str, Any]:

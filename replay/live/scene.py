@@ -24,9 +24,9 @@ from ..content import (
     signal_title,
 )
 from ..drawing import palette_of, start_of
-from ..facts import log_facts
+from ..facts import code, escaped, log_facts
 from ..plots import gait, joints, power
-from ..samples.quantities import DRAWN, SIGNALS
+from ..samples.quantities import DRAWN, SIGNALS, topic_entity
 from ..samples.sampling import hold
 from ..samples.timeline import Clock
 from ..samples.tracks import Track
@@ -241,7 +241,7 @@ class LiveScene:
             names = [track.name for track in self._window.tracks(topic)]
             self._of_joints[topic] = bool(set(names) & set(palette))
             colors = palette if self._of_joints[topic] else joints.joint_palette(names)
-            plot = self._signals.setdefault(topic, LivePlot(f"{SIGNALS}{topic}"))
+            plot = self._signals.setdefault(topic, LivePlot(topic_entity(SIGNALS, topic)))
             plot.write(self._rec, self._clock, tracks, colors)
 
     def _draw_words(self, batch: Batch) -> None:
@@ -364,7 +364,7 @@ class LiveScene:
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         facts = [
-            f"`{self._session_id}`",
+            code(self._session_id),
             "no robot description"
             if robot is None
             else f"{robot.name}, {len(robot.joints)} joints",
@@ -377,7 +377,7 @@ class LiveScene:
             notes.append(f"{dropped} messages were not shown here; what is recorded is not touched")
         parts = [f"**{'Recorded.' if ended else 'Recording.'}**", " · ".join(facts)]
         if notes:
-            parts.append("\n".join(f"- {note}" for note in notes))
+            parts.append("\n".join(f"- {escaped(note)}" for note in notes))
         legend = f"{body_title(replace(content, live=False))}. Grey is commanded."
         if content.charts:
             legend += " Bars are the last whole cycle of the gait."

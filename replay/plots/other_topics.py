@@ -18,8 +18,9 @@ from capture.errors import DataError
 from capture.log.topics import Channel
 
 from ..content import Signal
+from ..samples.quantities import topic_entity
 from ..samples.sampling import mark_gaps, ordered
-from ..samples.stretches import STRETCH_NS
+from ..samples.stretches import stretch_length_ns
 from ..samples.timeline import Clock
 from ..samples.tracks import JOINT_STATE
 from .gait import EVENTS, changes
@@ -73,9 +74,7 @@ def log_others(
         if not lines:
             left_out.append(f"{topic} ({channel.type_name or channel.encoding})")
             continue
-        entity = f"{OTHERS}/" + "/".join(
-            rr.escape_entity_path_part(part) for part in topic.strip("/").split("/")
-        )
+        entity = topic_entity(OTHERS, topic)
         log_look(rec, entity, lines, joint_palette(lines))
         rec.flush()  # else what comes first in the file is chance
         for table in _tables(session, topic):
@@ -169,8 +168,9 @@ def _lines(session: Session, topic: str) -> tuple[str, ...]:
 
 def _tables(session: Session, topic: str) -> Iterator[Any]:
     """The topic's tables, stretch by stretch, those with rows."""
-    for start_ns in range(session.start_ns, session.end_ns + 1, STRETCH_NS):
-        table = session.table(topic, start_ns=start_ns, stop_ns=start_ns + STRETCH_NS)
+    length_ns = stretch_length_ns(session)
+    for start_ns in range(session.start_ns, session.end_ns + 1, length_ns):
+        table = session.table(topic, start_ns=start_ns, stop_ns=start_ns + length_ns)
         session.forget()
         if len(table):
             yield table

@@ -161,9 +161,9 @@ class Plots:
 
     @property
     def signals(self) -> dict[str, tuple[Series, ...]]:
-        """Topic to what is written of it, where it has no views of its own."""
+        """Entity of a topic to what is written of it, where it has no views of its own."""
         return {
-            entity.removeprefix(SIGNALS): plot.series
+            entity: plot.series
             for entity, plot in self._plots.items()
             if entity.startswith(f"{SIGNALS}/")
         }

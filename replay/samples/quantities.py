@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import rerun as rr
+
 from ..plots.joints import (
     COMMANDED,
     ERROR,
@@ -21,6 +23,20 @@ DRAWN = {"/joint_states", "/joint_commands", "/gait"}
 """JointState topics that have views of their own."""
 
 SIGNALS = "/signals"
+
+
+def topic_entity(root: str, topic: str) -> str:
+    """Where a topic goes.
+
+    Args:
+        root: E.g. ``/signals``.
+        topic: Any name; it may come from a foreign bag.
+
+    Returns:
+        The path of its entity, each part escaped, and empty ones left out.
+    """
+    parts = (rr.escape_entity_path_part(part) for part in topic.split("/") if part)
+    return "/".join((root, *parts))
 
 
 def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
@@ -47,7 +63,7 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
         if whole is not None:
             found[f"{TOTAL}/{kind}"] = (whole,)
     found |= {
-        f"{SIGNALS}{topic}": tracks
+        topic_entity(SIGNALS, topic): tracks
         for (topic, field), tracks in columns.items()
         if topic not in DRAWN and field == "position"
     }

@@ -15,6 +15,13 @@ from .tracks import Columns, read_columns
 STRETCH_NS = 40_000_000_000
 """About how long a stretch is [ns]: at 100 Hz its rows are one chunk of the recording."""
 
+_LEAST_STRETCHES = 200
+"""A session may always have so many stretches: more than two hours have."""
+_LEAST_MESSAGES = 100
+"""Mean messages in a stretch, at least, where there are more."""
+_READ_AGAIN = 8
+"""How many stretches a chunk may be read for, in the mean, where there are more."""
+
 _FIRST_NS, _LAST_NS = -(1 << 62), 1 << 62
 
 
@@ -73,8 +80,8 @@ def stretches(
         The stretches in order; every sample is in the span of exactly one.
     """
     start_ns = session.start_ns
-    length_ns = max(STRETCH_NS, 4 * context_ns)
-    count = max(1, round((session.end_ns - start_ns) / length_ns))
+    length_ns = stretch_length_ns(session, 4 * context_ns)
+    count = _count(session, length_ns)
     for i in range(count):
         low = start_ns + i * length_ns if i else None
         high = start_ns + (i + 1) * length_ns if i + 1 < count else None
@@ -88,3 +95,39 @@ def stretches(
         span = Span(_FIRST_NS if low is None else low, _LAST_NS if high is None else high, known_ns)
         session.forget()
         yield Stretch(span, columns)
+
+
+def stretch_length_ns(session: Session, least_ns: int = 0) -> int:
+    """Length of the stretches that a session is read in.
+
+    Args:
+        session: The session.
+        least_ns: Shortest length wanted [ns].
+
+    Returns:
+        :data:`STRETCH_NS` or more [ns]: with shorter ones, a session whose clock jumps would have
+        millions of empty stretches.
+    """
+    length_ns = max(STRETCH_NS, least_ns)
+    while _laborious(session, length_ns):
+        length_ns *= 2
+    return length_ns
+
+
+def _count(session: Session, length_ns: int) -> int:
+    return max(1, round((session.end_ns - session.start_ns) / length_ns))
+
+
+def _laborious(session: Session, length_ns: int) -> bool:
+    """Whether most stretches are empty, or chunks are read again for many of them.
+
+    So it is where the clock jumps in the session.
+    """
+    count = _count(session, length_ns)
+    messages = sum(channel.count for channel in session.channels.values())
+    if count > max(_LEAST_STRETCHES, messages // _LEAST_MESSAGES):
+        return True
+    first_ns, last_ns = session.chunk_times_ns
+    length = np.uint64(length_ns)
+    read = int((last_ns // length - np.minimum(first_ns, last_ns) // length).sum()) + len(last_ns)
+    return count > 1 and read > _LEAST_STRETCHES + _READ_AGAIN * len(last_ns)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from typing import Any
 
 import rerun as rr
 from rerun.components import FillMode
 
 from capture import Session
-from capture.strict_table import Faults, Table
+from capture.strict_table import Faults, Table, read_toml
 from sim.world import Box, Cylinder, Obstacle, Target, Wall, World
 from sim.world.toml import read_world
 
@@ -37,8 +36,8 @@ def world_of(session: Session, warnings: list[str]) -> World | None:
     if data is None:
         return None
     try:
-        values: dict[str, Any] = tomllib.loads(data.decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        values: dict[str, Any] = read_toml(data.decode())
+    except ValueError as error:
         warnings.append(f"the attached scenario can't be read, obstacles are not drawn: {error}")
         return None
     faults = Faults()

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from capture import Session
-from capture.console import progress
+from capture.console import progress, say
 from capture.interruption import interruptible
 
 from .. import viewer
@@ -48,7 +48,7 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         stack.enter_context(process)
         if page:
             process.wait_until_it_listens()
-            print(page, flush=True)
+            say(page)
         # Rerun would tell a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
         from .apart import Analysing
@@ -63,9 +63,9 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return
-        print(f"{file}: {session.duration_s:.1f} s, all of it in the viewer", flush=True)
+        say(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
         for note in notes:
-            print(f"note: {note}", flush=True)
+            say(f"note: {note}")
         process.wait(stop)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from capture.console import complain, say
 from capture.errors import UsageError
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ class _Report:
 
     def events(self, events: Iterable[SourceEvent]) -> None:
         for event in events:
-            sys.stderr.write(f"{event.level}: {event.text}\n")
+            complain(f"{event.level}: {event.text}")
 
     def ready(self, address: tuple[str, int] | None, epoch_ns: int) -> None:
         plan = self._plan
@@ -210,8 +210,7 @@ class _Report:
         self._say(facts, _told(self._plan, served, bus, sender))
 
     def _say(self, facts: dict[str, Any], lines: list[str]) -> None:
-        sys.stdout.write((dumps(facts) if self._json else "\n".join(lines)) + "\n")
-        sys.stdout.flush()
+        say(*([dumps(facts)] if self._json else lines))
 
 
 def _told(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:

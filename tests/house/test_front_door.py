@@ -40,6 +40,15 @@ def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys: pytest.CaptureFi
     assert "Did you mean 'analyse'?" in said
 
 
+@pytest.mark.parametrize("words", [["--bogus"], ["-x", "analyse"], ["log", "--bogus"]])
+def test_an_unknown_option_is_named_and_exits_2(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert undulog.run(words) == 2
+    option = next(word for word in words if word.startswith("-"))
+    assert f"there is no option '{option}'" in capsys.readouterr().err
+
+
 def test_a_missing_argument_exits_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert undulog.run(["log", "info"]) == 2
     assert "FILE" in capsys.readouterr().err
@@ -86,3 +95,15 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path: Path) -> N
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "5 CAN frames" in done.stdout
+
+
+@pytest.mark.parametrize("words", ["--help", "info --json", "sim list"])
+def test_a_full_device_behind_the_output_is_an_error(words: str) -> None:
+    command = [sys.executable, "-m", "undulog", *words.split()]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+        silent = subprocess.run(command, cwd=ROOT, stdout=full, stderr=full, check=False)
+    assert (done.returncode, silent.returncode) == (1, 1)
+    assert done.stderr == "error: the output can't be written: No space left on device\n"

@@ -70,6 +70,54 @@ def there(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"run": folder / "run.mcap", "csv": folder / "a.csv"}
 
 
+@pytest.mark.parametrize("kind", ["empty", "several", "rosbag2", "rosbag2 of sqlite3"])
+@pytest.mark.parametrize("line", LINES)
+def test_a_folder_that_is_no_session_is_named_with_the_fix(
+    line: str,
+    kind: str,
+    there: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name in ("a.mcap", "b.mcap") if kind in ("several", "rosbag2") else ():
+        (folder / name).write_bytes(there["run"].read_bytes())
+    if kind.startswith("rosbag2"):
+        (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    suffix = re.search(r"\{no\}(\.\w+)", line)
+    assert suffix is not None
+    words = line.replace("{no}" + suffix[1], str(folder))
+    given = {"out": tmp_path / "out", **there}
+    assert undulog.run(shlex.split(words.format_map(given))) in (1, 2)
+    said = capsys.readouterr().err
+    assert str(folder) in said
+    if suffix[1] == ".mcap" and not line.startswith("drive"):
+        fixes = {"empty": "name a session's file", "several": "name one: a.mcap, b.mcap"}
+        fixes |= {"rosbag2": "undulog log merge", "rosbag2 of sqlite3": "ros2 bag convert"}
+        assert fixes[kind] in said
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "analyse {folder}",
+        "report {folder} -o {out}.html",
+        "compare {folder} {run}",
+        "view {folder} --save {out}.rrd",
+        "plan lag-sweep --like {folder} -o {out}",
+    ],
+)
+def test_a_folder_of_one_session_is_that_session(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    record(load_scenario("flat").changed(duration_s=12.0), folder / "run.mcap")
+    words = {"folder": folder, "out": tmp_path / "out", "run": folder / "run.mcap"}
+    assert undulog.run(shlex.split(line.format_map(words))) == 0, capsys.readouterr().err
+
+
 def test_every_verb_is_here() -> None:
     tried = {max((v for v in undulog.VERBS if line.startswith(v)), key=len) for line in LINES}
     assert tried == set(undulog.VERBS) - WITHOUT_FILES

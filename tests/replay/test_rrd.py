@@ -160,6 +160,13 @@ def test_a_folder_that_is_not_there_is_an_error(session_file, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_full_disk_is_an_error_and_leaves_nothing(session_file, disk_of):
+    disk = disk_of("64k")
+    with Session.open(session_file) as session, pytest.raises(LogWriteError, match="can't be wr"):
+        write_recording(session, disk / "run.rrd")
+    assert list(disk.iterdir()) == []
+
+
 def test_a_file_cut_short_by_a_full_disk_is_an_error(session_file, tmp_path, monkeypatch):
     import rerun as rr
 

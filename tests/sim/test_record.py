@@ -278,21 +278,35 @@ def test_two_processes_write_the_same_bytes(tmp_path):
     assert first == second
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_killed_run_leaves_a_whole_session(tmp_path, number):
-    path = tmp_path / "killed.mcap"
+def long_run(path):
+    """A run of an hour that has begun to write."""
     process = subprocess.Popen(
         [*UNDULOG, "sim", "run", "flat", "-o", str(path), "--duration", "3600"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
+    part = path.with_name(f"{path.name}.part")
     deadline = time.monotonic() + 60
-    while not (path.exists() and path.stat().st_size > 0):
+    while not (part.exists() and part.stat().st_size > 0):
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < deadline
         time.sleep(0.05)
     time.sleep(1.0)
+    return process
+
+
+def test_a_run_that_is_killed_leaves_no_session_under_its_name(tmp_path):
+    process = long_run(tmp_path / "killed.mcap")
+    process.kill()
+    process.communicate()
+    assert [path.name for path in tmp_path.iterdir()] == ["killed.mcap.part"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_run_leaves_a_whole_session(tmp_path, number):
+    path = tmp_path / "killed.mcap"
+    process = long_run(path)
     process.send_signal(number)
     told, complained = process.communicate(timeout=60)
     assert process.returncode == 1
@@ -371,6 +385,17 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, capsys, name):
     # All samples from before the failure, none from after it, and all of them sound.
     assert times == math.floor(float(found[1]) * 100 - 1e-6) + 1
     assert np.abs(angles).max(initial=0.0) < np.pi
+
+
+def test_a_full_disk_leaves_nothing_and_no_traceback(disk_of):
+    disk = disk_of("400k")
+    words = ["sim", "run", "flat", "-o", str(disk / "run.mcap"), "--duration", "60"]
+    done = subprocess.run([*UNDULOG, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "run.mcap" in done.stderr
+    assert "No space left" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(disk.iterdir()) == []
 
 
 def test_nothing_is_overwritten_unasked(tmp_path, scenario):

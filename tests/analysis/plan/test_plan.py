@@ -1,6 +1,7 @@
 """Plans: the commands that are written, read back as the experiment they are for."""
 
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -122,3 +123,22 @@ def test_what_is_refused(like, tmp_path, capsys):
     assert capsys.readouterr().out.startswith(f"{folder}: phase-kicks, 25 runs of 2 s")
     assert undulog.run([*words, *short]) != 0
     assert "exists" in capsys.readouterr().err
+
+
+def test_a_folder_that_can_not_be_written_is_an_error(like, tmp_path, disk_of, capsys):
+    words = ["plan", "phase-kicks", "--like", str(like), "--settle", "1", "--measure", "1", "-o"]
+    (tmp_path / "file").write_text("")
+    disk = disk_of("1m")
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    for folder in (tmp_path / "file", tmp_path / "file" / "below", disk, disk / "below"):
+        assert undulog.run([*words, str(folder)]) == 1
+        complaint = capsys.readouterr().err
+        assert complaint.startswith(f"error: {folder}")
+        assert "can't be written" in complaint or "no folder for the plan" in complaint
+
+
+def test_a_full_disk_ends_a_plan(like, disk_of, capsys):
+    disk = disk_of("200k")
+    assert undulog.run(["plan", "phase-kicks", "--like", str(like), "-o", str(disk)]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert not list(disk.glob("*.part"))
