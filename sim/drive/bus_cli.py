@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from capture.console import emit_json, progress
+from capture.console import complain, emit_json, progress, say
 from capture.daemon.control_socket import find_sockets
 from capture.errors import UsageError
 from capture.interruption import interruptible
@@ -83,7 +82,7 @@ class ArmedRun:
         if self.complete:
             return 0
         outcome = self.report.outcome
-        sys.stderr.write(f"error: {outcome.why}; {outcome.ended}\n")
+        complain(f"error: {outcome.why}; {outcome.ended}")
         return 1
 
 
@@ -200,7 +199,7 @@ def drive_on_bus(
     if as_json:
         emit_json(run.facts())
     else:
-        print("\n".join(run.lines()))
+        say(*run.lines())
     return run.complain()
 
 

@@ -5,10 +5,48 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..gate.gate import Remark
 from ..gate.lateness import Jitter
 from ..gate.outcome import How, Outcome
+from ..gate.tick import Remark
 from .loop import LoopTally
+
+UNASKED = "joints were received more often than asked: commands are not confirmed by replies"
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """What supervises a drive in real time.
+
+    Attributes:
+        by_replies: Whether commands are confirmed by replies to requests.
+        reply_interval_s: Reply interval of the bus, measured before arming [s].
+        hold_after_ticks: After so many control ticks without a joint the servos hold.
+        period_s: Control period [s].
+    """
+
+    by_replies: bool
+    reply_interval_s: float
+    hold_after_ticks: int
+    period_s: float
+
+    @property
+    def most_steps(self) -> int:
+        """So many steps of a joint may be on their way: `max_rate` times a period each."""
+        return 1 if self.by_replies else self.hold_after_ticks + 1
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "confirmed_by": "replies" if self.by_replies else None,
+            "reply_interval_s": self.reply_interval_s,
+            "hold_after_ticks": self.hold_after_ticks,
+            "hold_after_s": self.hold_after_ticks * self.period_s,
+            "most_steps": self.most_steps,
+        }
+
+    def facts(self) -> dict[str, str]:
+        """For a session's metadata."""
+        return {name: str(value or "nothing") for name, value in self.to_dict().items()}
 
 
 @dataclass
@@ -28,6 +66,8 @@ class BusReport:
         longest_wait_s: The longest of these waits [s].
         malformed: Messages of the bus that could not be read.
         dropped: Frames that came and were not fetched in time.
+        held_s: How long nothing was sent as the bus was silent [s].
+        feedback: What supervised it; None where the robot set the pace, or it was never armed.
         wall_s: How long it took.
         first_frames: The commands of the first tick, as candump writes frames.
         told: Samples of the gait that the recorder took.
@@ -46,6 +86,8 @@ class BusReport:
     longest_wait_s: float = 0.0
     malformed: int = 0
     dropped: int = 0
+    held_s: float = 0.0
+    feedback: Feedback | None = None
     wall_s: float = 0.0
     first_frames: list[str] = field(default_factory=list[str])
     told: int = 0
@@ -112,6 +154,8 @@ def report_facts(report: BusReport) -> dict[str, Any]:
         "longest_wait_s": report.longest_wait_s,
         "malformed": report.malformed,
         "dropped": report.dropped,
+        "held_s": report.held_s,
+        "feedback": None if report.feedback is None else report.feedback.to_dict(),
         "changed": report.cuts,
         "lateness": None if report.jitter is None else report.jitter.to_dict(),
         "real_time_factor": tally.loop_s / max(report.wall_s, 1e-3),

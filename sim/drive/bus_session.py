@@ -16,10 +16,11 @@ from capture.log.frames import FrameArray
 from capture.log.wal_segment import require_space
 from capture.log.writer import SessionWriter
 from capture.robot import ClockDomain, Robot
+from capture.sources.contract import DEVICE_TIMES_END_NS
 
 from ..gait import GaitTick
-from ..gate.gate import Remark
 from ..gate.outcome import How, Outcome
+from ..gate.tick import Remark
 from ..session_log import GAIT_UNIT
 from .loop import BusTick
 
@@ -128,10 +129,13 @@ class BusSession:
         for frames in tick.received:
             self._frames.add(frames)
             newest = frames[-1]
+            if newest["t_device_ns"] >= DEVICE_TIMES_END_NS:
+                continue
             self._device_minus_host_ns = int(newest["t_device_ns"]) - int(newest["t_host_ns"])
         self._keep_sent(tick.sent)
         if tick.tick % _DECODE_TICKS == 0:
             self._frames.decode(self._now_ns, t_ns + 1)
+            self._say_faults()
         self._change("phase", self._phase, step.phase)
         for level, text in step.remarks:
             self._events.write(t_ns, level, _EVENTS_OF, text)
@@ -141,6 +145,10 @@ class BusSession:
             self._wanted.write(t_ns, step.wanted)
         if step.gait is not None:
             self._write_gait(step.gait, t_ns)
+
+    def _say_faults(self) -> None:
+        for text in self._frames.take_faults():
+            self.say("error", text)
 
     def _keep_sent(self, frames: FrameArray) -> None:
         """Keep what was sent, with the time on the device's clock as far as that is known."""
@@ -226,6 +234,7 @@ class BusSession:
         self._open = False
         try:
             self._frames.finish(self._now_ns)
+            self._say_faults()
         finally:
             self.writer.close()
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing
+from capture.console import emit_json, progress, refuse_existing, say
 from capture.errors import UsageError
 from capture.interruption import interruptible
 
@@ -123,7 +123,7 @@ def _on_twin(
     if as_json:
         emit_json(_reported(driven, scenario, recording, factor))
     else:
-        print("\n".join(_told(driven, scenario, recording, factor)))
+        say(*_told(driven, scenario, recording, factor))
     return 0
 
 

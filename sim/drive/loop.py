@@ -16,10 +16,12 @@ from capture.interruption import StopRequest
 from capture.log.frames import FrameArray, empty_frames
 from capture.robot import Direction, Quantity, Robot
 
+from ..gate.confirmation import Confirmation
 from ..gate.faults import FaultKind, GateFault
-from ..gate.gate import Gate, GateStep, Heard, Phase
+from ..gate.gate import Gate
 from ..gate.presence import Presence
 from ..gate.spacing import Spacing
+from ..gate.tick import GateStep, Heard, Phase
 from ..scenario import CONTROL_RATE_HZ
 from .console_watch import ConsoleWatch
 from .link import Link
@@ -35,7 +37,7 @@ class BusTick(NamedTuple):
         tick: Its number, from 0.
         step: What the gate had done.
         received: Frames that came by then.
-        sent: What was sent: requests, then commands; ``t_host_ns`` is when the bus had them.
+        sent: What was sent: commands, then requests; ``t_host_ns`` is when the bus had them.
     """
 
     tick: int
@@ -105,7 +107,14 @@ class ControlLoop:
     """One drive: a gate between a gait and a bus."""
 
     def __init__(
-        self, gate: Gate, robot: Robot, link: Link, pace: Pace, spacing: Spacing | None
+        self,
+        gate: Gate,
+        robot: Robot,
+        link: Link,
+        pace: Pace,
+        *,
+        spacing: Spacing | None,
+        confirmation: Confirmation | None,
     ) -> None:
         """Put it together.
 
@@ -116,6 +125,7 @@ class ControlLoop:
             pace: When the ticks are.
             spacing: How closely commands may follow each other; None where the robot sets the
                 pace, and all ticks are a period apart.
+            confirmation: What replies confirm; None where the robot sets the pace.
 
         Raises:
             DataError: If the robot has no bus.
@@ -126,6 +136,14 @@ class ControlLoop:
         self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
         self._presence = Presence(robot)
         self._polls = poll_frames(robot)
+        self._confirmation = confirmation if len(self._polls) else None
+        timeout_s = robot.safety.reply_timeout_s if robot.safety is not None else None
+        self._longest_pause = int((timeout_s or 0.0) * CONTROL_RATE_HZ / 3)
+
+    @property
+    def by_replies(self) -> bool:
+        """Whether commands are confirmed by replies to requests."""
+        return self._confirmation is not None and self._confirmation.by_replies
 
     def run(
         self,
@@ -159,7 +177,7 @@ class ControlLoop:
                 step = self._gate.step(
                     tick, heard, why_stop(stop, console_gone=gone), at_once=stop.again
                 )
-                sent = self._send(step)
+                sent = self._send(step, heard)
             except SourceError as error:
                 if not self.tally.commanded:
                     raise
@@ -179,7 +197,7 @@ class ControlLoop:
             raise failed
 
     def _hear(self, tick: int, received: Sequence[FrameArray]) -> Heard:
-        time_s, trouble = tick / CONTROL_RATE_HZ, None
+        time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._known.angles.copy()
         for frames in received:
             self._known.add(frames, time_s)
             found: GateFault | None = self._presence.add(frames)
@@ -188,32 +206,53 @@ class ControlLoop:
         self.tally.decoded = self._known.tally.decoded
         if self._pace.by_the_clock:
             self.tally.late_s.append(self._pace.late_s)
+        fresh, bounds = self._known.angles - before, None
+        if self._confirmation is not None:
+            last_ns = max((int(frames["t_host_ns"][-1]) for frames in received), default=0)
+            self._confirmation.receive(fresh, last_ns)
+            bounds = self._confirmation.bounds()
         return Heard(
             readings=self._known.readings(time_s),
             status=self._known.status(time_s),
             trouble=trouble,
             another_robot=self._presence.another_robot(),
             late_s=self._pace.late_s,
+            received=bool(fresh.any()),
+            expected=self._confirmation is None or not self._confirmation.pausing,
+            bounds=bounds,
         )
 
-    def _send(self, step: GateStep) -> FrameArray:
-        """Send the commands, and ask for the state where the robot doesn't tell it unasked."""
+    def _send(self, step: GateStep, heard: Heard) -> FrameArray:
+        """Send the commands, then ask for the state where the robot doesn't tell it unasked.
+
+        The requests follow the commands, so that a reply confirms these.
+        """
         if self._gate.phase is Phase.DONE and step.command is None:
             return empty_frames(0)
-        frames, earliest_ns = self._polls, None
+        frames, earliest_ns = empty_frames(0), None
         if step.command is not None:
-            commands = self._encoder.frames(step.command)
+            frames = self._encoder.frames(step.command)
             if self._spacing is not None:
-                earliest_ns = self._spacing.earliest_ns(step.command, len(commands))
-                earliest_ns = np.pad(earliest_ns, (len(frames), 0))
-            frames = np.concatenate([frames, commands])
+                earliest_ns = self._spacing.earliest_ns(step.command, len(frames))
+            if self._confirmation is not None:
+                if not self.tally.commanded:
+                    silence = self._gate.silence
+                    self._confirmation.arm(
+                        silence.interval or 1, silence.limit, self._longest_pause
+                    )
+                self._confirmation.send(step.command, heard.status.angle)
             self.tally.commanded = True
+        commands = len(frames)
+        if self._confirmation is None or self._confirmation.ask():
+            frames = np.concatenate([frames, self._polls])
         if not len(frames):
             return frames
+        if earliest_ns is not None:
+            earliest_ns = np.pad(earliest_ns, (0, len(frames) - commands))
         sent_ns = self._link.send(frames, earliest_ns)
         self.tally.sent += len(frames)
         if step.command is not None and self._spacing is not None:
-            self._spacing.sent(step.command, sent_ns[len(self._polls) :])
+            self._spacing.sent(step.command, sent_ns[:commands])
         stamped = frames.copy()
         stamped["t_host_ns"] = sent_ns
         return stamped

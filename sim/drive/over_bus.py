@@ -18,6 +18,7 @@ from capture.sources.contract import SourceAddress, SourceCounts
 from capture.sources.events import Tally
 
 from ..garbage import quick_collections
+from ..gate.confirmation import Confirmation
 from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate
 from ..gate.lateness import jitter
@@ -25,7 +26,7 @@ from ..gate.limits import GateLimits, gate_limits
 from ..gate.outcome import How, Outcome
 from ..gate.spacing import Spacing
 from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
-from .bus_report import BusReport, remarks_of
+from .bus_report import UNASKED, BusReport, Feedback, remarks_of
 from .bus_session import BusSession, stamped
 from .console_watch import ConsoleWatch
 from .driven import Driven
@@ -36,7 +37,8 @@ from .open_link import open_link
 from .pace import LockstepPace, WallPace
 
 LISTEN_S = 0.5
-"""A bus whose robot doesn't say its name is listened to for so long before anything is sent [s]."""
+"""A bus is listened to for so long before anything is sent [s]: whose it is, and how often joints
+report. A robot in lockstep has said its name, and waits for each command."""
 
 _NS = 1_000_000_000
 
@@ -189,12 +191,7 @@ def drive_bus(
         tally = Tally(clock.now_ns)
         link = open_link(plan.address, tally)
         opened.callback(link.close)
-        virtual = link if isinstance(link, VirtualRobotLink) else None
-        if virtual is not None and virtual.robot_name != robot.name:
-            raise UsageError(
-                f"{plan.address.text} is {virtual.robot_name}, and {plan.driven.name} is for "
-                f"{robot.name}; nothing was sent"
-            )
+        virtual = _virtual(link, plan)
         lockstep = virtual is not None and virtual.lockstep
         epoch_ns = Scenario.epoch_s * _NS if lockstep else clock.epoch_ns
         session = _session(plan, link, epoch_ns, gait.names)
@@ -218,15 +215,20 @@ def drive_bus(
             duration_s=plan.duration_s,
             rate_hz=CONTROL_RATE_HZ,
             place=plan.address.text,
-            listen_s=0.0 if virtual is not None else LISTEN_S,
+            listen_s=0.0 if lockstep else LISTEN_S,
         )
         pace = LockstepPace(virtual) if virtual and lockstep else WallPace(link, CONTROL_RATE_HZ)
         # In simulated time all ticks are a period apart, whenever they come.
-        spacing = None if lockstep else Spacing(plan.limits.rate, clock.now_ns)
-        loop = ControlLoop(gate, robot, link, pace, spacing)
+        spacing = confirmation = None
+        if not lockstep:
+            spacing = Spacing(plan.limits.rate, clock.now_ns)
+            period_s = 1.0 / CONTROL_RATE_HZ
+            confirmation = Confirmation(plan.limits.rate, period_s, clock.now_ns)
+        loop = ControlLoop(gate, robot, link, pace, spacing=spacing, confirmation=confirmation)
 
         def each_tick(tick: BusTick) -> None:
             tell.tick(tick)
+            tell.feedback(_feedback(gate, loop))
             if (shortage := session.shortage) is not None:  # it still takes what the ending is
                 gate.report(GateFault(FaultKind.LOG, shortage))
 
@@ -235,7 +237,7 @@ def drive_bus(
         try:
             tell.begin()
             loop.run(stop, each_tick, console)
-            report = _report(gate, loop.tally, spacing, tally.counts)
+            report = _report(gate, loop, spacing, tally.counts)
             tell.end(report)
             session.close()
         except LogWriteError as error:
@@ -251,6 +253,18 @@ def drive_bus(
             f"{teller.dropped} samples: the recorder was too slow" if teller.dropped else None
         )
     return report
+
+
+def _virtual(link: Link, plan: BusPlan) -> VirtualRobotLink | None:
+    """The bus, if it is the virtual robot's; None if it is any other."""
+    if not isinstance(link, VirtualRobotLink):
+        return None
+    if link.robot_name != plan.robot.name:
+        raise UsageError(
+            f"{plan.address.text} is {link.robot_name}, and {plan.driven.name} is for "
+            f"{plan.robot.name}; nothing was sent"
+        )
+    return link
 
 
 def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -> BusSession:
@@ -288,20 +302,30 @@ def _unwritten(
     return LogWriteError(error.path, "; ".join(said))
 
 
-def _report(gate: Gate, tally: LoopTally, spacing: Spacing | None, bus: SourceCounts) -> BusReport:
+def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:
+    """What supervises the drive; None before it is armed."""
+    if (interval := gate.silence.interval) is None:
+        return None
+    period_s = 1.0 / CONTROL_RATE_HZ
+    return Feedback(loop.by_replies, interval * period_s, gate.silence.limit, period_s)
+
+
+def _report(gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceCounts) -> BusReport:
     outcome = gate.outcome or Outcome(How.STOPPED, "", "")
     began = gate.run_from
     return BusReport(
         outcome=outcome,
-        tally=tally,
+        tally=loop.tally,
         lockstep=spacing is None,
         approach_s=None if began is None else began / CONTROL_RATE_HZ,
         gait_s=gate.run_s,
         ticks=gate.run_ticks,
         cuts=gate.cuts,
-        jitter=jitter(tally.late_s),
+        jitter=jitter(loop.tally.late_s),
         waits=0 if spacing is None else spacing.waits,
         longest_wait_s=0.0 if spacing is None else spacing.longest_s,
+        held_s=gate.held_ticks / CONTROL_RATE_HZ,
+        feedback=_feedback(gate, loop),
         malformed=bus.malformed,
         dropped=bus.dropped or 0,
     )
@@ -325,6 +349,7 @@ class _Telling:
         self.first_frames: list[str] = []
         self._plan, self._session, self._teller = plan, session, teller
         self._events = tally.events
+        self._feedback: Feedback | None = None
         self._clock, self._simulated_ns, self._on_tick = clock, simulated_ns, on_tick
 
     def begin(self) -> None:
@@ -351,6 +376,15 @@ class _Telling:
                 self._teller.note(text, level)
         if self._on_tick is not None:
             self._on_tick(tick)
+
+    def feedback(self, feedback: Feedback | None) -> None:
+        """Write what supervises the drive, as it is armed and where it changes."""
+        if feedback is None or feedback == self._feedback:
+            return
+        if self._feedback is not None:
+            self._session.say("warn", f"gate: {UNASKED}")
+        self._feedback = feedback
+        self._session.note("undulog.gate.feedback", feedback.facts())
 
     def end(self, report: BusReport) -> None:
         for event in self._events.flush():

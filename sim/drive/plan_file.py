@@ -33,14 +33,13 @@ A plane that is to come in later is driven from the start, with an amplitude of 
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from capture.errors import Fault, PlanError
 from capture.robot import Plane
-from capture.strict_table import NAME_PATTERN, Faults, Table, listed
+from capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 
 from ..gait import WALK, PlaneGait, Serpentine, Wave
 from ..gait.toml import read_gait
@@ -61,8 +60,8 @@ def is_plan(text: str) -> bool:
         Whether it has segments.
     """
     try:
-        return "segments" in tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
+        return "segments" in read_toml(text)
+    except ValueError:
         return False
 
 
@@ -81,8 +80,8 @@ def parse_plan(text: str, source: Path) -> Plan:
         ScenarioError: If the file of its scenario has faults.
     """
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        values = read_toml(text)
+    except ValueError as error:
         raise PlanError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
     top = Table(values, "", faults)

@@ -88,6 +88,7 @@ class PythonCanBus:
         options: dict[str, object] = {"channel": cast_from_string(channel)}
         if interface == "socketcand":
             options["host"], options["port"] = server_of(address)
+            options["tcp_tune"] = True  # else a command waits for the acknowledgement of another
             self._complaints = _Complaints(tally)
         else:
             if kind.__module__.startswith("can."):  # others' classes may take what they don't name

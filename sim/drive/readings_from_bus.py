@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from capture.arrays import FloatArray, frozen
+from capture.arrays import FloatArray, IntArray, frozen
 from capture.bus.decoding import BusDecoder, DecodedSignals, FrameTally
 from capture.log.frames import FrameArray
 from capture.robot import Quantity, Robot
@@ -66,6 +66,8 @@ class BusReadings:
         }
         self.tally = FrameTally()
         """What became of the frames so far."""
+        self.angles: IntArray = np.zeros(count, dtype=np.int64)
+        """Angles received of each joint so far, shape (m,)."""
 
     def add(self, frames: FrameArray, time_s: float) -> None:
         """Take frames, in the order in which they came.
@@ -130,6 +132,8 @@ class BusReadings:
             joints = own[decoded.member[known]]
             self._joint_values[quantity][joints] = decoded.values[known]
             self._joint_times[quantity][joints] = time_s
+            if quantity is Quantity.POSITION:
+                np.add.at(self.angles, joints, 1)
             return
         members: list[int] = decoded.member.tolist()
         values: list[float] = decoded.values.tolist()

@@ -20,12 +20,15 @@ class Clamped(NamedTuple):
         command: Joint angles [rad], shape (m,); finite, whatever was wanted.
         by_position: Joints that were cut to their position limits, shape (m,).
         by_rate: Joints that were held back to their greatest rate, shape (m,).
+        unconfirmed: Joints that were held back as the bus had not confirmed the commands before,
+            shape (m,).
         not_finite: Joints for which something was wanted that is no angle, shape (m,).
     """
 
     command: FloatArray
     by_position: BoolArray
     by_rate: BoolArray
+    unconfirmed: BoolArray
     not_finite: BoolArray
 
 
@@ -54,14 +57,18 @@ class Clamp:
         self._limits, self._reach = limits, limits.rate * period_s
         self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
         """What was commanded last, at first the pose [rad], shape (m,)."""
-        self.cuts: dict[str, int] = {"by_position": 0, "by_rate": 0, "not_finite": 0}
+        self.cuts: dict[str, int] = dict.fromkeys(Clamped._fields[1:], 0)
         """Commands of single joints that were changed, by why."""
 
-    def apply(self, wanted: FloatArray) -> Clamped:
+    def apply(
+        self, wanted: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
+    ) -> Clamped:
         """Make a command fit to be sent; it counts as sent.
 
         Args:
             wanted: Joint angles [rad], shape (m,); anything.
+            bounds: Least and greatest angles that the commands on their way leave [rad], shapes
+                (m,), the last command among them; None: all.
 
         Returns:
             The command, and what was changed.
@@ -69,11 +76,16 @@ class Clamp:
         limits = self._limits
         finite = np.isfinite(wanted)
         within = np.clip(np.where(finite, wanted, self.last), limits.lower, limits.upper)
-        command = np.clip(within, self.last - self._reach, self.last + self._reach)
+        stepped = np.clip(within, self.last - self._reach, self.last + self._reach)
+        command = stepped
+        if bounds is not None:  # the last command is within, but for rounding
+            least, greatest = np.minimum(bounds[0], self.last), np.maximum(bounds[1], self.last)
+            command = np.clip(stepped, least, greatest)
         by_position = finite & (np.abs(within - wanted) > _ROUNDING)
-        by_rate = np.abs(command - within) > _ROUNDING
+        by_rate = np.abs(stepped - within) > _ROUNDING
+        unconfirmed = np.abs(command - stepped) > _ROUNDING
         self.last = command
-        found = Clamped(command.copy(), by_position, by_rate, ~finite)
+        found = Clamped(command.copy(), by_position, by_rate, unconfirmed, ~finite)
         for why, joints in zip(self.cuts, found[1:], strict=True):
             self.cuts[why] += int(joints.sum())
         return found

@@ -34,10 +34,11 @@ from ..twin import Sample, Twin
 from .dry_run_gait import GatedGait
 from .dry_run_tally import Demand, JointDemand
 from .faults import GateFault
-from .gate import POSE_S, Gate, Remark
+from .gate import POSE_S, Gate
 from .limits import GateLimits, gate_limits
 from .outcome import How
 from .ramp import Ramp
+from .tick import Remark
 
 _NOMINAL = """
 description = "Flat ground, and servos as the description of the robot has them."

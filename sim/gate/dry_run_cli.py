@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from capture.console import emit_json, progress
+from capture.console import emit_json, progress, say
 from capture.interruption import interruptible
 from capture.robot import Robot
 
@@ -74,7 +74,7 @@ def run_dry(
         emit_json({"on": on, **reported(run)})
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _UNLIMITED
-        print("\n".join(told(run, width)))
+        say(*told(run, width))
         if run.verdict.fit:
-            print(f"\nTo send it to {on}, the same with --arm and -o SESSION.mcap")
+            say("", f"To send it to {on}, the same with --arm and -o SESSION.mcap")
     return 0 if run.verdict.fit else 1

@@ -14,9 +14,10 @@ from ..readings import Readings
 from ..sensing.contract import JointSample
 from ..twin import Sample, Twin
 from .dry_run_tally import DemandTally
-from .gate import Gate, Heard, Phase, Remark
+from .gate import Gate
 from .limits import GateLimits
 from .status import JointStatus
+from .tick import Heard, Phase, Remark
 
 _CHANGED = 1e-12  # rad; the same as the clamp's
 

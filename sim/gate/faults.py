@@ -10,6 +10,7 @@ class FaultKind(StrEnum):
     """What went wrong."""
 
     LOST = "lost"
+    SILENT = "silent"
     TRACKING = "tracking"
     CURRENT = "current"
     TEMPERATURE = "temperature"

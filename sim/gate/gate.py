@@ -4,20 +4,17 @@
 
     reading the pose -> approach -> run -> done
             |              |         |
-            |              +-> ending +-> done
+            |              +-> hold <-> ending -> done
             +-> refused
 
 It is asked once a control tick what to send. Until the pose of every joint is known it sends
 nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
 (:mod:`sim.gate.clamp`). A fault or a request to stop leads to the ending that the robot's file
-names. It opens nothing and waits for nothing: what it knows it is told.
+names. While the bus is silent (:mod:`sim.gate.silence`) nothing is sent, and the servos hold; the
+ending begins when a joint is received again. It opens nothing and waits for nothing.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +23,6 @@ from capture.errors import SourceError, UsageError
 from capture.robot import OnFault
 
 from ..gait import Gait, GaitTick
-from ..readings import Readings
 from .clamp import Clamp, Clamped
 from .ending import Ending
 from .faults import MUTE, FaultKind, GateFault
@@ -34,66 +30,16 @@ from .limits import GateLimits
 from .outcome import How, Outcome
 from .pose import why_not_from
 from .ramp import Ramp
+from .silence import Silence
 from .status import JointStatus
+from .tick import GateStep, Heard, Phase, Remark
 from .watch import Watch
 from .yielding import Yielding
 
 POSE_S = 2.0
 """So long the gate waits for the pose of every joint [s]."""
-
-
-class Phase(StrEnum):
-    """What the gate is about."""
-
-    POSE = "reading the pose"
-    APPROACH = "approach"
-    RUN = "run"
-    ENDING = "ending"
-    DONE = "done"
-
-
-@dataclass(frozen=True)
-class Heard:
-    """What is known at a tick.
-
-    Attributes:
-        readings: For the gait.
-        status: For the gate.
-        trouble: What the bus itself told: bus-off, or somebody else's commands.
-        another_robot: Why this can't be the robot, None if it may be.
-        late_s: How late the tick is [s].
-    """
-
-    readings: Readings
-    status: JointStatus
-    trouble: GateFault | None = None
-    another_robot: str | None = None
-    late_s: float = 0.0
-
-
-class Remark(NamedTuple):
-    """Something to be logged: level and text."""
-
-    level: str
-    text: str
-
-
-class GateStep(NamedTuple):
-    """What to do at a tick.
-
-    Attributes:
-        phase: What the gate is about.
-        command: What to send, joint angles [rad], shape (m,); None: nothing.
-        wanted: What that was made from, before the gate changed anything; None likewise.
-        gait: What the gait said, while it runs.
-        remarks: What is worth a line in the log.
-    """
-
-    phase: Phase
-    command: FloatArray | None
-    wanted: FloatArray | None
-    gait: GaitTick | None
-    remarks: tuple[Remark, ...]
+HOLD_S = 10.0
+"""So long the joints are held while the bus is silent [s]; then the drive ends without a ramp."""
 
 
 class Gate:
@@ -118,7 +64,8 @@ class Gate:
             rate_hz: Control ticks a second.
             place: The bus, for messages.
             listen_s: So long the bus is listened to at least before anything is sent, to see whose
-                it is [s]; 0: the robot has said its name.
+                it is and to measure its reply interval [s]; 0: it is the robot's, which waits for
+                each command, so that no command can be held up.
         """
         self.phase = Phase.POSE
         self.outcome: Outcome | None = None
@@ -131,6 +78,11 @@ class Gate:
         """Ticks that the gait commanded."""
         self.run_s = 0.0
         """The gait's time [s]."""
+        self.silence = Silence()
+        """Whether the bus is silent."""
+        self.held_ticks = 0
+        """Ticks in which nothing was sent as the bus was silent, those left out among them."""
+        self._silent_ticks = 0  # those of the silence that were counted by then
         self._gait, self._limits, self._place = gait, limits, place
         self._rate_hz, self._listen_s = rate_hz, listen_s
         self._last = round(duration_s * rate_hz)
@@ -181,16 +133,17 @@ class Gate:
             return self._quiet()
         if not tick:
             self._remark("info", f"gate: {Phase.POSE}")
+        self.silence.tick(tick, received=heard.received, expected=heard.expected)
         clamp = self._clamp or self._begin(tick, heard, stop)
         if clamp is None:
             return self._quiet()
         self._tell_left_out(tick, heard.late_s)
         self._heed(tick, heard, clamp, stop, at_once=at_once)
-        if self.phase is Phase.DONE:
+        if self.phase in {Phase.DONE, Phase.HOLD}:
             return self._quiet()
         wanted, gait = self._wanted(tick, heard, clamp)
         pulled = self._yielding.apply(wanted, heard.status.angle, heard.status.current)
-        given = clamp.apply(pulled)
+        given = clamp.apply(pulled, heard.bounds)
         self._tell_changes(given)
         phase = self.phase
         self._end_in_time()
@@ -232,9 +185,13 @@ class Gate:
         if self._listen_s and heard.another_robot is not None:
             raise UsageError(f"{self._place}: no command was sent: {heard.another_robot}")
         angle, limits = heard.status.angle, self._limits
-        if np.isnan(angle).any() and waited_s < POSE_S:
+        measured = not self._listen_s or self.silence.measure()
+        if (np.isnan(angle).any() or not measured) and waited_s < POSE_S:
             return None
         if (why := why_not_from(angle, limits, waited_s)) is not None:
+            raise SourceError(self._place, f"no command was sent: {why}")
+        if not measured:
+            why = f"joints told their angles too rarely in {waited_s:.2g} s to supervise a drive"
             raise SourceError(self._place, f"no command was sent: {why}")
         clamp = self._clamp = Clamp(limits, angle, 1.0 / self._rate_hz)
         first = self._first = self._gait.step(0.0, heard.readings)
@@ -297,8 +254,15 @@ class Gate:
     def _heed(self, tick: int, heard: Heard, clamp: Clamp, stop: str, *, at_once: bool) -> None:
         """Change the phase where a fault, or who asks to stop, wants it."""
         found = self._trouble(tick, heard, clamp)
-        if found is not None and (self.phase is not Phase.ENDING or found.kind in MUTE):
+        if self.phase is Phase.HOLD and (found is None or found.kind not in MUTE):
+            self._go_on_holding(clamp, heard.status, at_once=at_once)
+            return
+        ending = self.phase is Phase.ENDING or self.silence.silent
+        if found is not None and (not ending or found.kind in MUTE):
             self._fail(found, clamp, heard.status)
+            return
+        if self.silence.silent:
+            self._fail(self._silent(tick), clamp, heard.status)
             return
         if found is not None and f"{found.kind} {found.joint}" not in self._said:
             self._said.add(f"{found.kind} {found.joint}")
@@ -326,8 +290,33 @@ class Gate:
             self.outcome = Outcome(How.FAULT, fault.text, "", fault)
         if fault.kind in MUTE:
             self._halt(self.outcome.why)
+        elif fault.kind is FaultKind.SILENT:
+            self.held_ticks, self._silent_ticks = self.held_ticks + 1, self.silence.ticks
+            self._become(Phase.HOLD, "nothing is sent until a joint is received")
         else:
             self._end(clamp, status)
+
+    def _silent(self, tick: int) -> GateFault:
+        """Nothing was received for too long."""
+        silence, period_s = self.silence, 1.0 / self._rate_hz
+        silent_s, limit_s = silence.ticks * period_s, silence.limit * period_s
+        text = (
+            f"the bus was silent: no joint was received for {silence.ticks} control ticks "
+            f"({silent_s:.3g} s), at a reply interval of {(silence.interval or 0) * period_s:.3g} s"
+        )
+        since_s = tick * period_s - silent_s
+        return GateFault(FaultKind.SILENT, text, "", silent_s, limit_s, since_s)
+
+    def _go_on_holding(self, clamp: Clamp, status: JointStatus, *, at_once: bool) -> None:
+        """Hold until a joint is received, then end; not for ever, and not if asked twice."""
+        if not self.silence.silent:
+            self._remark("info", "gate: a joint was received again")
+            self._end(clamp, status)
+            return
+        self.held_ticks += self.silence.ticks - self._silent_ticks
+        self._silent_ticks = self.silence.ticks
+        if at_once or self.silence.ticks >= HOLD_S * self._rate_hz:
+            self._halt("" if self.outcome is None else self.outcome.why)
 
     def _end(self, clamp: Clamp, status: JointStatus) -> None:
         """Begin the ending that the robot's file names."""
@@ -337,6 +326,8 @@ class Gate:
             how = "the joints were held where they were"
         else:
             how = f"the joints were brought straight within {ending.duration_s:.2g} s"
+        if self.held_ticks:
+            how = f"the servos held for {self.held_ticks / self._rate_hz:.2g} s, then {how}"
         if self.outcome is not None:
             self.outcome = Outcome(self.outcome.how, self.outcome.why, how, self.outcome.fault)
             self._become(Phase.ENDING, f"{self.outcome.why}; {self._limits.on_fault}")
@@ -380,6 +371,7 @@ class Gate:
         reasons = (
             ("cut", given.by_position, "command cut to the limits of the joint"),
             ("rate", given.by_rate, "command held back to {rate:g} rad/s"),
+            ("reply", given.unconfirmed, "command held back until a reply confirms those before"),
             ("nan", given.not_finite, "command is no number; the one before is held"),
             (
                 "yields",

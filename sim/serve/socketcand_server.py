@@ -25,7 +25,7 @@ from .loopback import listen_on_loopback
 from .socketcand_text import frame_text, sent_frame
 
 MOST_CLIENTS = 16
-"""Clients at once."""
+"""Clients at once. One more takes the place of the one outside raw mode that is silent longest."""
 MOST_BYTES = 1 << 20
 """What waits for one client, at most: some ten seconds of a robot of 25 joints."""
 MOST_SENT = 10_000
@@ -168,6 +168,10 @@ class SocketcandServer:
         except OSError as error:
             self._say("warn", f"a client could not be let in: {error.strerror}")
             return
+        idle = [client for client in self._clients.values() if not client.raw]
+        if len(self._clients) >= MOST_CLIENTS and idle:
+            longest = min(idle, key=lambda client: (client.bus_open, client.heard))
+            self._drop(longest, "was silent and gives its place to another one")
         if len(self._clients) >= MOST_CLIENTS:
             self._say("warn", f"no more than {MOST_CLIENTS} clients are let in")
             sock.close()
@@ -191,6 +195,8 @@ class SocketcandServer:
         except ValueError as error:
             self._drop(client, f"makes no sense: {error}")
             return
+        if messages:
+            client.heard = time.monotonic()
         for message in messages:
             if client.number not in self._clients:
                 return

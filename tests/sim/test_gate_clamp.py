@@ -69,7 +69,7 @@ def test_what_is_within_the_limits_passes_bit_by_bit():
         wanted = 0.4 * np.sin(np.pi * k * PERIOD_S + np.arange(25)) * min(k / 100, 1.0)
         found = clamp.apply(wanted)
         np.testing.assert_array_equal(found.command, wanted)
-    assert clamp.cuts == {"by_position": 0, "by_rate": 0, "not_finite": 0}
+    assert clamp.cuts == {"by_position": 0, "by_rate": 0, "unconfirmed": 0, "not_finite": 0}
 
 
 def test_cuts_are_told_by_joint_and_reason():
@@ -81,7 +81,7 @@ def test_cuts_are_told_by_joint_and_reason():
     assert np.flatnonzero(found.by_rate).tolist() == [3, 4]
     assert np.flatnonzero(found.not_finite).tolist() == [5]
     assert found.command[[3, 4, 5]].tolist() == [0.04, 0.04, 0.0]
-    assert clamp.cuts == {"by_position": 1, "by_rate": 2, "not_finite": 1}
+    assert clamp.cuts == {"by_position": 1, "by_rate": 2, "unconfirmed": 0, "not_finite": 1}
 
 
 def test_a_pose_that_is_not_known_is_no_start():

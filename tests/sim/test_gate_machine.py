@@ -12,12 +12,13 @@ from capture.robot import OnFault
 from capture.sources.bus_watch import BUS_OFF
 from sim.gait import GaitTick
 from sim.gate.faults import FaultKind, GateFault
-from sim.gate.gate import POSE_S, Gate, Heard, Phase
+from sim.gate.gate import HOLD_S, POSE_S, Gate
 from sim.gate.lateness import jitter
 from sim.gate.limits import gate_limits
 from sim.gate.outcome import How
 from sim.gate.presence import Presence
 from sim.gate.status import JointStatus
+from sim.gate.tick import Heard, Phase
 from sim.readings import Readings
 
 ROBOT = load_robot("snake25")
@@ -261,6 +262,33 @@ def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
     assert said == ["fault while ending: joint01: temperature 99 degC, more than 70 degC for 0.3 s"]
     assert bench.gate.outcome.how is How.STOPPED
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
+
+
+def test_while_the_bus_is_silent_nothing_is_sent_and_then_it_ends():
+    bench = Bench(duration_s=60.0, listen_s=0.5)
+    bench.until(Phase.RUN)
+    for _ in range(50):
+        bench.step()
+    sent, last = len(bench.sent), bench.sent[-1]
+    found = [bench.step(received=False) for _ in range(200)]
+    assert [step.command is not None for step in found] == [True] * 2 + [False] * 198
+    assert bench.gate.phase is Phase.HOLD
+    assert np.abs(bench.sent[-1] - last).max() <= 2 * 4.0 / RATE_HZ
+    bench.until(Phase.DONE)
+    np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
+    assert np.abs(np.diff(bench.sent[sent + 2 :], axis=0)).max() <= 0.5 / RATE_HZ
+    assert bench.gate.outcome.fault.kind is FaultKind.SILENT
+    assert bench.gate.outcome.ended.startswith("the servos held for 2 s, then the joints were ")
+
+
+def test_a_bus_that_stays_silent_gets_no_ramp():
+    bench = Bench(duration_s=60.0, listen_s=0.5)
+    bench.until(Phase.RUN)
+    for k in range(int(HOLD_S * RATE_HZ)):
+        bench.step(received=False, silence_s=k / RATE_HZ)
+    assert bench.gate.phase is Phase.DONE
+    assert (bench.gate.outcome.how, bench.gate.outcome.fault.kind) == (How.FAULT, "silent")
+    assert bench.gate.outcome.ended.startswith("nothing more was sent")
 
 
 def test_asked_to_stop_before_anything_was_sent_nothing_is():

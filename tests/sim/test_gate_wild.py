@@ -19,9 +19,10 @@ from capture.robot import OnFault
 from sim.drive.loop import CommandEncoder
 from sim.gait import GaitTick
 from sim.gate.faults import FaultKind, GateFault
-from sim.gate.gate import Gate, Heard, Phase
+from sim.gate.gate import Gate
 from sim.gate.limits import gate_limits
 from sim.gate.status import JointStatus
+from sim.gate.tick import Heard, Phase
 from sim.readings import Readings
 
 ROBOT = load_robot("snake25")
@@ -46,6 +47,7 @@ moments = st.fixed_dictionaries(
         "current": angles,
         "wish": wishes,
         "skip": st.sampled_from([0, 0, 0, 0, 1, 7, 200]),
+        "received": st.sampled_from([True, True, True, False]),
         "late_s": st.sampled_from([0.0, 0.0, 0.0, 0.1, 3.0]),
         "trouble": st.none() | st.none() | troubles,
         "stop": st.sampled_from(["", "", "", "", "asked to stop"]),
@@ -95,14 +97,19 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
         gait.wish = wish
         status = JointStatus(angle, current, unknown, unknown, np.zeros(COUNT))
         heard = Heard(
-            Readings(angle, unknown), status, trouble=more["trouble"], late_s=more["late_s"]
+            Readings(angle, unknown),
+            status,
+            trouble=more["trouble"],
+            late_s=more["late_s"],
+            received=more["received"],
         )
         found = gate.step(tick, heard, more["stop"], at_once=more["at_once"])
         tick += 1
         if found.command is not None:
             sent.append(on_the_bus(found.command))
 
-    calm = {"trouble": None, "late_s": 0.0, **last}
+    gate.silence.interval = 1
+    calm = {"trouble": None, "late_s": 0.0, "received": True, **last}
     try:
         step(pose, np.zeros(COUNT), np.full(COUNT, 0.2), **calm)
         for moment in drawn:

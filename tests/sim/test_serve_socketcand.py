@@ -3,7 +3,7 @@
 import socket
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import can
 import numpy as np
@@ -368,14 +368,30 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
 
 
 def test_no_more_clients_than_there_is_room_for(serving):
-    socks = [socket.create_connection(("127.0.0.1", serving.port)) for _ in range(MOST_CLIENTS)]
-    try:
-        assert all(heard(sock, b">") == b"< hi >" for sock in socks)
+    with ExitStack() as clients:
+        for _ in range(MOST_CLIENTS):
+            clients.enter_context(hand(serving, b"open can0", b"rawmode"))
         with socket.create_connection(("127.0.0.1", serving.port)) as late:
+            late.settimeout(PATIENCE_S)
             assert late.recv(10) == b""
-    finally:
-        for sock in socks:
-            sock.close()
+
+
+@pytest.mark.parametrize("said", [(), (b"open can0",)], ids=["nothing", "open"])
+def test_silent_clients_lock_nobody_out(serving, said):
+    """Whoever connects and stays silent gives way; who works on the bus stays."""
+    frames = traffic(50)
+    with ExitStack() as clients:
+        worker = clients.enter_context(hand(serving, b"open can0", b"rawmode"))
+        for _ in range(3 * MOST_CLIENTS):
+            clients.enter_context(hand(serving, *said))
+        late = clients.enter_context(peer(serving))
+        serving.until(lambda: serving.raw() == 2, "both in raw mode")
+        serving.send(frames)
+        found = received(late, len(frames))
+        text = frame_text(frames)
+        assert heard(worker, text[-40:]) == text
+    sane = (frames["id_flags"] & REMOTE_FLAG) == 0
+    assert same(as_frames(found), frames[sane])
 
 
 def test_only_loopback_is_served():
