@@ -66,10 +66,12 @@ def payloads(cycle: np.ndarray, first: int, count: int, rate: float, t0_ns: int)
 class UnixPeer:
     """Packets of up to 256 records, each with the running number of its first frame."""
 
-    def __init__(self, path: str) -> None:
-        """Connect to a recorder that may still be starting."""
+    def __init__(self, path: str, *, per_packet: int, buffer: int) -> None:
+        """Connect to a recorder that may still be starting; a buffer of 0 is the system's own."""
+        self.per_packet = per_packet
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)  # cut to the limit
+        if buffer:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, buffer)  # cut to the limit
         deadline = time.monotonic() + 60
         while True:
             try:
@@ -82,17 +84,18 @@ class UnixPeer:
         self.socket.setblocking(False)
         self.refused = 0
 
-    def send(self, frames: np.ndarray, first: int) -> int:
-        """Offer frames; returns how many were taken."""
+    def send(self, frames: np.ndarray, first: int, sent_ns: np.ndarray) -> int:
+        """Offer frames; notes when each was taken and returns how many were."""
         sent = 0
-        for start in range(0, len(frames), PER_PACKET):
-            part = frames[start : start + PER_PACKET]
+        for start in range(0, len(frames), self.per_packet):
+            part = frames[start : start + self.per_packet]
             head = struct.pack("<QQ", first + start, self.refused)
             try:
                 self.socket.send(head + part.tobytes())
             except BlockingIOError:
                 self.refused += len(part)
                 continue
+            sent_ns[start : start + len(part)] = time.time_ns()
             sent += len(part)
         return sent
 
@@ -128,8 +131,11 @@ class SocketcandPeer:
         self.rest = b""
         self.refused = 0
 
-    def send(self, frames: np.ndarray, first: int) -> int:
-        """Offer frames; returns how many were taken, the ones in our own buffer included."""
+    def send(self, frames: np.ndarray, first: int, sent_ns: np.ndarray) -> int:
+        """Offer frames; returns how many were taken, the ones in our own buffer included.
+
+        Those that stay in our buffer have no time: they leave with a later call.
+        """
         del first
         if self.rest and not self._push():
             self.refused += len(frames)
@@ -146,7 +152,8 @@ class SocketcandPeer:
             )
         ]
         self.rest = b"".join(text)
-        self._push()
+        if self._push():
+            sent_ns[:] = time.time_ns()
         return len(frames)  # what is begun will be finished: a partial frame breaks the stream
 
     def _push(self) -> bool:
@@ -174,16 +181,27 @@ def main() -> None:
     parser.add_argument("where")
     parser.add_argument("--rate", type=float, default=9000.0)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--per-packet", type=int, default=PER_PACKET)
+    parser.add_argument("--buffer", type=int, default=1 << 20, help="SO_SNDBUF; 0: the default")
+    parser.add_argument("--fifo", action="store_true", help="real-time priority")
+    parser.add_argument("--sent", type=Path, help="npz of when each frame was taken")
     parser.add_argument("--log", type=Path, help="append each accepted batch: time, frames so far")
     args = parser.parse_args()
-    os.nice(-5) if os.geteuid() == 0 else None
-    peer = UnixPeer(args.where) if args.kind == "unix" else SocketcandPeer(int(args.where))
+    if args.fifo:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    elif os.geteuid() == 0:
+        os.nice(-5)
+    if args.kind == "unix":
+        peer = UnixPeer(args.where, per_packet=args.per_packet, buffer=args.buffer)
+    else:
+        peer = SocketcandPeer(int(args.where))
     cycle = cycle_frames()
     log = args.log.open("wb", buffering=0) if args.log else None
     begin = time.monotonic_ns() + 50_000_000
     wall = time.time_ns() + 50_000_000
     offered = accepted = late = worst_ns = 0
     total = round(args.rate * args.seconds)
+    sent_ns = np.zeros(total, np.int64)
     while offered < total:
         time.sleep(STEP_S)
         now = time.monotonic_ns() - begin
@@ -195,11 +213,13 @@ def main() -> None:
         worst_ns = max(worst_ns, behind_ns)
         if behind_ns > LATE_NS:
             late += max(0, min(len(frames), int((behind_ns - LATE_NS) * args.rate / NS)))
-        accepted += peer.send(frames, offered)
+        accepted += peer.send(frames, offered, sent_ns[offered:due])
         offered = due
         if log is not None:
             log.write(struct.pack("<QQ", time.monotonic_ns(), accepted))
     peer.close()
+    if args.sent is not None:
+        np.savez(args.sent, sent_ns=sent_ns, t0_ns=wall, rate=args.rate)
     result = {
         "offered": offered,
         "accepted": accepted,

@@ -4,7 +4,8 @@
 ``undulog record`` over AF_UNIX and over loopback socketcand; the same socketcand buses into
 python-can's Logger (BLF and candump) and into mcap-ros2-support; a burst of 500,000 frames/s; and
 a live view that is frozen all the time. Senders are paced by the clock and wait for nobody: what
-the socket refuses and what is sent more than 20 ms late counts as lost.
+the socket refuses and what is sent more than 20 ms late counts as lost. In the end the same beside
+busy loops and a busy disk (``bench/contention.py``).
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import contention
 
 from capture import Session
 
@@ -257,6 +260,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
             outcomes.append(run(Path(folder)))
         print(outcomes[-1].line(), flush=True)
+    print(f"\nbeside two busy loops a core and dd with fsync\n{contention.HEAD}", flush=True)
+    contended = contention.measure(6.0, runs=3)
     ours, text, frozen, burst, *peers = outcomes
     growth = ours.rss_mb[-1] - ours.rss_mb[len(ours.rss_mb) // 3]
     more_ms = (frozen.tick_p99_ms or 0) - (ours.tick_p99_ms or 0)
@@ -274,6 +279,7 @@ def main() -> None:
             text.cpu < least.cpu,
             f"socketcand: {least.cpu / text.cpu:.1f} times as cheap as {least.name}",
         ),
+        *contention.verdicts(contended),
     ):
         print("PASS" if passed else "FAIL", words)
 

@@ -45,10 +45,14 @@ class RoundGatherer:
             joints: Number of joints m.
             quantities: Number of values q a sample.
         """
-        self._joints = joints
+        self._joints, self._quantities = joints, quantities
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the samples kept back."""
         self._t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint: IntArray = np.empty(0, dtype=np.int64)
-        self._values: FloatArray = np.empty((0, quantities), dtype=np.float64)
+        self._values: FloatArray = np.empty((0, self._quantities), dtype=np.float64)
 
     def add(self, t_ns: IntArray, joint: IntArray, values: FloatArray) -> Rounds:
         """Add samples in the order in which they were recorded.

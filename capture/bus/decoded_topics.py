@@ -125,6 +125,11 @@ class DecodedTopics:
         """The messages that waited for more samples."""
         return [message for group in self._groups for message in group.finish()]
 
+    def forget(self) -> None:
+        """Drop the samples that wait for more, after a failure."""
+        for group in self._groups:
+            group.forget()
+
 
 _Piece: TypeAlias = tuple[int, IntArray, IntArray, FloatArray]
 """Samples of one axis of a sensor: column, rows, times [Unix ns], values."""
@@ -196,6 +201,10 @@ class _OffsetTopic:
 
         return stamp_ns, [Message(self._topic, sampled_ns, write)]
 
+    def forget(self) -> None:
+        """Write offsets again: the messages of the last call may be lost."""
+        self._written.clear()
+
 
 class _JointGroup:
     """JointState topics whose samples come in the same frames, hence in the same rounds."""
@@ -227,6 +236,10 @@ class _JointGroup:
 
     def finish(self) -> list[Message]:
         return self._messages(self._gatherer.finish())
+
+    def forget(self) -> None:
+        self._gatherer.forget()
+        self._offsets.forget()
 
     def _blocks(
         self, samples: Sequence[DecodedSignals]

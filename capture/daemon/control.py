@@ -58,8 +58,8 @@ class ControlServer:
             handler: Does what is asked; None where :meth:`serve` says so later.
 
         Raises:
-            ControlError: If another recorder listens there, something else is in the way, or the
-                socket can't be made.
+            SocketInUseError: If another recorder listens there.
+            ControlError: If something else is in the way, or the socket can't be made.
         """
         self.path = path
         self.requests = 0

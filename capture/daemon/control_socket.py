@@ -9,11 +9,12 @@ import socket
 import stat
 import tempfile
 import time
+import zlib
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..errors import ControlError
+from ..errors import ControlError, SocketInUseError
 
 _SUFFIX = ".sock"
 _LONGEST_PATH = 107  # bytes of sun_path, less the closing zero
@@ -44,15 +45,16 @@ def socket_folder(environ: Mapping[str, str]) -> Path:
     return Path(tempfile.gettempdir()) / f"undulog-{os.getuid()}"
 
 
-def default_socket(output: Path, environ: Mapping[str, str]) -> Path:
-    """The usual socket of a recording, named after its output; makes the folder.
+def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Path]:
+    """The usual sockets of a recording, named after its output; makes the folder.
 
     Args:
         output: The session.
         environ: The environment.
 
     Returns:
-        The path, e.g. ``/run/user/1000/undulog/run.sock``.
+        The path, e.g. ``/run/user/1000/undulog/run.sock``, and the one to use where a recorder
+        into another folder listens there, e.g. ``run-1c291ca3.sock``.
 
     Raises:
         ControlError: If the folder can't be made, or is another user's.
@@ -65,7 +67,9 @@ def default_socket(output: Path, environ: Mapping[str, str]) -> Path:
         raise ControlError(f"{folder}: no folder for the control socket: {error}") from error
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
         raise ControlError(f"{folder}: not a folder of this user; name a socket with --socket")
-    return folder / f"{output.stem}{_SUFFIX}"
+    number = zlib.crc32(os.fsencode(output.absolute()))
+    stem = output.stem
+    return folder / f"{stem}{_SUFFIX}", folder / f"{stem}-{number:08x}{_SUFFIX}"
 
 
 def find_sockets(environ: Mapping[str, str]) -> list[Path]:
@@ -99,7 +103,8 @@ def listen(
         The non-blocking socket, and what its file is, for :func:`release`.
 
     Raises:
-        ControlError: If somebody listens there, it is no socket, or it can't be made.
+        SocketInUseError: If somebody listens there.
+        ControlError: If it is no socket, or it can't be made.
     """
     if len(os.fsencode(path)) > _LONGEST_PATH:
         raise ControlError(
@@ -149,7 +154,7 @@ def _remove_stale(path: Path) -> None:
     if not stat.S_ISSOCK(found.st_mode):
         raise ControlError(f"{path} is there and no socket; name another with --socket")
     if _somebody_listens(path):
-        raise ControlError(
+        raise SocketInUseError(
             f"{path}: another recorder listens there; end it, or name another with --socket"
         )
     path.unlink()

@@ -11,16 +11,15 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from ..errors import LogWriteError, SourceError, UsageError
+from ..errors import LogWriteError, SocketInUseError, SourceError, UsageError
 from ..interruption import StopRequest
 from ..log.writer import SessionWriter
-from ..robot import ClockDomain
 from ..sources.contract import SourceContext
 from ..sources.registry import open_sources
 from .clock import SessionClock
 from .control import ControlServer
 from .control_requests import OperatorLog, request_handler
-from .control_socket import default_socket
+from .control_socket import default_sockets
 from .live_feed import LiveFeed
 from .live_health import LiveHealth
 from .machine import free_space, machine_facts
@@ -87,11 +86,10 @@ class Recording:
         self._events: deque[EventLine] = deque(maxlen=_EVENTS_SHOWN)
         self._sizes: deque[tuple[int, int]] = deque(maxlen=_RATE_UPDATES)
         self._snapshot: RecorderSnapshot | None = None
-        socket = settings.socket or default_socket(settings.output, os.environ)
         with ExitStack() as opened:  # what is open is closed again if the next thing fails
-            self._control = ControlServer(socket)  # first: two recorders never share one
+            self._control = _control_of(settings)  # first: two recorders never share one
             opened.callback(self._control.close)
-            self._feed = LiveFeed(socket.with_suffix(".live"))
+            self._feed = LiveFeed(self._control.path.with_suffix(".live"))
             opened.callback(self._feed.close)
             self._storage = open_storage(settings)
             self._writer = SessionWriter(
@@ -269,9 +267,9 @@ class Recording:
 
     def _recorded(self) -> Ending:
         try:
-            # A scenario's time is its own: it is told how long to go on, and ends by itself.
-            simulated = all(source.clock is ClockDomain.SIMULATED for source in self._sources)
-            duration_s = None if simulated else self._settings.duration_s
+            # A twin's time is its own: it gets the duration, and ends by itself.
+            twins = all(source.robot is not None for source in self._sources)
+            duration_s = None if twins else self._settings.duration_s
             return self._recorder.run(self._stop, duration_s)
         except LogWriteError as error:
             return Ending(str(error), failed=True)
@@ -313,6 +311,7 @@ class Recording:
         times = self._recorder.ticks.result()
         return {
             "ended": ending.reason,
+            "priority": self._recorder.priority.text,
             "ticks": str(times.count),
             "tick_p50_s": f"{times.p50_s:.3g}",
             "tick_p99_s": f"{times.p99_s:.3g}",
@@ -381,6 +380,17 @@ class Recording:
             sources={s.name: dataclasses.asdict(s.counts) for s in self._sources},
             recorder=self._recorder_facts(ending),
         )
+
+
+def _control_of(settings: RecordSettings) -> ControlServer:
+    """The control socket: the one that was named, or the first usual one that is free."""
+    if settings.socket is not None:
+        return ControlServer(settings.socket)
+    usual, other = default_sockets(settings.output, os.environ)
+    try:
+        return ControlServer(usual)
+    except SocketInUseError:
+        return ControlServer(other)
 
 
 def _wishes(settings: RecordSettings) -> dict[str, str]:

@@ -9,16 +9,20 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from select import select
 
-from ..errors import LogWriteError
+import numpy as np
+
+from ..errors import LogWriteError, SourceError, UndulogError
 from ..interruption import StopRequest
+from ..log.frames import FD_FRAME_DTYPE, FRAME_DTYPE, FrameArray
 from ..log.recorder_channels import TimeReferenceChannel
 from ..log.writer import SessionWriter
+from ..priority import Priority, raised_priority
 from ..robot import Robot
-from ..sources.contract import Polled, Source, SourceContext
+from ..sources.contract import EndingSource, Polled, Source, SourceContext
 from .bus_recorder import BusRecorder
 from .clock import SessionClock
 from .each_second import EachSecond
@@ -29,7 +33,7 @@ TICK_NS = 10_000_000
 """Sources are asked this often, and what they have is safe then [ns]."""
 
 DECODE_TICKS = 10
-"""Frames are decoded every so many ticks, a backlog in every one."""
+"""Frames are decoded every so many ticks, what was left over in the next one."""
 
 WATCHED_TICKS = 4
 """The same while somebody watches."""
@@ -39,11 +43,11 @@ _PRESSED = 1000
 buffers hold only milliseconds of a burst."""
 
 _BREATH_NS = 1_000_000
+_DRAIN_NS = 500_000_000
 _MOST_WAITING = 2_000_000
 """So many frames may wait to be decoded, 64 MB; then the burst is no burst."""
 
 _DECODE_BUDGET_NS = 4_000_000
-_BACKLOG = 16_384
 _NS = 1_000_000_000
 _LONGEST_NS = 2**31 * _NS  # what a TimeReference can hold
 
@@ -69,6 +73,7 @@ class Recorder:
         overruns: Ticks that were left out because the one before took too long.
         ending: Set to end the recording, from within one of the ``each_tick`` or ``each_second``.
         watched: Whether somebody looks at what is decoded as it comes.
+        priority: What the recorder's threads have got.
     """
 
     def __init__(
@@ -99,6 +104,7 @@ class Recorder:
         self.overruns = 0
         self.ending: Ending | None = None
         self.watched = False
+        self.priority = Priority("not asked for")
         self.clocks: dict[str, SourceClock] = {source.name: SourceClock() for source in sources}
         self.buses: dict[str, BusRecorder] = {}
         self._writer, self._clock, self._context = writer, clock, context
@@ -111,6 +117,8 @@ class Recorder:
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
         self._came = 0  # frames in the last poll
         self._failed: set[str] = set()
+        self._end_ns: int | None = None  # when the recording ended [Unix ns]
+        self._later: set[str] = set()  # sources of which frames came after it
         self._odd_clocks: set[str] = set()
         self._told: dict[str, set[str]] = {source.name: set() for source in self._sources}
         self._on_event: Callable[[int, str, str, str], None] | None = None
@@ -157,27 +165,53 @@ class Recorder:
             Why it ended. The session is whole then, but not closed.
 
         Raises:
-            SourceError: If a source can never work.
+            SourceError: If a source can never work, or fails to start.
             LogWriteError: If the session can't be written; the sources are stopped then.
         """
         try:
-            self._start()
-            with _tidied_by_hand():
-                self._loop(stop, duration_s)
+            with _tidied_by_hand():  # first: it takes long, and sources that listen want to be read
+                self._start()
+                with self._urgent():
+                    self._loop(stop, duration_s)
+                    self._drain()
             self._finish()
         finally:
             for source in self._sources:
-                source.stop()
+                self._stop_source(source)
         assert self.ending is not None  # noqa: S101 - the loop ends with one
         return self.ending
 
     # -- inside ----------------------------------------------------------------------------
 
     def _start(self) -> None:
-        for source in self._sources:
-            source.start(self._context)
+        # Last those that listen: to connect may take half a second, and senders wait for nobody.
+        for source in sorted(self._sources, key=lambda each: isinstance(each, EndingSource)):
+            try:
+                source.start(self._context)
+            except UndulogError:
+                raise
+            except Exception as error:
+                fault = f"its kind of source failed to start: {error!r}"
+                raise SourceError(source.name, fault) from error
         listed = ", ".join(source.name for source in self._sources)
         self.say("info", "recorder", f"recording {listed}")
+
+    @contextmanager
+    def _urgent(self) -> Generator[None]:
+        """Ask for priority; not beside a twin, whose physics would have it, too."""
+        if any(source.robot is not None for source in self._sources):
+            yield
+            return
+        with raised_priority() as self.priority:
+            if self.priority.refused:
+                self.say(
+                    "info",
+                    "recorder",
+                    "priority was refused: while other programs hold the processors, frames may be "
+                    "refused or stamped late; CAP_SYS_NICE allows it, and so does a service "
+                    "('undulog record unit')",
+                )
+            yield
 
     def _loop(self, stop: StopRequest, duration_s: float | None) -> None:
         begun_ns = due_ns = time.monotonic_ns()
@@ -209,19 +243,51 @@ class Recorder:
         waits = self.backlog
         pressed = self._came >= _PRESSED and waits < _MOST_WAITING
         every = WATCHED_TICKS if self.watched else DECODE_TICKS
-        if not pressed and (tick % every == 1 or waits > _BACKLOG):
+        due = tick % every == 1
+        if not pressed and (due or any(bus.behind for bus in self.buses.values())):
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
-                self._decode(name, bus, until_ns)
+                self._decode(name, bus, until_ns, rest=due)
         self._each_second.run(now_ns)
         for each in self._each_tick:
             each()
+
+    def _drain(self) -> None:
+        """End at this instant: what came before is kept, what came later is left out.
+
+        A source that can refuses from now on what its senders have. Of the others a frame that came
+        later proves that all before are here; as none takes so long, half a second does, too.
+        """
+        self._end_ns = self._clock.now_ns()
+        for source in self._sources:
+            if source.name not in self._failed:
+                self._end_source(source)
+        until_ns = self._end_ns + _DRAIN_NS
+        while True:
+            self._poll()
+            for bus in self.buses.values():
+                bus.write_raw(self._clock.now_ns)
+            late = self._clock.now_ns() >= until_ns
+            if late or not any(self._has_more(source) for source in self._sources):
+                return
+            select([], [], [], _BREATH_NS / _NS)
+
+    def _has_more(self, source: Source) -> bool:
+        """Whether frames from before the end may still come."""
+        if source.finished or source.name in self._failed or source.robot is not None:
+            return False
+        return isinstance(source, EndingSource) or (
+            source.connected and source.name not in self._later
+        )
 
     def _poll(self) -> None:
         self._came = 0
         for source in self._sources:
             polled = self._asked(source)
             arrays = (*polled.frames, *polled.fd_frames)
+            if self._end_ns is not None and not isinstance(source, EndingSource):
+                kept = (self._before_end(source, frames) for frames in arrays)
+                arrays = tuple(frames for frames in kept if len(frames))
             self._came += sum(map(len, arrays))
             for event in polled.events:
                 self.say(event.level, source.name, event.text, event.t_ns)
@@ -231,29 +297,52 @@ class Recorder:
                     bus = self.buses[source.name] = self._open_bus(source)
                 bus.add(frames)
 
+    def _before_end(self, source: Source, frames: FrameArray) -> FrameArray:
+        """Those of a source's frames that came before the end; a twin's are of its own time."""
+        if self._end_ns is None or source.robot is not None:
+            return frames
+        before = frames["t_host_ns"] <= np.uint64(self._end_ns)
+        if before.all():
+            return frames
+        self._later.add(source.name)
+        return frames[before]
+
     def _asked(self, source: Source) -> Polled:
         """What a source has; one that fails in a way nobody foresaw doesn't end the others."""
         if source.name in self._failed:
             return Polled()
         try:
-            return source.poll()
+            polled = source.poll()
+            _check(polled)
         except LogWriteError:
             raise
         except Exception as error:  # noqa: BLE001 - the other sources go on
             self._failed.add(source.name)
             self.say("error", source.name, f"this source is given up: it failed with {error!r}")
-            source.stop()
+            self._stop_source(source)
             return Polled()
+        return polled
 
-    def _decode(self, name: str, bus: BusRecorder, until_ns: int) -> None:
+    def _end_source(self, source: Source) -> None:
+        """End a source that can refuse what comes later; one that fails in that is given up."""
         try:
-            bus.decode(self._clock.now_ns, until_ns)
-        except LogWriteError:
-            raise
-        except Exception as error:  # noqa: BLE001 - raw frames go on, whatever decoding trips over
-            bus.decode_no_more()
-            text = f"frames are only kept raw from here on: decoding them failed with {error!r}"
-            self.say("error", name, text)
+            if isinstance(source, EndingSource):
+                source.end()
+        except Exception as error:  # noqa: BLE001 - the other sources are drained
+            self._failed.add(source.name)
+            self.say("error", source.name, f"this source can't be ended: {error!r}")
+
+    def _stop_source(self, source: Source) -> None:
+        """Release a source; one that fails in that doesn't keep the others open."""
+        try:
+            source.stop()
+        except Exception as error:  # noqa: BLE001 - the other sources are released
+            self._failed.add(source.name)
+            with suppress(LogWriteError):  # a full disk is reported by what ended the recording
+                self.say("error", source.name, f"this source can't be released: {error!r}")
+
+    def _decode(self, name: str, bus: BusRecorder, until_ns: int, *, rest: bool) -> None:
+        bus.decode(self._clock.now_ns, until_ns, rest=rest)
         self._tell_clock(name)
 
     def _open_bus(self, source: Source) -> BusRecorder:
@@ -290,6 +379,8 @@ class Recorder:
     def _tell_odd_frames(self) -> None:
         """Say once what nobody knows and what is too short; the counts come at the end."""
         for name, bus in self.buses.items():
+            for text in bus.take_faults():
+                self.say("error", name, text)
             if not bus.decodes:
                 continue
             for level, what, found in (
@@ -304,8 +395,7 @@ class Recorder:
                     self.say(level, name, f"{what}: {listed}{more}")
 
     def _finish(self) -> None:
-        """Take what is still there, and say what became of the frames."""
-        self._poll()
+        """Decode what waits, and say what became of the frames."""
         for name, bus in self.buses.items():
             bus.finish(self._clock.now_ns)
             self._tell_clock(name)
@@ -319,6 +409,17 @@ class Recorder:
         ending = self.ending
         assert ending is not None  # noqa: S101 - set by the loop
         self.say("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
+
+
+def _check(polled: Polled) -> None:
+    """Refuse what a plug-in may give and no source gives.
+
+    Raises:
+        TypeError: If it isn't what :class:`Polled` says.
+    """
+    for frames in (*polled.frames, *polled.fd_frames):
+        if frames.dtype not in (FRAME_DTYPE, FD_FRAME_DTYPE):
+            raise TypeError(f"poll() gave frames of the type {frames.dtype}")
 
 
 @contextmanager

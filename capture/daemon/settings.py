@@ -33,7 +33,6 @@ from __future__ import annotations
 
 import os
 import time
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -43,7 +42,7 @@ from typing import Any, cast
 
 from ..errors import DataError, SettingsError
 from ..input_file import read_input
-from ..strict_table import Faults, listed, shown
+from ..strict_table import Faults, listed, read_toml, shown
 from .amounts import SIZE_UNITS
 from .setting_values import PARSERS
 
@@ -210,11 +209,11 @@ def _environment(environ: Mapping[str, str], faults: Faults) -> _Layer:
 
 def _file(path: Path, faults: Faults) -> _Layer:
     try:
-        tables = tomllib.loads(read_input(path).decode("utf-8"))
+        tables = read_toml(read_input(path).decode("utf-8"))
     except UnicodeDecodeError as error:
         faults.add(f"{path}: byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
         tables = {}
-    except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
+    except ValueError as error:  # no TOML
         faults.add(f"{path}: syntax", str(error), "TOML 1.0")
         tables = {}
     for name in tables:

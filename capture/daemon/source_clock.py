@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, IntArray
+from ..sources.contract import DEVICE_TIMES_END_NS
 from .envelope import BUCKET_NS, PRIOR, SAME_DEVICE, Envelope
 
 JUMP_NS = 100_000_000
@@ -47,6 +48,7 @@ class ClockEstimate:
         delay_p99_s: 99 % point of arrival minus mapped time [s], within 9 %.
         samples: Samples mapped.
         resets: How often the device's clock was set or restarted.
+        out_of_range: Samples whose device time is impossible.
     """
 
     own_clock: bool
@@ -57,6 +59,7 @@ class ClockEstimate:
     delay_p99_s: float
     samples: int
     resets: int
+    out_of_range: int = 0
 
     def as_metadata(self, name: str) -> dict[str, str]:
         """Key-values for the session's metadata record ``undulog.clock``.
@@ -77,6 +80,8 @@ class ClockEstimate:
             "jitter_s": f"{self.jitter_s:.3g}",
             "delay_p99_s": f"{self.delay_p99_s:.3g}",
         }
+        if self.out_of_range:
+            facts["out_of_range"] = str(self.out_of_range)
         if self.offset_ns is not None:
             facts["offset_ns"] = str(self.offset_ns)
         if self.drift_ppm is not None and self.drift_uncertainty_ppm is not None:
@@ -98,13 +103,14 @@ class SourceClock:
         self._envelope = Envelope()
         self._own = False
         self._device = self._host = 0  # of the last sample
+        self._possible_ns = 0  # arrival of the last sample whose device time is possible
         self._front = 0  # the latest device time so far
         self._pair: tuple[int, int] | None = None
         self._last = -(2**62)  # the last mapped time
         self._floor = -(2**62)  # what the next may not fall below, at half speed
         self._origin = (0, 0)  # device time, host minus device time
         self._bucket_ends = 0
-        self._samples = self._resets = 0
+        self._samples = self._resets = self._out_of_range = 0
         self._events: list[str] = []
         self._delays: list[IntArray] = []
         self._waiting = 0
@@ -116,7 +122,10 @@ class SourceClock:
 
         Args:
             t_device_ns: On the device's own clock, in the order they came, shape (n,); equal to
-                ``t_host_ns`` where a sample has no time of its own.
+                ``t_host_ns`` where a sample has no time of its own. Times that are not in
+                [0, :data:`~capture.sources.contract.DEVICE_TIMES_END_NS`) are no device's: such
+                samples take the time of the one before, or of their arrival where none came
+                within 100 ms, and leave the estimate as it is.
             t_host_ns: Arrival on the session's clock [Unix ns], not decreasing, shape (n,).
 
         Returns:
@@ -127,6 +136,11 @@ class SourceClock:
         if not len(host):
             return host
         self._samples += len(host)
+        odd = device.view(np.uint64) >= DEVICE_TIMES_END_NS
+        if odd.any():
+            self._replace(device, host, odd)
+        else:
+            self._possible_ns = int(host[-1])
         without = device == host
         if without.all():
             self._pair = int(device[-1]), int(host[-1])
@@ -149,6 +163,11 @@ class SourceClock:
         """What happened to the clock since the last call, one sentence each."""
         events, self._events = self._events, []
         return events
+
+    def restart(self) -> None:
+        """Begin a new estimate with the next sample, after a failure."""
+        self._own, self._delays, self._waiting = False, [], 0
+        self._resets += 1
 
     def result(self) -> ClockEstimate:
         """What is known of the clock so far."""
@@ -174,9 +193,22 @@ class SourceClock:
             delay_p99_s=2.0 ** (place / _BINS_PER_OCTAVE) / _NS if place else 0.0,
             samples=self._samples,
             resets=self._resets,
+            out_of_range=self._out_of_range,
         )
 
     # -- mapping ---------------------------------------------------------------------------
+
+    def _replace(self, device: IntArray, host: IntArray, odd: BoolArray) -> None:
+        """Put the last possible device time in place of each impossible one, or the arrival's."""
+        self._out_of_range += int(odd.sum())
+        last = np.maximum.accumulate(np.where(odd, -1, np.arange(len(device))))
+        if not self._own and not odd.all():
+            last = np.maximum(last, int(odd.argmin()))  # before the first, the one that follows
+        t_ns = np.where(last < 0, self._device, device[last])
+        came_ns = np.where(last < 0, self._possible_ns, host[last])
+        near = ((last >= 0) | self._own) & (host - came_ns <= JUMP_NS)
+        device[odd] = np.where(near, t_ns, host)[odd]
+        self._possible_ns = int(came_ns[-1])
 
     def _in_order(self, t_ns: IntArray) -> IntArray:
         """Times that are the host's own."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..log.frames import ERROR_FLAG, ID_MASK, FrameArray
-from .events import Tally
+from .contract import DEVICE_TIMES_END_NS
+from .events import ODD_TIME, Tally
 
 BUS_OFF = 0x40
 """Error class: the controller left the bus."""
@@ -39,7 +40,7 @@ _CONTROLLER_STATES = {
 
 
 class BusWatch:
-    """Counts error frames and tells what they mean."""
+    """Counts error frames, and tells what they mean, and impossible device times."""
 
     def __init__(self) -> None:
         """Start with a bus that is well."""
@@ -52,6 +53,10 @@ class BusWatch:
             frames: What came, in order.
             tally: Where to count and tell.
         """
+        t_ns = frames["t_device_ns"]
+        if t_ns.max(initial=0) >= DEVICE_TIMES_END_NS:
+            odd = int((t_ns >= np.uint64(DEVICE_TIMES_END_NS)).sum())
+            tally.malformed(ODD_TIME, odd)
         ids = frames["id_flags"]
         if not np.bitwise_or.reduce(ids) & ERROR_FLAG:
             if self._off and len(ids):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from ..log.frames import FrameArray
 from ..robot import ClockDomain, Robot
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = "undulog.sources"
 """Entry point group: the name is the scheme, the object opens a source."""
+
+DEVICE_TIMES_END_NS = 1 << 62
+"""Device times lie below this [ns], 146 years. A frame with another one is kept and decoded, at an
+estimated time, and counts as malformed."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,8 @@ class Polled:
     Attributes:
         frames: Arrays of records of :data:`capture.log.frames.FRAME_DTYPE`, in the order they
             came. ``t_host_ns`` is the arrival on the session's clock, ``t_device_ns`` the device's
-            own time, on the device's own clock, or equal to ``t_host_ns`` where it gives none.
+            own time, on the device's own clock and below :data:`DEVICE_TIMES_END_NS`, or equal to
+            ``t_host_ns`` where it gives none.
         events: What happened.
         fd_frames: The same of CAN FD frames: records of :data:`capture.log.frames.FD_FRAME_DTYPE`.
     """
@@ -82,7 +87,7 @@ class SourceCounts:
         frames: Frames taken.
         dropped: Frames that the source's own sequence numbers or counters prove lost before us;
             None where the source has no such thing.
-        malformed: Packets or lines that could not be read.
+        malformed: Packets or lines that could not be read, frames with impossible device times.
         error_frames: Frames that report a bus error.
         reconnects: How often the connection came back.
     """
@@ -177,4 +182,13 @@ class Source(Protocol):
 
     def stop(self) -> None:
         """End and release everything; safe to call twice. Never raises for a dead device."""
+        ...
+
+
+@runtime_checkable
+class EndingSource(Protocol):
+    """A source that can end at an instant, so that its senders know what was accepted."""
+
+    def end(self) -> None:
+        """Accept nothing more. What was accepted comes with the next polls; then it is finished."""
         ...

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 
 from .contract import SourceCounts, SourceEvent
 
+ODD_TIME = "device time out of range, another is estimated"
+"""The event of a frame whose device time is impossible."""
+
 _PAUSE_NS = 1_000_000_000
 
 

@@ -30,13 +30,14 @@ from ..log.frames import (
     empty_frames,
 )
 from ..robot import ClockDomain
-from .contract import SourceAddress
-from .events import Tally
+from .contract import DEVICE_TIMES_END_NS, SourceAddress
+from .events import ODD_TIME, Tally
 from .link import LinkedSource
 
 _WAIT_S = 0.1
 _JOIN_S = 1.0
 _MOST_HELD = 1_000_000
+_TIMES_END_S = DEVICE_TIMES_END_NS / 1e9
 
 
 def bus_class(text: str, interface: str) -> type[can.BusABC]:
@@ -96,6 +97,9 @@ class PythonCanLink:
         if not count:
             return ()
         held = [self._held.popleft() for _ in range(count)]
+        if self._device_time:
+            odd = sum(not 0.0 <= message.timestamp < _TIMES_END_S for _, message in held)
+            self._tally.malformed(ODD_TIME, odd)
         classic = [pair for pair in held if not _is_fd(pair[1])]
         fd = [pair for pair in held if _is_fd(pair[1])] if len(classic) < count else []
         return (
@@ -139,7 +143,8 @@ def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool)
 
     Args:
         messages: Arrival [Unix ns] and message, of at most 8 bytes.
-        device_time: Whether to take the messages' times, to the microsecond, as the device's.
+        device_time: Whether to take the messages' times, to the microsecond, as the device's; those
+            that are negative, not finite or out of range are replaced by the arrival's.
 
     Returns:
         The frames.
@@ -178,9 +183,10 @@ def _fill(
     frames["t_host_ns"] = host
     frames["t_device_ns"] = host
     if device_time:
-        micros = np.array([round(m.timestamp * 1e6) for _, m in messages], dtype=np.int64)
-        given = micros > 0  # a driver without times says 0
-        frames["t_device_ns"][given] = micros[given].astype(np.uint64) * np.uint64(1000)
+        stamps = np.array([m.timestamp for _, m in messages], dtype=np.float64)
+        given = (stamps > 0.0) & (stamps < _TIMES_END_S)  # a driver without times says 0
+        micros = np.rint(stamps[given] * 1e6).astype(np.uint64)
+        frames["t_device_ns"][given] = micros * np.uint64(1000)
     frames["id_flags"] = [
         m.arbitration_id
         | (EXTENDED_FLAG if m.is_extended_id and not m.is_error_frame else 0)

@@ -29,6 +29,7 @@ SO_RCVBUFFORCE = 33
 """Socket option: receive buffer beyond the system's limit, for the superuser."""
 
 _CONTROL = 128
+_EMPTY = 2**32 - 1  # no packet has this size
 _SLACK_NS = 20_000_000
 
 
@@ -99,12 +100,8 @@ class ReceiveMany:
         self._heads["iovlen"] = 1
         self._heads["control"] = self._control.ctypes.data + row * _CONTROL
         self._heads["controllen"] = _CONTROL
-        self._call = (
-            ctypes.c_void_p(self._heads.ctypes.data),
-            ctypes.c_uint(packets),
-            ctypes.c_int(socket.MSG_DONTWAIT),
-            None,
-        )
+        self._sizes = self._heads["size"]
+        self._call = (ctypes.c_void_p(self._heads.ctypes.data), ctypes.c_uint(packets))
         self._stamps = self._control[:, : _STAMP.itemsize].view(_STAMP)[:, 0]
         drops = self._control[:, _STAMP.itemsize : _STAMP.itemsize + _DROPS.itemsize]
         self._drops = drops.view(_DROPS)[:, 0]
@@ -121,35 +118,99 @@ class ReceiveMany:
         Raises:
             OSError: As ``recvmmsg`` has it.
         """
-        count = int(_RECVMMSG(ctypes.c_int(fileno), *self._call))
-        if count < 0:
-            code = ctypes.get_errno()
-            if code not in (errno.EAGAIN, errno.EINTR):
-                raise OSError(code, os.strerror(code))
-            count = 0
-        if not count:
+        return self.batch(0, self._received(fileno, socket.MSG_DONTWAIT))
+
+    def fill(self, fileno: int) -> int:
+        """Wait for packets in the kernel, the interpreter's lock released, until all rows are full.
+
+        Meanwhile :meth:`arrived` and :meth:`batch` give another thread what is there already.
+        :meth:`clear` comes before.
+
+        Args:
+            fileno: The socket, blocking.
+
+        Returns:
+            How many rows are filled: fewer after a signal or in front of an error.
+
+        Raises:
+            OSError: As ``recvmmsg`` has it.
+        """
+        return self._received(fileno, 0)
+
+    def clear(self) -> None:
+        """Forget what is there, before the next :meth:`fill`."""
+        self._sizes[:] = _EMPTY
+        self._heads["controllen"] = _CONTROL
+
+    def arrived(self, start: int) -> int:
+        """How far a :meth:`fill` has come.
+
+        The kernel stores the bytes of a packet before its size, and the calls between this look
+        and the reading of the bytes take longer than a store needs to be seen by another core.
+
+        Args:
+            start: Rows known to be filled.
+
+        Returns:
+            Rows that are filled.
+        """
+        empty = self._sizes[start:] == _EMPTY
+        return start + int(empty.argmax()) if empty.any() else self.capacity
+
+    def sizes(self, count: int) -> list[int]:
+        """Sizes of the first packets.
+
+        Args:
+            count: How many.
+
+        Returns:
+            Bytes of each.
+        """
+        sizes: list[int] = self._sizes[:count].tolist()
+        return sizes
+
+    def batch(self, start: int, stop: int) -> Batch:
+        """Packets that are there.
+
+        Args:
+            start: Of these rows,
+            stop: up to this one.
+
+        Returns:
+            The packets.
+        """
+        if start == stop:
             return Batch(self._packets[:0], [], [], [], None)
-        heads = self._heads[:count]
+        heads = self._heads[start:stop]
         used: list[int] = heads["controllen"].tolist()
         heads["controllen"] = _CONTROL  # for the next call
         stamps_ns = [
             s * 1_000_000_000 + ns if kind == _TIME_KIND and room >= _STAMP.itemsize else 0
-            for (_, kind, s, ns), room in zip(self._stamps[:count].tolist(), used, strict=True)
+            for (_, kind, s, ns), room in zip(self._stamps[start:stop].tolist(), used, strict=True)
         ]
         drops = None
         if max(used) > _STAMP.itemsize:
-            rows = zip(self._drops[:count].tolist(), used, strict=True)
+            rows = zip(self._drops[start:stop].tolist(), used, strict=True)
             told = [
                 n for (_, kind, n), room in rows if kind == _DROPS_KIND and room > _STAMP.itemsize
             ]
             drops = told[-1] if told else None
         return Batch(
-            packets=self._packets[:count],
+            packets=self._packets[start:stop],
             sizes=heads["size"].tolist(),
             flags=heads["flags"].tolist(),
             stamps_ns=stamps_ns,
             drops=drops,
         )
+
+    def _received(self, fileno: int, flags: int) -> int:
+        count = int(_RECVMMSG(ctypes.c_int(fileno), *self._call, ctypes.c_int(flags), None))
+        if count < 0:
+            code = ctypes.get_errno()
+            if code not in (errno.EAGAIN, errno.EINTR):
+                raise OSError(code, os.strerror(code))
+            count = 0
+        return count
 
 
 class ArrivalClock:

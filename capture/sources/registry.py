@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from importlib.metadata import EntryPoint, entry_points
 from typing import cast
 
-from ..errors import MissingExtraError, UsageError
+from ..errors import MissingExtraError, SourceError, UndulogError, UsageError
 from ..strict_table import listed
 from .address import parse_address
 from .contract import ENTRY_POINTS, Source, SourceAddress
@@ -32,7 +32,7 @@ def open_source(address: SourceAddress) -> Source:
     Raises:
         UsageError: If there is no such scheme or its options are wrong.
         MissingExtraError: If the scheme needs an extra that is not installed.
-        SourceError: If it can never work here.
+        SourceError: If it can never work here, or its plug-in fails.
     """
     found = entry_points(group=ENTRY_POINTS, name=address.scheme)
     if not found:
@@ -72,8 +72,11 @@ def open_sources(texts: Iterable[str]) -> list[Source]:
 def _open(entry: EntryPoint, address: SourceAddress) -> Source:
     try:
         return cast("Callable[[SourceAddress], Source]", entry.load())(address)
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").split(".")[0]
-        if missing not in _EXTRAS:
-            raise  # a fault of the installation, not an extra left out
-        raise MissingExtraError(address.text, _EXTRAS[missing], missing) from error
+    except UndulogError:
+        raise
+    except Exception as error:
+        missing = (getattr(error, "name", None) or "").split(".")[0]
+        if isinstance(error, ModuleNotFoundError) and missing in _EXTRAS:
+            raise MissingExtraError(address.text, _EXTRAS[missing], missing) from error
+        fault = f"{entry.value} can't be opened: {error!r}"  # a plug-in, or the installation
+        raise SourceError(address.text, fault) from error

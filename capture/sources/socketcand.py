@@ -17,14 +17,17 @@ from .contract import SourceAddress
 from .events import Tally
 from .link import LinkedSource
 from .options import number, only
+from .receive_many import ArrivalClock
+from .receive_thread import ReceiveThread
 from .socketcand_text import SocketcandText
 
 PORT = 29536
 """Where socketcand listens unless told otherwise."""
 
 _CONNECT_S = 5.0
-_CHUNK = 1 << 18
-_MOST_BYTES = 1 << 21
+_PIECE = 4096  # bytes that share a time of arrival: those of one segment, mostly fewer
+_MOST_PIECES = 512  # in one read
+_LATEST_NS = 1_000_000_000  # a piece is taken from the kernel within this time
 _LONGEST_ANSWER = 4096
 
 
@@ -41,43 +44,42 @@ class SocketcandLink:
             first: What came already behind the last answer.
             tally: Where to count.
         """
-        self._socket = sock
         self._first = first
-        self._buffer = memoryview(bytearray(_CHUNK))
         self._text = SocketcandText()
         self._tally = tally
-        self._error: OSError | None = None
-        sock.setblocking(False)
+        self._clock = ArrivalClock(tally.now_ns)
+        self._floor_ns = tally.now_ns()
+        self._receiver = ReceiveThread(sock, _PIECE)
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:
         """See :meth:`Link.read`."""
-        if self._error is not None:
-            raise self._error
-        chunks = [self._first] if self._first else []
-        self._first = b""
-        size = 0
-        try:
-            while size < _MOST_BYTES:
-                count = self._socket.recv_into(self._buffer)
-                if not count:
-                    raise ConnectionResetError(errno.ECONNRESET, "the server closed the connection")
-                chunks.append(self._buffer[:count].tobytes())
-                size += count
-                if count < len(self._buffer):
-                    break
-        except BlockingIOError:
-            pass
-        except OSError as error:
-            if not chunks:
-                raise
-            self._error = error  # first hand out what came before
-        if not chunks:
-            return ()
-        return (self._text.feed(b"".join(chunks), now_ns, self._tally),)
+        pieces: list[bytes] = []
+        times_ns: list[int] = []
+        if self._first:
+            pieces.append(self._first)
+            times_ns.append(now_ns)
+            self._first = b""
+        batches = self._receiver.take(_MOST_PIECES)
+        ended = self._receiver.ended
+        for batch in batches:
+            pieces += [
+                row[:size].tobytes() for row, size in zip(batch.packets, batch.sizes, strict=True)
+            ]
+            found = self._clock.times(batch.stamps_ns, self._floor_ns)
+            self._floor_ns = found[-1]
+            times_ns += found
+        if pieces:
+            return (self._text.feed_pieces(pieces, times_ns, self._tally),)
+        self._floor_ns = max(self._floor_ns, now_ns - _LATEST_NS)
+        if ended:
+            raise self._receiver.error or ConnectionResetError(
+                errno.ECONNRESET, "the server closed the connection"
+            )
+        return ()
 
     def close(self) -> None:
         """Close the connection."""
-        self._socket.close()
+        self._receiver.close()
 
 
 def server_of(address: SourceAddress) -> tuple[str, int]:

@@ -4,15 +4,20 @@ A frame is ``< frame 123 1700000000.123456 1122AABB >``: an identifier of three 
 eight (29 bit), the server's time, the data, with some servers with blanks between the bytes. One
 expression finds them all. What is rare is read one by one: remote requests
 ``< rtr 123 TIME LENGTH >``, error frames ``< error CLASSES TIME >``, times with another number of
-decimals, and whatever is broken.
+decimals or out of range, and whatever is broken.
 """
 
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
 
 from ..log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
-from .events import Tally
+from .events import ODD_TIME, Tally
 from .records import pack_record, records
 
 _FRAMES = re.compile(
@@ -20,10 +25,12 @@ _FRAMES = re.compile(
 )
 _MESSAGE = re.compile(r"<[^<>]*>")
 _ANY = re.compile(
-    r"< *(frame|rtr|error) +([0-9A-Fa-f]{1,8}) +(\d{1,10})(?:\.(\d{1,9}))?"
+    r"< *(frame|rtr|error) +([0-9A-Fa-f]{1,8})"
+    r" +(-?\d+(?:\.\d*)?(?:[Ee][-+]?\d+)?|-?(?:[Nn][Aa][Nn]|[Ii][Nn][Ff]))"
     r"(?: +([0-9A-Fa-f ]*?))? *>",
     re.ASCII,
 )
+_TIME = re.compile(r"(\d{1,10})(?:\.(\d{1,9}))?", re.ASCII)
 _WORD = re.compile(r"< *(hi|ok|echo) *>")
 _TOLD = re.compile(r"< *(error\b[^>]*?) *>")
 _LONGEST = 400  # a CAN FD frame with 64 bytes and blanks has about 220
@@ -39,7 +46,7 @@ class SocketcandText:
         self._rest = b""
 
     def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> FrameArray:
-        """Take what was read.
+        """Take what was read at once.
 
         Args:
             chunk: The bytes.
@@ -49,7 +56,23 @@ class SocketcandText:
         Returns:
             The frames whose messages have ended.
         """
-        whole = self._rest + chunk
+        return self.feed_pieces((chunk,), (t_ns,), tally)
+
+    def feed_pieces(
+        self, pieces: Sequence[bytes], times_ns: Sequence[int], tally: Tally
+    ) -> FrameArray:
+        """Take what came in pieces.
+
+        Args:
+            pieces: The bytes.
+            times_ns: When each piece came [Unix ns].
+            tally: Where to count what is malformed.
+
+        Returns:
+            The frames whose messages have ended, with the time of the piece that ended them.
+        """
+        whole = b"".join((self._rest, *pieces))
+        begun = len(self._rest)
         end = whole.rfind(b">") + 1
         self._rest = whole[end:]
         if len(self._rest) > _LONGEST:
@@ -58,13 +81,17 @@ class SocketcandText:
         found: list[tuple[str, str, str, str]] = _FRAMES.findall(text)
         packed = None
         if len(found) == text.count("<") == text.count(">"):
-            packed = _together(found, t_ns)
-        if packed is None:
-            packed = _one_by_one(text, t_ns, tally)
-        return records(packed)
+            packed = _together(found)
+        if packed is not None:
+            frames = records(packed)
+            counts = [piece.count(b">") for piece in pieces]
+            frames["t_host_ns"] = np.repeat(np.array(times_ns, dtype=np.uint64), counts)
+            return frames
+        stops = list(accumulate(map(len, pieces), initial=begun))[1:]
+        return records(_one_by_one(text, stops, times_ns, tally))
 
 
-def _together(found: list[tuple[str, str, str, str]], t_ns: int) -> list[bytes] | None:
+def _together(found: list[tuple[str, str, str, str]]) -> list[bytes] | None:
     """Records from their fields; None if an identifier is too high for its number of digits."""
     packed: list[bytes] = []
     for digits, seconds, micros, field in found:
@@ -76,15 +103,22 @@ def _together(found: list[tuple[str, str, str, str]], t_ns: int) -> list[bytes] 
         elif flags > _HIGHEST_STANDARD:
             return None
         data = bytes.fromhex(field)
-        packed.append(pack_record(int(seconds + micros) * 1000, t_ns, flags, len(data), 0, data))
+        packed.append(pack_record(int(seconds + micros) * 1000, 0, flags, len(data), 0, data))
     return packed
 
 
-def _one_by_one(text: str, t_ns: int, tally: Tally) -> list[bytes]:
-    messages = _MESSAGE.findall(text)
+def _one_by_one(
+    text: str, stops: Sequence[int], times_ns: Sequence[int], tally: Tally
+) -> list[bytes]:
+    """Records of all messages; ``stops`` are the ends of the pieces that they came in."""
+    messages = list(_MESSAGE.finditer(text))
     broken = text.count("<") + text.count(">") - 2 * len(messages)
     tally.malformed("malformed message", broken)
-    return [record for message in messages if (record := _record(message, t_ns, tally))]
+    return [
+        record
+        for message in messages
+        if (record := _record(message[0], times_ns[bisect_left(stops, message.end())], tally))
+    ]
 
 
 def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
@@ -97,11 +131,11 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
         elif not _WORD.fullmatch(message):
             tally.malformed("malformed message", 1)
         return None
-    kind, digits, seconds, fraction, rest = found.groups(default="")
-    t_ns = int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))
+    kind, digits, stamp, rest = found.groups(default="")
     identifier = int(digits, 16)
     if kind == "error":  # the server keeps the details to itself
-        return pack_record(t_ns, t_host_ns, identifier & ID_MASK | ERROR_FLAG, 0, 0, b"")
+        flags = identifier & ID_MASK | ERROR_FLAG
+        return pack_record(_time_ns(stamp, t_host_ns, tally), t_host_ns, flags, 0, 0, b"")
     extended = len(digits) > 3
     flags = extended * EXTENDED_FLAG
     rest = rest.replace(" ", "")
@@ -118,4 +152,15 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     if data is None or not 0 <= length <= 8 or identifier > highest:
         tally.malformed("malformed message", 1)
         return None
+    t_ns = _time_ns(stamp, t_host_ns, tally)
     return pack_record(t_ns, t_host_ns, identifier | flags, length, 0, data)
+
+
+def _time_ns(stamp: str, t_host_ns: int, tally: Tally) -> int:
+    """A frame's time; that of its arrival where the server's is negative, infinite or too long."""
+    found = _TIME.fullmatch(stamp)
+    if found is None:
+        tally.malformed(ODD_TIME, 1)
+        return t_host_ns
+    seconds, fraction = found.groups(default="")
+    return int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))

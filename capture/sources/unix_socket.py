@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import select
 import socket
 import stat
+import threading
+import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,17 +23,24 @@ import numpy as np
 
 from ..errors import SourceError, UsageError
 from ..log.frames import FrameArray, frames_from_bytes
+from ..priority import share_priority
 from ..robot import ClockDomain, Robot
 from .bus_watch import BusWatch
 from .contract import Polled, Source, SourceAddress, SourceContext, SourceCounts
 from .events import Tally
 from .options import flag, only
 from .packets import HEAD, LONGEST, MOST_RECORDS, RECORD_SIZE
-from .receive_many import SO_TIMESTAMPNS, ArrivalClock, Batch, ReceiveMany
+from .receive_many import ArrivalClock, Batch
+from .receive_thread import ReceiveThread
 
-_PACKETS = 128
-_MOST_BATCHES = 64  # in one poll, of one sender: others want to be heard too
+_MOST_PACKETS = 8192  # in one poll, of one sender: others want to be heard too
 _BACKLOG = 64
+MOST_SENDERS = 64
+"""Connections at once. One more takes the place of the sender that was silent longest."""
+_PAUSE_S = 0.1
+_ORDER_S = 0.002  # in one poll,
+_MOST_WAIT_S = 0.02  # and over several: a thread that gets no processor
+_LATEST_NS = 1_000_000_000  # a packet is taken from the kernel within this time
 _SHAPES = {
     head + count * RECORD_SIZE: (count, head)
     for head in (0, HEAD.size)
@@ -39,17 +48,19 @@ _SHAPES = {
     if head or count
 }
 """Size of a packet to its number of records and the size of its head."""
-_GONE = select.EPOLLHUP | select.EPOLLRDHUP | select.EPOLLERR
 
 
 @dataclass
 class _Sender:
     """One connection."""
 
-    sock: socket.socket
+    receiver: ReceiveThread
     floor_ns: int
+    last_ns: int
     expected: int | None = None
     dropped: int = 0
+    spoke: bool = False
+    leaves: bool = False
 
 
 class UnixSource:
@@ -71,13 +82,15 @@ class UnixSource:
         self._clock = clock
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
-        self._receive = ReceiveMany(_PACKETS, LONGEST + 1)
         self._arrivals = ArrivalClock(self._tally.now_ns)
         self._listener: socket.socket | None = None
-        self._epoll: select.epoll | None = None
+        self._acceptor: threading.Thread | None = None
         self._inode: tuple[int, int] | None = None
-        self._senders: dict[int, _Sender] = {}
+        self._new: deque[_Sender] = deque()
+        self._senders: list[_Sender] = []
         self._had_sender = False
+        self._waits_since = 0.0
+        self._ending = False
         self._finished = False
 
     @property
@@ -112,8 +125,8 @@ class UnixSource:
 
     @property
     def finished(self) -> bool:
-        """Whether it was stopped: a sender may come at any time."""
-        return self._finished
+        """Whether it was stopped, or ended and handed out all: a sender may come at any time."""
+        return self._finished or (self._ending and not self._senders and not self._new)
 
     def start(self, context: SourceContext) -> None:
         """Listen.
@@ -128,7 +141,7 @@ class UnixSource:
         self._tally = Tally(context.now_ns)
         self._arrivals = ArrivalClock(context.now_ns)
         _clear(self._address.text, self._path)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             os.fchmod(listener.fileno(), 0o600)  # before it has a name: no moment without
             listener.bind(str(self._path))
@@ -142,8 +155,10 @@ class UnixSource:
             )
         self._listener = listener
         self._inode = (made.st_dev, made.st_ino)
-        self._epoll = select.epoll()
-        self._epoll.register(listener.fileno(), select.EPOLLIN)
+        self._acceptor = threading.Thread(
+            target=self._accept, args=(listener,), name="undulog-accept", daemon=True
+        )
+        self._acceptor.start()
         self._tally.events.say("info", f"listens at {self._path}")
 
     def poll(self) -> Polled:
@@ -152,20 +167,18 @@ class UnixSource:
         Returns:
             Frames, of all senders in the order of their arrival, and events.
         """
-        if self._epoll is None or self._listener is None:
+        if self._finished:
             return Polled((), self._tally.events.flush())
+        while self._new:
+            self._welcome(self._new.popleft())
         found: list[FrameArray] = []
         heard = 0
-        for fileno, mask in self._epoll.poll(0, _BACKLOG + 1):
-            if fileno == self._listener.fileno():
-                new = self._accept()
-                senders = [(sender, False) for sender in new]
-            else:
-                senders = [(self._senders[fileno], bool(mask & _GONE))]
-            for sender, gone in senders:
-                before = len(found)
-                self._drain(sender, gone, found)
-                heard += len(found) > before
+        if self._out_of_step():
+            return Polled((), self._tally.events.take())
+        for sender in tuple(self._senders):
+            before = len(found)
+            self._drain(sender, found)
+            heard += len(found) > before
         if not found:
             return Polled((), self._tally.events.take())
         frames = found[0] if len(found) == 1 else np.concatenate(found)
@@ -175,15 +188,27 @@ class UnixSource:
         self._watch.look(frames, self._tally)
         return Polled((frames,), self._tally.events.take())
 
+    def end(self) -> None:
+        """See :meth:`capture.sources.contract.EndingSource.end`: senders get an error from now on.
+
+        What they could send before comes with the next polls.
+        """
+        if self._ending or self._listener is None or self._acceptor is None:
+            return
+        self._listener.shutdown(socket.SHUT_RD)  # who waits is still let in
+        self._acceptor.join()
+        for sender in (*self._new, *self._senders):
+            sender.receiver.end()
+        self._ending = True
+
     def stop(self) -> None:
         """Disconnect everybody and remove the socket."""
+        self.end()
         self._finished = True
-        for sender in self._senders.values():
-            sender.sock.close()
+        for sender in (*self._new, *self._senders):
+            sender.receiver.close()
+        self._new.clear()
         self._senders.clear()
-        if self._epoll is not None:
-            self._epoll.close()
-            self._epoll = None
         if self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -192,68 +217,83 @@ class UnixSource:
                 if (there.st_dev, there.st_ino) == self._inode:  # not another recorder's
                     self._path.unlink()
 
-    def _accept(self) -> list[_Sender]:
-        """Let in who waits."""
-        new: list[_Sender] = []
-        if self._listener is None or self._epoll is None:
-            return new
+    def _accept(self, listener: socket.socket) -> None:
+        """Let senders in and begin to receive at once: their buffers hold only milliseconds."""
+        share_priority()
         while True:
             try:
-                sock, _ = self._listener.accept()
-            except BlockingIOError:
-                return new
+                sock, _ = listener.accept()
             except OSError as error:
+                if error.errno == errno.EINVAL:  # shut down
+                    return
                 if error.errno != errno.ECONNABORTED:
                     reason = error.strerror or str(error)
                     self._tally.events.say("error", f"can't accept a sender: {reason}")
-                return new
-            sock.setblocking(False)
-            sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-            back = self._had_sender and not self._senders
-            self._had_sender = True
-            self._tally.counts.reconnects += back
-            self._tally.events.say("info", "a sender is back" if back else "a sender connected")
-            new.append(_Sender(sock, self._tally.now_ns()))
-            self._senders[sock.fileno()] = new[-1]
-            self._epoll.register(sock.fileno(), select.EPOLLIN | select.EPOLLRDHUP)
+                    time.sleep(_PAUSE_S)
+                continue
+            now_ns = self._tally.now_ns()
+            self._new.append(_Sender(ReceiveThread(sock, LONGEST + 1), now_ns, now_ns))
 
-    def _drain(self, sender: _Sender, gone: bool, found: list[FrameArray]) -> None:
+    def _welcome(self, sender: _Sender) -> None:
+        back = self._had_sender and not self._senders
+        self._had_sender = True
+        self._tally.counts.reconnects += back
+        self._tally.events.say("info", "a sender is back" if back else "a sender connected")
+        self._senders.append(sender)
+        stay = [each for each in self._senders if not each.leaves]
+        if len(stay) > MOST_SENDERS:
+            longest = min(stay, key=lambda each: (each.spoke, each.last_ns))
+            text = f"more than {MOST_SENDERS} senders: the one silent for longest is disconnected"
+            self._tally.events.say("warn", text)
+            longest.leaves = True
+            longest.receiver.end()  # what it could send before is still taken
+
+    def _out_of_step(self) -> bool:
+        """Whether to wait for a sender's thread, so that the frames of all stay in order."""
+        if len(self._senders) < 2:
+            return False
+        now = time.monotonic()
+        deadline = now + _ORDER_S
+        while any(each.receiver.pending for each in self._senders):
+            if time.monotonic() >= deadline:
+                self._waits_since = self._waits_since or now
+                return now - self._waits_since < _MOST_WAIT_S
+            time.sleep(_ORDER_S / 10)
+        self._waits_since = 0.0
+        return False
+
+    def _drain(self, sender: _Sender, found: list[FrameArray]) -> None:
         """Take a sender's packets; afterwards let it go if it has gone."""
-        for _ in range(_MOST_BATCHES):
-            looked_ns = self._tally.now_ns()
-            try:
-                batch = self._receive.receive(sender.sock.fileno())
-            except ConnectionError:
-                self._forget(sender)
-                return
-            if 0 in batch.sizes:  # beyond a sender's last packet, reads are empty
-                gone = gone or _hung_up(sender.sock)
-            if gone and not any(batch.sizes):
-                self._forget(sender)
-                return
-            if len(batch.sizes):
-                times = self._arrivals.times(batch.stamps_ns, sender.floor_ns)
-                sender.floor_ns = times[-1]
-                frames = self._unpack(sender, batch, times, gone)
-                if len(frames):
-                    found.append(frames)
-            else:
-                sender.floor_ns = looked_ns
-            if len(batch.sizes) < self._receive.capacity and not gone:
-                return
+        looked_ns = self._tally.now_ns()
+        batches = sender.receiver.take(_MOST_PACKETS)
+        gone = sender.receiver.ended
+        for batch in batches:
+            times = self._arrivals.times(batch.stamps_ns, sender.floor_ns)
+            sender.floor_ns = times[-1]
+            frames = self._unpack(sender, batch, times)
+            if len(frames):
+                found.append(frames)
+                sender.spoke, sender.last_ns = True, times[-1]
+        if not batches:
+            sender.floor_ns = max(sender.floor_ns, looked_ns - _LATEST_NS)
+        if gone:
+            self._forget(sender)
 
-    def _unpack(self, sender: _Sender, batch: Batch, times: list[int], gone: bool) -> FrameArray:
+    def _unpack(self, sender: _Sender, batch: Batch, times: list[int]) -> FrameArray:
         flat = batch.packets.reshape(-1).data
         width = batch.packets.shape[1]
         pieces: list[memoryview] = []
         arrivals: list[int] = []
         counts: list[int] = []
         malformed = 0
+        empty = 0  # beyond a sender's last packet, reads are empty
         for row, (size, time_ns) in enumerate(zip(batch.sizes, times, strict=True)):
             shape = _SHAPES.get(size)  # one that is too long is cut to a size that isn't there
             if shape is None:
-                malformed += bool(size) or not gone
+                malformed += empty + 1 if size else 0
+                empty = 0 if size else empty + 1
                 continue
+            malformed, empty = malformed + empty, 0
             count, head = shape
             start = row * width
             if head:
@@ -280,18 +320,9 @@ class UnixSource:
             self._tally.events.say("warn", "frame lost before it reached us", lost)
 
     def _forget(self, sender: _Sender) -> None:
-        fileno = sender.sock.fileno()
-        if self._epoll is not None:
-            self._epoll.unregister(fileno)
-        del self._senders[fileno]
-        sender.sock.close()
+        self._senders.remove(sender)
+        sender.receiver.close()
         self._tally.events.say("warn", "a sender disconnected")
-
-
-def _hung_up(sock: socket.socket) -> bool:
-    poll = select.poll()
-    poll.register(sock.fileno(), select.POLLRDHUP)
-    return bool(poll.poll(0))
 
 
 def open_unix(address: SourceAddress) -> Source:

@@ -1,6 +1,5 @@
-"""What the tests of sources share: a recording, random bus traffic, and patience; small disks."""
+"""What the tests of sources share: a recording, random bus traffic, and patience."""
 
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -66,27 +65,6 @@ class Heard:
     @property
     def texts(self) -> list[str]:
         return [event.text for event in self.events]
-
-
-@pytest.fixture
-def disk_of(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
-    """Mounts a file system of a size, e.g. ``4m``; skips where that is not permitted."""
-    place = tmp_path / "disk"
-
-    def mount(size: str) -> Path:
-        place.mkdir()
-        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-        except OSError as error:
-            pytest.skip(f"no mount: {error}")
-        if done.returncode:
-            pytest.skip(f"mounting is not permitted here: {done.stderr.strip()}")
-        return place
-
-    yield mount
-    if place.is_mount():
-        subprocess.run(["umount", str(place)], check=True)
 
 
 @pytest.fixture

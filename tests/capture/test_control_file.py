@@ -14,7 +14,7 @@ import pytest
 
 from capture.daemon.control import TEND_POLLS, ControlServer
 from capture.daemon.control_client import ControlClient
-from capture.daemon.control_socket import default_socket, find_sockets, socket_folder
+from capture.daemon.control_socket import default_sockets, find_sockets, socket_folder
 from capture.errors import ControlError
 
 shared = runpy.run_path(str(Path(__file__).with_name("control_clients.py")))
@@ -138,7 +138,7 @@ def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
 def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_in(tmp_path):
     session = tmp_path / "user"
     session.mkdir()
-    path = default_socket(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(session)})
+    path, _ = default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(session)})
     server = ControlServer(path, echo)
     with connected(server) as client:
         client.sendall(b'{"do": "x"}\n')
@@ -161,7 +161,7 @@ def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_
 
 def test_the_usual_place_and_finding_what_runs(tmp_path):
     environ = {"XDG_RUNTIME_DIR": str(tmp_path)}
-    path = default_socket(Path("somewhere/run.mcap"), environ)
+    path, _ = default_sockets(Path("somewhere/run.mcap"), environ)
     assert path == tmp_path / "undulog" / "run.sock"
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
     stale = path.with_name("stale.sock")
@@ -191,4 +191,4 @@ def test_a_folder_of_another_user_is_not_trusted(tmp_path):
     (tmp_path / "undulog").mkdir()
     os.chown(tmp_path / "undulog", 65534, 65534)
     with pytest.raises(ControlError, match="not a folder of this user"):
-        default_socket(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(tmp_path)})
+        default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(tmp_path)})

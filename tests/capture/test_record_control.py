@@ -223,3 +223,30 @@ def test_the_unit_is_printed_with_this_installation_s_command(place, capsys):
     code, out, _ = said(capsys, "unit")
     assert code == 0
     assert f"ExecStart={sys.prefix}/bin/undulog record --settings /etc/undulog/%i.toml" in out
+
+
+def test_two_outputs_of_one_name_in_two_folders(place, capsys):
+    processes = []
+    for folder in ("a", "b"):
+        (place / folder).mkdir()
+        command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/{folder}.frames"]
+        command += ["-o", str(place / folder / "run.mcap"), "--quiet", "--floor", "0"]
+        processes.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while len(find_sockets(os.environ)) < 2:
+            assert time.monotonic() < deadline
+            for process in processes:
+                assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
+        _, out, _ = said(capsys, "status", "--json")
+        found = {each["output"]: each["socket"] for each in json.loads(out)["recordings"]}
+        assert set(found) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
+        assert f"{place}/r/undulog/run.sock" in found.values()
+        for socket in found.values():
+            assert said(capsys, "stop", "--wait", "--socket", socket)[0] == 0
+        assert [process.wait(PATIENCE_S) for process in processes] == [0, 0]
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()

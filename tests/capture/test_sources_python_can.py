@@ -83,6 +83,19 @@ def test_a_driver_without_times_gets_those_of_arrival() -> None:
     assert frames["t_device_ns"].tolist() == [123, 1_500_000_000]
 
 
+def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, listen) -> None:
+    heard = listen(source_at("?device_time=1&preserve_timestamps=1"))
+    heard.until_event("connected")
+    times = (float("nan"), float("inf"), -1.5, 1e300, 9.3e9, 4611686018.5)
+    for k, time_s in enumerate((*times, 5.25)):
+        bus.send(can.Message(arbitration_id=k, timestamp=time_s))
+    found = heard.until_frames(len(times) + 1)
+    assert np.array_equal(found["t_device_ns"][:-1], found["t_host_ns"][:-1])
+    assert found["t_device_ns"][-1] == 5_250_000_000
+    assert heard.source.counts.malformed == len(times)
+    assert heard.source.counts.reconnects == 0
+
+
 def test_error_frames(bus, listen) -> None:
     heard = listen(source_at())
     heard.until_event("connected")

@@ -220,6 +220,15 @@ def test_other_decimals_and_other_widths() -> None:
     assert tally.counts.malformed == 0
 
 
+def test_a_time_out_of_range_is_replaced_by_the_arrivals_and_counted() -> None:
+    tally = Tally(lambda: 0)
+    times = ("-1.5", "nan", "-inf", "1e300", "99999999999.0", "9" * 300, "5.5")
+    stream = "".join(f"< frame 123 {time_s} 11 >< rtr 123 {time_s} 3 >" for time_s in times)
+    found = SocketcandText().feed(stream.encode(), 77, tally)
+    assert found["t_device_ns"].tolist() == [77] * 2 * 6 + [5_500_000_000] * 2
+    assert tally.counts.malformed == 12
+
+
 def test_can_fd_frames_are_left_out_and_told(traffic, same) -> None:
     truth = traffic(3)
     tally = Tally(lambda: 0)

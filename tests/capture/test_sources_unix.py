@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from capture.robot import ClockDomain
 from capture.sources.address import parse_address
 from capture.sources.registry import open_source
 from capture.sources.sender import FrameSender
+from capture.sources.unix_socket import MOST_SENDERS
 
 # Knows nothing of us but the packets: 32 bytes a frame, packed by struct.
 FOREIGN = """
@@ -199,11 +201,13 @@ def test_arrival_is_when_it_came_not_when_it_was_fetched(tmp_path, listen, peer,
 def test_two_senders_are_put_in_the_order_of_arrival(tmp_path, listen, peer) -> None:
     heard = listen(source_at(tmp_path / "snake.sock"))
     one, two = peer(), peer()
-    heard.until(lambda: heard.texts.count("a sender connected") + len(heard.texts) >= 2)
+    heard.until(lambda: len(heard.source._senders) == 2)
     frames = empty_frames(40)
     frames["id_flags"] = np.arange(40)
     for number in range(40):
         (one, two)[number % 3 == 0].send(frames[number : number + 1].tobytes())
+    while any(sender.receiver.pending for sender in heard.source._senders):
+        time.sleep(0.001)
     found = heard.until_frames(40)
     assert found["id_flags"].tolist() == list(range(40))
 
@@ -248,8 +252,11 @@ def test_our_sender_waits_for_a_recorder_and_for_the_next_one(tmp_path, context,
         while sender.send(truth) == 0:
             assert time.monotonic() < deadline
             time.sleep(0.01)
-        frames = np.concatenate([*source.poll().frames])
-        assert len(frames) == 10
+        count = 0
+        while count < 10:
+            assert time.monotonic() < deadline
+            count += sum(map(len, source.poll().frames))
+        assert count == 10
         assert source.counts.dropped == 0  # what was refused without a recorder is not its loss
         source.stop()
         while sender.connected:
@@ -257,6 +264,46 @@ def test_our_sender_waits_for_a_recorder_and_for_the_next_one(tmp_path, context,
     sender.close()
     with pytest.raises(DataError, match="records of 32 bytes"):
         sender.send(np.zeros(3))
+
+
+def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(
+    tmp_path, listen, peer
+) -> None:
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    worker = peer()
+    worker.send(foreign_truth(0, 3).tobytes())
+    heard.until_frames(3)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    idle = []
+    for _ in range(3 * MOST_SENDERS):
+        idle.append(peer())
+        heard.poll()
+    deadline = time.monotonic() + 10
+    while len(list(Path("/proc/self/fd").iterdir())) - before - len(idle) > MOST_SENDERS:
+        assert time.monotonic() < deadline
+        heard.poll()
+    heard.until_event("more than 64 senders")
+    worker.send(foreign_truth(3, 4).tobytes())  # who sends is not silent
+    heard.until_frames(7)
+    with pytest.raises(BrokenPipeError):
+        idle[1].send(foreign_truth(0, 1).tobytes())
+    idle[-1].send(foreign_truth(0, 1).tobytes())
+    heard.until_frames(8)
+
+
+def test_no_frame_of_a_sender_that_gives_its_place_is_lost(tmp_path, listen, peer) -> None:
+    """Every sender's packets are counted by itself; none that was accepted is missing."""
+    heard = listen(source_at(tmp_path / "snake.sock"))
+    accepted = 0
+    senders = []
+    for _ in range(3 * MOST_SENDERS):
+        senders.append(peer())
+        for sender in senders[-2 * MOST_SENDERS :: 7]:
+            with suppress(BrokenPipeError):
+                accepted += sender.send(foreign_truth(accepted, 1).tobytes()) == 32
+        if len(senders) % 5 == 0:
+            heard.poll()
+    assert len(heard.until_frames(accepted)) == accepted > 3 * MOST_SENDERS
 
 
 def test_error_frames_are_counted(tmp_path, listen, peer) -> None:
