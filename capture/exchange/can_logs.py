@@ -15,10 +15,10 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 from ..errors import ImportFormatError
@@ -48,17 +48,28 @@ CSV_HEADER = "timestamp,arbitration_id,"
 _MOST_TEXTS = 20  # different warnings of a library that are told
 _LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
 _WITHOUT_DIRECTIONS = (".csv", ".db")
-_READ_ERRORS = (
-    ValueError,  # text that is no number, a wrong file version
-    IndexError,
-    KeyError,
-    TypeError,
-    EOFError,
-    OSError,
-    struct.error,
-    zlib.error,
-    sqlite3.Error,
-)
+_LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
+_HIGHEST_ID = 0x1FFF_FFFF
+_MOST_BYTES = 64
+
+
+def _read_errors() -> tuple[type[Exception], ...]:
+    """What python-can's readers raise on damaged files."""
+    from can.io.blf import BLFParseError
+
+    return (
+        ValueError,  # text that is no number, a wrong file version
+        LookupError,
+        TypeError,
+        AttributeError,  # of None
+        ArithmeticError,  # infinite or huge times
+        EOFError,
+        OSError,
+        struct.error,
+        zlib.error,
+        sqlite3.Error,
+        BLFParseError,
+    )
 
 
 @contextmanager
@@ -115,22 +126,43 @@ def _reader(path: Path) -> MessageReader:
 
     try:
         if log_suffix(path) == ".blf" and path.suffix != ".gz":
-            _check_blf(path)  # its reader would leave the file open
+            return _blf_reader(path)
+        if log_suffix(path) == ".db":
+            _check_database(path)
         return LogReader(path)
-    except _READ_ERRORS as error:
+    except _read_errors() as error:
         raise ImportFormatError(path, f"can't be read: {error}") from error
 
 
-def _check_blf(path: Path) -> None:
-    with path.open("rb") as stream:
+def _blf_reader(path: Path) -> MessageReader:
+    """The reader of a BLF file, which would leave the file open where its header is damaged."""
+    from can import BLFReader
+
+    with ExitStack() as stack:
+        stream = stack.enter_context(path.open("rb"))
         if stream.read(4) != b"LOGG":
             raise ValueError("not a BLF file")
+        stream.seek(0)
+        reader = BLFReader(stream)
+        stack.pop_all()  # the reader closes it
+        return reader
+
+
+def _check_database(path: Path) -> None:
+    """Refuse data that is a number: the reader would take it for a number of bytes."""
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as base:
+        number = "typeof(data) IN ('integer', 'real')"
+        count = base.execute(f"SELECT count(*) FROM messages WHERE {number}").fetchone()[0]  # noqa: S608
+    if count:
+        raise ValueError(f"{count} rows have a number as data")
 
 
 def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
     messages = _messages(path, reader)
     if suffix == ".asc":
         messages = map(_with_length_code, messages)
+    odd = _Odd()
+    messages = filter(odd.is_frame, messages)
     first = next(messages, None)
     if first is None:
         raise ImportFormatError(path, "holds no CAN frames")
@@ -144,7 +176,9 @@ def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
         else "as recorded, rounded to 1 us",
     )
     epoch_ns = RELATIVE_EPOCH_NS if relative else 0
-    log.blocks = _blocks(path, chain([first], messages), log, epoch_ns, lambda: _read_part(reader))
+    log.blocks = _blocks(
+        path, chain([first], messages), log, epoch_ns, lambda: _read_part(reader), odd
+    )
     claimed = getattr(reader, "file_size", 0)  # of a BLF file, by its header
     if suffix == ".blf" and claimed > path.stat().st_size:
         log.problems.append(
@@ -168,7 +202,7 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
         for message in reader:
             yield message
             count += 1
-    except _READ_ERRORS as error:
+    except _read_errors() as error:
         text = f"can't be read after {count} frames: {error}"
         raise ImportFormatError(path, text) from error
 
@@ -185,12 +219,13 @@ def _read_part(reader: MessageReader) -> float:
         return 0.0
 
 
-def _blocks(
+def _blocks(  # noqa: PLR0917
     path: Path,
     messages: Iterator[Message],
     log: FrameLog,
     epoch_ns: int,
     done: Callable[[], float],
+    odd: _Odd,
 ) -> Iterator[LogBlock]:
     rows = BlockBuilder()
     unmarked = 0
@@ -201,6 +236,11 @@ def _blocks(
             if len(rows) == FRAMES_PER_BLOCK:
                 yield rows.block(done())
                 rows = BlockBuilder()
+    if odd.count:
+        log.problems.append(
+            f"{odd.count} records are no CAN frames (a time, an identifier, a length or data that "
+            "can't be) and are left out"
+        )
     if unmarked:
         log.problems.append(
             f"{unmarked} frames of more than 8 bytes are CAN FD frames; the log doesn't say so, "
@@ -208,6 +248,29 @@ def _blocks(
         )
     if len(rows):
         yield rows.block(1.0)
+
+
+class _Odd:
+    """Records that a damaged file has as frames, and that can be none."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def is_frame(self, message: Message) -> bool:
+        """Whether a record can be a frame; counts those that can't."""
+        record: Any = message  # a database and a damaged file have any type and value
+        time, identifier, code = record.timestamp, record.arbitration_id, record.dlc
+        sound = (
+            isinstance(time, int | float)
+            and -_LATEST_S < time < _LATEST_S
+            and isinstance(identifier, int)
+            and 0 <= identifier <= _HIGHEST_ID
+            and isinstance(code, int)
+            and 0 <= code <= _MOST_BYTES
+            and isinstance(record.data, bytes | bytearray | memoryview)
+        )
+        self.count += not sound
+        return sound
 
 
 def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, path: Path) -> None:

@@ -6,6 +6,11 @@ is the quantity: ``joint_states.velocity [rad/s]``, ``joint_current [A]``. A row
 of its topic, and nothing in the columns of other topics. Nothing is resampled or filled in: joints
 that were asked one after the other have rows at different times. Rows are sorted by time within a
 topic.
+
+A spreadsheet takes text in a CSV that begins with ``=``, ``+``, ``-`` or ``@`` for a formula. So
+a name of a topic, a joint or a column that begins with such a character, with a tab, a line end or
+an apostrophe has an apostrophe before it in CSV, and only there: take one leading apostrophe away
+to have the name. Numbers are never changed.
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 
@@ -34,6 +39,8 @@ DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())
 """The topics written unless others are named, those of them that the session has."""
 
 _ROWS_PER_BLOCK = 100_000
+_FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
+"""How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
 
 
 @dataclass
@@ -161,8 +168,8 @@ def export_columns(
 def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
     """CSV in UTF-8; floats with as many digits as bring them back exactly, NaN as an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["t_ns", "topic", "joint", *columns])
+        head = ["t_ns", "topic", "joint", *map(_as_text, columns)]
+        _writer(stream, head).writerow(head)
 
         def write(block: RowBlock) -> None:
             empty = [""] * len(block.t_ns)
@@ -170,8 +177,10 @@ def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
                 _cells(block.values[name]) if name in block.values else empty for name in columns
             ]
             row_joints: list[int] = block.joint.tolist()
-            joints = [block.names[j] for j in row_joints]
-            topics = [block.topic] * len(joints)
+            names = [_as_text(name) for name in block.names]
+            joints = [names[j] for j in row_joints]
+            topics = [_as_text(block.topic)] * len(joints)
+            writer = _writer(stream, [*names, *topics[:1]])
             writer.writerows(zip(block.t_ns.tolist(), topics, joints, *cells, strict=True))
 
         yield write
@@ -213,6 +222,18 @@ def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
 
 TABLE_FORMATS: dict[str, TableFormat] = {".csv": _open_csv, ".parquet": _open_parquet}
 """Suffix to what creates a table."""
+
+
+def _writer(stream: TextIO, texts: Sequence[str]) -> Any:
+    """A writer of rows with those texts; a carriage return ends a row where it isn't quoted."""
+    odd = any("\r" in text for text in texts)  # the module doesn't quote for it
+    quoting = csv.QUOTE_NONNUMERIC if odd else csv.QUOTE_MINIMAL
+    return csv.writer(stream, lineterminator="\n", quoting=quoting)
+
+
+def _as_text(name: str) -> str:
+    """A name that no spreadsheet takes for a formula."""
+    return f"'{name}" if name.startswith(_FORMULA) else name
 
 
 def _cells(values: FloatArray) -> list[object]:

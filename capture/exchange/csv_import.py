@@ -7,7 +7,7 @@ import math
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import TextIO
 
@@ -28,6 +28,7 @@ from .import_output import ImportReport, imported_session
 from .undated import RELATIVE_EPOCH_NS
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
+_LATEST_NS = 7_258_118_400 * 1_000_000_000  # the year 2200, and room for an epoch
 _ROWS_PER_UPDATE = 4096
 _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 
@@ -240,9 +241,12 @@ def _time_ns(
 ) -> int:
     """A time in ns, without going through a double, which can't hold Unix times to the ns."""
     try:
-        return round(Decimal(cell.strip()) * unit_ns)
-    except (InvalidOperation, ValueError, OverflowError) as error:
+        t_ns = Decimal(cell.strip()) * unit_ns
+        if abs(t_ns) < _LATEST_NS:
+            return round(t_ns)
+    except (ArithmeticError, ValueError) as error:
         raise where(name, f"{cell!r} is not a time") from error
+    raise where(name, f"{cell[:40]!r} is no time before the year 2200")
 
 
 def _number(cell: str, where: Callable[[str, str], ImportFormatError], name: str) -> float:

@@ -67,7 +67,11 @@ def filled_arenas(
         A buffer, which is overwritten when the next is asked for, and what is in it.
     """
     ids = set(channel_ids)
-    wanted = [each for each in blocks if not each.index_at or not ids.isdisjoint(each.index_at)]
+    wanted = [
+        each
+        for each in blocks
+        if (not ids.isdisjoint(each.index_at) if each.index_at else not each.is_empty)
+    ]
     runs = list(_runs(log_file, wanted))
     spare = 1 if threads > 1 and len(runs) > 1 else 0
     keep_freed(ARENA_SIZE)  # no copy of messages is larger

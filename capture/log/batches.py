@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from ..arrays import IntArray
 from ..errors import LogError
 from .arenas import Placed, filled_arenas
-from .chunk import PREFIX_SIZE, Block, Buffer
+from .chunk import LAST_NS, PREFIX_SIZE, Block, Buffer
 from .message_heads import BODY_AT, FIXED_SIZE, HEAD, Places, gather
 from .storage import LogFile
 
@@ -136,7 +136,7 @@ def _records(
         records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
         if records is None:
             _check_each(log_file, data, starts)
-            log_ns = gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT)
+            log_ns = _readable(gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT))
             records = Records(at, log_ns, None, Places(data, at + BODY_AT))
         found.append(records)
     return found
@@ -173,9 +173,16 @@ def _tiled(
 
 def _records_at(offsets: IntArray, places: Places, length: int) -> Records:
     """Records of whole messages of one length: where they are in the buffer, and in a copy."""
-    log_ns = places.field(_LOG_TIME_KIND, _LOG_TIME_AT).copy()
+    log_ns = _readable(places.field(_LOG_TIME_KIND, _LOG_TIME_AT).copy())
     bodies = Places(places.data, places.at + BODY_AT, places.step)
     return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
+
+
+def _readable(log_ns: IntArray) -> IntArray:
+    """Log times of 64 bits without a sign, as far as a signed number holds them."""
+    if log_ns.min(initial=0) < 0:
+        log_ns[log_ns < 0] = LAST_NS
+    return log_ns
 
 
 def _alike(data: Buffer, starts: _Starts) -> Records | None:

@@ -27,6 +27,8 @@ LITTLE_ENDIAN_HEADER = b"\x00\x01\x00\x00"
 
 _HEADER_SIZE = 4
 _MAX_ELEMENTS = 1_000_000
+_ELEMENTS_A_BYTE = 4
+"""Nested messages for each byte, at most: those without a byte of their own would have no end."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,7 @@ class _Walker:
         self._name = name
         self._message = message
         self._at = _HEADER_SIZE
+        self._left = _ELEMENTS_A_BYTE * len(message)  # strings and nested messages
         self.leaves: dict[str, Leaf] = {}
         self.strings: dict[str, str] = {}
         self.static: list[tuple[int, int]] = [(0, 2)]
@@ -146,6 +149,9 @@ class _Walker:
             if field.base in PRIMITIVES:
                 self._numbers(path, PRIMITIVES[field.base], count, field.is_array)
                 continue
+            self._left -= count
+            if self._left < 0:
+                raise DataError(f"{self._name}.{path}: more elements than the message has bytes")
             for k in range(count):
                 item = f"{path}[{k}]" if field.is_array else path
                 if field.nested is not None:

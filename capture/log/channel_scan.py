@@ -15,7 +15,7 @@ from ..arrays import FloatArray, IntArray
 from ..errors import DataError
 from .bus_tally import BusTally
 from .cdr import Layout, layout_of
-from .chunk import Buffer
+from .chunk import LAST_NS, Buffer
 from .frame_messages import records_at
 from .frames import (
     FD_FRAME_DTYPE,
@@ -36,7 +36,6 @@ _STAMP_AT = 4  # a leading Header or Time follows the encapsulation header at on
 _BATCH_ROWS = 4096
 _BATCH_BYTES = 1 << 21
 _MAX_LAYOUTS = 64
-_FLOATS = ("float32", "float64")
 _FIELDS = ("position", "velocity", "effort")
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -134,7 +133,7 @@ class ChannelScan:
         self._limits = limits
         self._stamped = kind is not None and _is_stamped(kind)
         self._horizon_s = horizon_s
-        self._text = kind is not None and not joints and not _has_numbers(kind)
+        self._text = kind is not None and not joints and not kind.has_floats
         self._layouts: dict[int, list[Layout]] = {}
         self._layout_count = 0
         self._log: list[NDArray[np.uint64]] = []
@@ -150,6 +149,16 @@ class ChannelScan:
             offsets: Where their records start, in file order, shape (n,).
             heads: The records' heads, of :data:`HEAD`, shape (n,).
         """
+        # Few large messages at a time: each is copied.
+        pieces = int(min(len(heads), heads["length"].sum() // (2 * _BATCH_BYTES) + 1))
+        if pieces > 1:
+            for k in range(pieces):
+                part = slice(k * len(heads) // pieces, (k + 1) * len(heads) // pieces)
+                self._add(data, offsets[part], heads[part])
+        else:
+            self._add(data, offsets, heads)
+
+    def _add(self, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
         self._log.append(heads["log"])
         self._sequence.append(heads["sequence"])
         if self.kind is not None:
@@ -168,8 +177,13 @@ class ChannelScan:
 
     def _take(self, data: Buffer, offsets: IntArray, rows: IntArray, size: int) -> None:
         """Copy messages of one length; ``rows`` are their places in the block."""
-        records = gather(data, offsets + BODY_AT, np.dtype(f"V{max(size, 1)}"))
-        matrix = records.view(np.uint8).reshape(len(rows), -1)[:, :size]
+        if not size:
+            matrix = np.empty((len(rows), 0), np.uint8)
+        elif len(rows) == 1 and size >= _BATCH_BYTES:  # looked at before the payload is gone
+            matrix = np.frombuffer(data, np.uint8, size, int(offsets[0]) + BODY_AT)[None]
+        else:
+            records = gather(data, offsets + BODY_AT, np.dtype(f"V{size}"))
+            matrix = records.view(np.uint8).reshape(len(rows), -1)
         self._pending.append((self._rows + rows, matrix))
         self._bytes += matrix.size
 
@@ -177,7 +191,7 @@ class ChannelScan:
         """Look at the messages gathered so far."""
         if not self._rows:
             return
-        log_ns = np.concatenate(self._log).astype(np.int64)
+        log_ns = np.minimum(np.concatenate(self._log), LAST_NS).astype(np.int64)
         self.sequence.add(np.concatenate(self._sequence).astype(np.int64))
         self.count += len(log_ns)
         batch = self._pending
@@ -187,7 +201,9 @@ class ChannelScan:
         for rows, matrix in batch:
             by_length.setdefault(matrix.shape[1], []).append((rows, matrix))
         whole = [
-            (np.concatenate([r for r, _ in parts]), np.concatenate([m for _, m in parts]))
+            parts[0]
+            if len(parts) == 1
+            else (np.concatenate([r for r, _ in parts]), np.concatenate([m for _, m in parts]))
             for parts in by_length.values()
         ]
         kind = self.kind
@@ -383,11 +399,3 @@ def _is_stamped(kind: MessageType) -> bool:
 
 def _holds_frames(topic: str, kind: MessageType) -> bool:
     return topic.startswith(FRAME_TOPIC_PREFIXES) and kind.name == "std_msgs/msg/UInt8MultiArray"
-
-
-def _has_numbers(kind: MessageType) -> bool:
-    """Whether a message can hold numbers that are NaN."""
-    return any(
-        _has_numbers(part.nested) if part.nested is not None else part.base in _FLOATS
-        for part in kind.fields
-    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import mmap
 import os
+import re
 import struct
 import threading
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ..arrays import IntArray
+from ..errors import UsageError
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a file."""
@@ -26,7 +28,18 @@ MAGIC = b"\x89MCAP0\r\n"
 PREFIX_SIZE = 9
 """Opcode (u8) and length (u64) before each record's body."""
 
+LAST_NS = 2**63 - 1
+"""Latest log time that is read [Unix ns], in the year 2262; a later one is read as this."""
+
+LARGEST_CHUNK_VARIABLE = "UNDULOG_MAX_CHUNK_MIB"
+"""Environment variable with the largest uncompressed size of a chunk that is read [MiB]."""
+
+_LARGEST_CHUNK_MIB = 256
+_LEAST_WINDOW = 1 << 23
+
 _NAME_AT = PREFIX_SIZE + 8 + 8 + 8 + 4  # of the compression's name in a chunk's record
+
+_COMPRESSION_NAME = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 
 Buffer = bytes | bytearray | mmap.mmap
 
@@ -72,31 +85,65 @@ class Block:
     complete: bool = True
     part: int = 0
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether it declares to have no bytes."""
+        return self.size == 0 if self.compression else self.start == self.stop
+
+
+def largest_chunk() -> int:
+    """Largest uncompressed size of a chunk that is read [byte].
+
+    Raises:
+        UsageError: If the environment sets something else than a positive whole number of MiB.
+    """
+    text = os.environ.get(LARGEST_CHUNK_VARIABLE, str(_LARGEST_CHUNK_MIB))
+    if not text.isascii() or not text.isdecimal() or not 0 < int(text[:9]) < 1 << 24:
+        raise UsageError(f"{LARGEST_CHUNK_VARIABLE}={text!r}: give a whole number of MiB above 0")
+    return int(text) << 20
+
 
 def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
-    """Decompress a payload; of a cut one, as much as there is.
+    """Decompress a payload into no more memory than it is declared to need.
 
     Args:
         compression: ``zstd`` or ``lz4``.
         raw: The compressed bytes.
-        size: Uncompressed size of the whole payload [byte]; no more than this is produced.
+        size: Declared size of the whole payload [byte].
         whole: False where the end of the file cuts ``raw`` short.
 
     Returns:
-        The payload, or its readable beginning.
+        The payload; of a cut one, its readable beginning.
 
     Raises:
-        RuntimeError: If the compression is unknown or the lz4 frame is damaged.
+        RuntimeError: If the compression is unknown, the lz4 frame is damaged, or the payload is
+            larger than declared or declared larger than :func:`largest_chunk`.
         zstandard.ZstdError: If the zstd frame is damaged.
     """
+    if size > largest_chunk():
+        raise RuntimeError(
+            f"it declares {size} bytes, more than {largest_chunk() >> 20} MiB; "
+            f"--max-chunk-mib {-(-size >> 20)} reads it"
+        )
     if compression == "zstd":
+        # The library allocates what a frame states, whatever max_output_size says.
+        stated = zstandard.get_frame_parameters(raw).content_size
+        if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise RuntimeError(f"its frame states {stated} bytes, its record {size}")
         if whole:
             return zstandard.ZstdDecompressor().decompress(raw, max_output_size=max(size, 1))
-        return zstandard.ZstdDecompressor().decompressobj().decompress(raw)
-    if compression == "lz4":
+        decompressor = zstandard.ZstdDecompressor(max_window_size=max(size, _LEAST_WINDOW))
+        with cast("io.RawIOBase", decompressor.stream_reader(raw)) as reader:
+            data, more = reader.read(size) or b"", reader.read(1)
+    elif compression == "lz4":
         frame = cast("Any", lz4.frame.LZ4FrameDecompressor())  # the package has no types
-        return bytes(frame.decompress(raw, max_length=size))
-    raise RuntimeError(f"unknown compression {compression!r}")
+        data = bytes(frame.decompress(raw, max_length=size))
+        more = b"" if frame.eof else frame.decompress(b"", max_length=1)
+    else:
+        raise RuntimeError(f"unknown compression {compression!r}")
+    if more:
+        raise RuntimeError(f"it expands beyond the {size} bytes that its record declares")
+    return data
 
 
 def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
@@ -166,11 +213,13 @@ def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int
         stop: One past the last byte to look at.
 
     Yields:
-        Opcode, body start and body stop of each whole record in [start, stop).
+        Opcode, body start and body stop of each whole record in [start, stop), up to zeros.
     """
     at = start
     while at + PREFIX_SIZE <= stop:
         opcode = data[at]
+        if not opcode:  # no record has it: millions of them fit into a small chunk
+            return
         (length,) = struct.unpack_from("<Q", data, at + 1)
         body = at + PREFIX_SIZE
         if body + length > stop:
@@ -190,18 +239,12 @@ def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
     Returns:
         Offset of its record's opcode, or None.
     """
-    found: list[int] = []
-    for name in (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"):
-        tag = data.find(name, start + _NAME_AT, stop)
-        while tag >= 0:
-            at = tag - _NAME_AT
-            size_at = tag + len(name)
-            if data[at] == Opcode.CHUNK and size_at + 8 <= stop:
-                (length,) = struct.unpack_from("<Q", data, at + 1)
-                (size,) = struct.unpack_from("<Q", data, size_at)
-                whole = size_at + 8 + size
-                if at + PREFIX_SIZE + length == whole <= stop:
-                    found.append(at)
-                    break
-            tag = data.find(name, tag + 1, stop)
-    return min(found, default=None)
+    for tag in _COMPRESSION_NAME.finditer(data, start + _NAME_AT, stop):
+        at, size_at = tag.start() - _NAME_AT, tag.end()
+        if data[at] == Opcode.CHUNK and size_at + 8 <= stop:
+            (length,) = struct.unpack_from("<Q", data, at + 1)
+            (size,) = struct.unpack_from("<Q", data, size_at)
+            whole = size_at + 8 + size
+            if at + PREFIX_SIZE + length == whole <= stop:
+                return at
+    return None

@@ -71,6 +71,7 @@ def check_container(path: Path) -> Container:
     found = Container()
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         last, at, header_stop = 0, len(MAGIC), len(MAGIC)
+        ended = False
         for opcode, start, stop in walk_records(data, at, len(data)):
             last, at = opcode, stop
             if opcode == Opcode.HEADER:
@@ -81,7 +82,10 @@ def check_container(path: Path) -> Container:
                     found.damage.append(f"the chunk at byte {start - PREFIX_SIZE} has no header")
                 else:
                     found.chunks[place.start] = place
+            elif opcode == Opcode.DATA_END and ended:  # each CRC covers all of the data section
+                found.damage.append(f"the data section ends a second time at byte {start}")
             elif stop - start >= 4:
+                ended = ended or opcode == Opcode.DATA_END
                 found.damage += _outside_chunks(data, opcode, start, stop, header_stop)
             if opcode == Opcode.FOOTER:
                 break

@@ -17,7 +17,7 @@ from mcap.records import Attachment, Channel
 from mcap.writer import Writer
 
 from ..console import refuse_existing
-from ..errors import UndulogError, UsageError
+from ..errors import DataError, UndulogError, UsageError
 from ..interruption import StopRequest
 from ..part_file import part_file
 from .raw_log import RawLog, RawMessage
@@ -26,6 +26,7 @@ EDIT_RECORD = "undulog.edit"
 """Metadata record that says what an edited log was made from."""
 HEALTH_RECORD = "undulog.health"
 NS = 1_000_000_000
+_MOST_CHANNELS = 2**16 - 1
 
 
 @dataclass
@@ -98,6 +99,9 @@ class EditedLog:
 
         Returns:
             Its id in the new file.
+
+        Raises:
+            DataError: If the new file has as many channels as MCAP can number.
         """
         schema_id = 0
         schema = source.file.schemas.get(channel.schema_id)
@@ -109,6 +113,12 @@ class EditedLog:
         facts = json.dumps(channel.metadata, sort_keys=True)
         key = (channel.topic, channel.message_encoding, schema_id, facts)
         if key not in self._channels:
+            if len(self._channels) == _MOST_CHANNELS:
+                raise DataError(
+                    f"{source.path}: with its channels the new log would have more than "
+                    f"{_MOST_CHANNELS}, which is all that MCAP can number: leave topics out first "
+                    "(undulog log cut --topics)"
+                )
             new_id = self._writer.register_channel(
                 channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
             )

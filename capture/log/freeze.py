@@ -145,10 +145,11 @@ class FreezeTally:
             names: Joints that are measured.
             commanded: Joints that are commanded.
         """
-        self.columns = tuple(k for k, name in enumerate(names) if name in commanded)
+        place = {name: k for k, name in reversed([*enumerate(commanded)])}
+        self.columns = tuple(k for k, name in enumerate(names) if name in place)
         """Places in ``names`` of the joints of both, m of them."""
         self._measured = list(self.columns)
-        self._commanded = [commanded.index(names[k]) for k in self.columns]
+        self._commanded = [place[names[k]] for k in self.columns]
         self._runs = _Runs(len(self.columns))
 
     def result(

@@ -137,9 +137,10 @@ class JointReader:
             if offset_topic in wanted:
                 offsets = _copied(offsets)
             times |= zip(own, own_times(stamped, offsets), strict=True)
+            known = set(offsets.names)
             for key in own:
                 for name in series[key].names:
-                    if name not in offsets.names:
+                    if name not in known:
                         self._warn(f"{offset_topic} has no {name}: its message stamps are used")
         shared = {id(t_ns): t_ns for key in keys for t_ns in times[key]}
         cuts = {each: cut(t_ns, window_ns) for each, t_ns in shared.items()}
@@ -212,8 +213,9 @@ class JointReader:
             tuple(cuts[id(t_ns)][1] for t_ns in times),
             tuple(v[cuts[id(t_ns)][0]] for t_ns, v in zip(times, series.values, strict=True)),
         )
-        known = [name for name in chain if name in names]
-        order = (*known, *(name for name in names if name not in chain))
+        there, of_chain = set(names), set(chain)
+        known = [name for name in chain if name in there]
+        order = (*known, *(name for name in names if name not in of_chain))
         return signals if order == names else signals.select(order)
 
     def _general_rows(self, topic: str, field: str, found: Messages) -> list[JointRows]:

@@ -6,8 +6,10 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, MetadataIndex, Statistics
@@ -21,6 +23,12 @@ _FOOTER_SIZE = 1 + 8 + 20
 _CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
+
+
+_INDEXED: dict[int, tuple[Opcode, Callable[[ReadDataStream], AttachmentIndex | MetadataIndex]]] = {
+    Opcode.ATTACHMENT_INDEX: (Opcode.ATTACHMENT, AttachmentIndex.read),
+    Opcode.METADATA_INDEX: (Opcode.METADATA, MetadataIndex.read),
+}
 
 
 class _NoSummaryError(Exception):
@@ -90,16 +98,16 @@ class _Summary:
                     held.blocks.append(self._block(start, stop))
                 elif opcode == Opcode.STATISTICS:
                     statistics = held.parse(Statistics.read, buffer, start, stop)
-                elif opcode == Opcode.ATTACHMENT_INDEX:
-                    entry = held.parse(AttachmentIndex.read, buffer, start, stop)
-                    indexes.append((Opcode.ATTACHMENT, entry.offset))
-                elif opcode == Opcode.METADATA_INDEX:
-                    entry = held.parse(MetadataIndex.read, buffer, start, stop)
-                    indexes.append((Opcode.METADATA, entry.offset))
+                elif opcode in _INDEXED:
+                    indexed, read = _INDEXED[opcode]
+                    indexes.append((indexed, held.parse(read, buffer, start, stop).offset))
                 else:
                     held.take(opcode, buffer, start, stop)
+            self._check_places(summary_start)
+            before = 0
             for opcode, offset in sorted(indexes, key=lambda index: index[1]):  # file order
-                held.take(opcode, buffer, *self._record_at(offset))
+                start, before = self._record_at(offset, before)
+                held.take(opcode, buffer, start, before)
         except (LogError, McapError, struct.error, ValueError) as error:
             raise _NoSummaryError(f"the summary is damaged ({error})") from error
         if statistics is None or not held.channels:
@@ -139,7 +147,23 @@ class _Summary:
         block.index_at = dict(_INDEX_OFFSET.iter_unpack(buffer[entries_at : entries_at + size]))
         return block
 
-    def _record_at(self, offset: int) -> tuple[int, int]:
+    def _check_places(self, summary_start: int) -> None:
+        """Refuse chunks and message indexes that share bytes: each byte is to be read once."""
+        blocks = self._held.blocks
+        blocks.sort(key=lambda block: block.start)
+        bounds = [*(block.start for block in blocks[1:]), summary_start]
+        for block, bound in zip(blocks, bounds, strict=True):
+            places = block.index_at.values()
+            if block.stop > bound or (
+                places and not block.stop <= min(places) <= max(places) < bound
+            ):
+                where = f"the chunk at byte {block.start}"
+                raise LogError(self._file.path, f"the indexes of {where} and of another overlap")
+
+    def _record_at(self, offset: int, before: int) -> tuple[int, int]:
+        """Where the body of an indexed record lies, which begins after all bytes read before."""
+        if offset < before:
+            raise LogError(self._file.path, f"indexes overlap at byte {offset}")
         for _, start, stop in walk_records(self._buffer, offset, len(self._buffer)):
             return start, stop
         raise LogError(self._file.path, f"an index points to byte {offset}, where no record is")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import mmap
 import os
+import threading
 import weakref
 import zlib
 from collections import OrderedDict
@@ -14,8 +16,44 @@ import zstandard
 from ..errors import LogError, NotALogError
 from .chunk import Block, Buffer, checks_itself, inflate, inflate_zstd_into, read_at
 
-_MAX_BLOCK_SIZE = 1 << 30
 _CACHE_SIZE = 64 << 20
+
+
+class _Cache:
+    """Payloads that were decompressed last, of all open files together."""
+
+    def __init__(self) -> None:
+        self._held: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._size = 0
+        self._lock = threading.Lock()
+        self.owners = itertools.count()
+
+    def get(self, key: tuple[int, int]) -> bytes | None:
+        with self._lock:
+            data = self._held.get(key)
+            if data is not None:
+                self._held.move_to_end(key)
+            return data
+
+    def put(self, key: tuple[int, int], data: bytes) -> None:
+        """Keep a payload; one that is larger than all room is not kept."""
+        if len(data) > _CACHE_SIZE:
+            return
+        with self._lock:
+            self._size += len(data) - len(self._held.pop(key, b""))
+            self._held[key] = data
+            while self._size > _CACHE_SIZE:
+                _, dropped = self._held.popitem(last=False)
+                self._size -= len(dropped)
+
+    def drop(self, owner: int) -> None:
+        """Let go of all payloads of one file."""
+        with self._lock:
+            for key in [key for key in self._held if key[0] == owner]:
+                self._size -= len(self._held.pop(key))
+
+
+_cache = _Cache()
 
 
 class McapPayloads:
@@ -35,17 +73,18 @@ class McapPayloads:
         self.buffer, descriptor = _mapped(path)
         self._close_descriptor = weakref.finalize(self, os.close, descriptor)
         self._descriptor = descriptor
-        self._cache: OrderedDict[int, Buffer] = OrderedDict()
+        self._owner = next(_cache.owners)
+        weakref.finalize(self, _cache.drop, self._owner)
 
     def close(self) -> None:
         """Release the mapping."""
-        self._cache.clear()
+        _cache.drop(self._owner)
         self.buffer.close()
         self._close_descriptor()
 
     def forget(self) -> None:
         """Let go of the file's pages and of what was decompressed; it is read again when needed."""
-        self._cache.clear()
+        _cache.drop(self._owner)
         if hasattr(mmap, "MADV_DONTNEED"):  # what is mapped counts as this process's memory
             self.buffer.madvise(mmap.MADV_DONTNEED)
 
@@ -53,13 +92,11 @@ class McapPayloads:
         """See :meth:`BlockSource.payload`."""
         if not block.compression:
             return self.buffer, block.start
-        if block.start in self._cache:
-            self._cache.move_to_end(block.start)
-            return self._cache[block.start], 0
-        data = self._decompress(block)
-        self._cache[block.start] = data
-        while len(self._cache) > 1 and sum(map(len, self._cache.values())) > _CACHE_SIZE:
-            self._cache.popitem(last=False)
+        key = self._owner, block.start
+        data = _cache.get(key)
+        if data is None:
+            data = self._decompress(block)
+            _cache.put(key, data)
         return data, 0
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
@@ -100,8 +137,6 @@ class McapPayloads:
 
     def _decompress(self, block: Block) -> bytes:
         where = f"the chunk at byte {block.start}"
-        if block.size > _MAX_BLOCK_SIZE:
-            raise LogError(self.path, f"{where} claims {block.size} bytes; at most 1 GiB is read")
         raw = self.buffer[block.start : block.stop]
         try:
             data = inflate(block.compression, raw, block.size, whole=block.complete)

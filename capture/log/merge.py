@@ -24,6 +24,7 @@ from mcap.records import Schema
 from ..console import progress
 from ..errors import DataError, UsageError
 from ..interruption import StopRequest
+from .cdr import layout_of
 from .edit import (
     EDIT_RECORD,
     NS,
@@ -34,10 +35,17 @@ from .edit import (
     refuse_output,
     refuse_stopped,
 )
+from .joint_reader import JOINT_STATE
 from .merge_records import copy_records
 from .raw_log import RawLog, RawMessage
 from .rosmsg import parse_message_type
+from .topics import Topics
 
+FAR_APART_S = 86400.0
+"""Logs with a longer time between them are merged only on request [s]: one of them is of another
+day's session, or a clock was wrong."""
+
+_LATER_S = 60.0
 _FOREVER_NS = 2**64
 _LOOK_EVERY = 1024
 
@@ -47,6 +55,7 @@ def merge_logs(
     output: Path,
     *,
     robot: str | None = None,
+    apart: bool = False,
     force: bool = False,
     stop: StopRequest | None = None,
 ) -> EditReport:
@@ -56,6 +65,7 @@ def merge_logs(
         paths: The logs, two or more.
         output: The new log.
         robot: The robot that the merged session is of, where the logs are of different ones.
+        apart: Merge logs with more than :data:`FAR_APART_S` between them.
         force: Replace an existing file.
         stop: Request to stop.
 
@@ -64,7 +74,8 @@ def merge_logs(
 
     Raises:
         UsageError: If there are fewer than two logs, one is given twice, they are of different
-            robots and ``robot`` names none of them, or the output can't be that.
+            robots and ``robot`` names none of them, they lie far apart in time and ``apart`` is
+            not given, or the output can't be that.
         DataError: If a topic has different types or units in two logs, or there is no message.
         LogError: If a log can't be read or the new one can't be written.
         UndulogError: If a stop was requested; nothing is left behind then.
@@ -78,7 +89,8 @@ def merge_logs(
         _refuse_twice(sources)
         of_robot = _common_robot(sources, robot)
         _refuse_other_types(sources)
-        warnings = _mixed(sources)
+        warnings = [*_other_robots(sources, of_robot), *_apart(sources, allowed=apart)]
+        warnings += _mixed(sources)
         with edited_log(sources, output, force=force, stop=stop) as log:
             last = copy_records(sources, log, of_robot, warnings)
             _copy_messages(sources, log, stop)
@@ -136,8 +148,9 @@ def _common_robot(sources: Sequence[RawLog], told: str | None) -> str:
 def _refuse_other_types(sources: Sequence[RawLog]) -> None:
     """Refuse topics whose messages would be read wrong under one name."""
     faults: list[str] = []
-    for one, other in combinations(sources, 2):
-        kinds, others = _kinds(one), _kinds(other)
+    for (one, kinds), (other, others) in combinations(
+        [(each, _kinds(each)) for each in sources], 2
+    ):
         for topic in sorted(kinds.keys() & others.keys()):
             this, that = kinds[topic], others[topic]
             if this.definitions != that.definitions:
@@ -172,26 +185,82 @@ class _Kind:
 
 def _kinds(source: RawLog) -> dict[str, _Kind]:
     found: dict[str, _Kind] = {}
+    definitions = {key: _definition(schema) for key, schema in source.file.schemas.items()}
     for channel in source.file.channels.values():
         kind = found.setdefault(channel.topic, _Kind())
         schema = source.file.schemas.get(channel.schema_id)
         coding = channel.message_encoding, schema.encoding if schema is not None else ""
         name = source.type_name(channel) or "without a type"
         kind.names.add(name if coding == ("cdr", "ros2msg") else f"{name} ({'/'.join(coding)})")
-        kind.definitions.add((name, coding, _definition(schema)))
+        kind.definitions.add((name, coding, definitions.get(channel.schema_id)))
         if channel.metadata.get("unit"):
             kind.units.add(channel.metadata["unit"])
     return found
 
 
-def _definition(schema: Schema | None) -> object:
+def _definition(schema: Schema) -> object:
     """A message definition that can be compared: comments and spaces don't matter."""
-    if schema is None:
-        return None
     if schema.encoding == "ros2msg":
         with suppress(DataError):  # what can't be parsed is compared as bytes
             return parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
     return schema.data
+
+
+def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
+    """Warn of logs that are not, or seem not to be, of the merged session's robot."""
+    said = [
+        f"{source.path} is of {source.robot}, not of {robot}: its messages are merged all the same"
+        for source in sources
+        if source.robot and source.robot != robot
+    ]
+    joints = [(source, _joint_names(source)) for source in sources]
+    for (one, names), (other, others) in combinations(joints, 2):
+        unstated = not one.robot or not other.robot
+        if unstated and names and others and names.isdisjoint(others):
+            said.append(
+                f"{one.path} has {_listed(names)}, {other.path} has {_listed(others)}: no joint "
+                "is in both, are they of one robot?"
+            )
+    return said
+
+
+def _joint_names(source: RawLog) -> set[str]:
+    """The joints that the first message of each JointState topic names."""
+    topics, found = Topics(source.file, source.warn), set[str]()
+    for topic, channel in topics.channels.items():
+        if channel.type_name == JOINT_STATE and channel.is_ros2 and channel.count:
+            with suppress(DataError):  # damage has no names; whoever reads the topic is told
+                first = topics.first(topic)
+                strings = {} if first is None else layout_of(first[2], first[1]).strings
+                found |= {name for path, name in strings.items() if path.startswith("name[")}
+    return found
+
+
+def _listed(names: set[str]) -> str:
+    listed = sorted(names)
+    return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
+
+
+def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
+    """Warn of logs with time between them, and refuse those that are far apart."""
+    said: list[str] = []
+    ordered = sorted((each for each in sources if each.end_ns), key=lambda each: each.start_ns)
+    for k, later in enumerate(ordered[1:], start=1):
+        earlier = max(ordered[:k], key=lambda each: each.end_ns)
+        gap_s = (later.start_ns - earlier.end_ns) / NS
+        sentence = f"{later.path} begins {_span(gap_s)} after {earlier.path} ends"
+        if gap_s > FAR_APART_S and not allowed:
+            raise UsageError(f"{sentence}: not one session; --apart merges them all the same")
+        if gap_s > _LATER_S:
+            said.append(sentence)
+    return said
+
+
+def _span(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("h", 3600.0)):
+        if seconds > size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 def _mixed(sources: Sequence[RawLog]) -> list[str]:

@@ -125,7 +125,7 @@ def _reasons(health: dict[str, str] | None) -> list[str]:
     text = health.get("reasons", "[]")
     try:
         reasons: object = json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         reasons = [text]
     listed = cast("list[object]", reasons) if isinstance(reasons, list) else [reasons]
     return [health.get("verdict", "no verdict"), *map(str, listed)]

@@ -11,6 +11,8 @@ from .mcap_file import McapFile
 from .part_names import PART_RECORD, later_parts, part_path, split_part_path
 from .wal import wal_folder
 
+_MOST_LISTED = 20
+
 
 @dataclass
 class PartFiles:
@@ -240,9 +242,16 @@ def _session_in(folder: Path) -> Path:
             heads[first_part(path)] = None
         elif path.name.endswith(".mcap.wal") and path.is_dir():
             heads[path.with_name(path.name.removesuffix(".wal"))] = None
+    bag = folder / "metadata.yaml" in names  # as rosbag2 writes it
+    if not heads and bag:
+        why = "a rosbag2 folder without .mcap; convert it: ros2 bag convert, storage_id: mcap"
+        raise NotALogError(folder, why)
     if not heads:
-        raise NotALogError(folder, "no session (.mcap) is in this folder")
+        raise NotALogError(folder, "no session (.mcap) is in this folder; name a session's file")
     if len(heads) > 1:
-        listed = ", ".join(path.name for path in heads)
-        raise LogError(folder, f"{len(heads)} sessions are in this folder; name one: {listed}")
+        listed = ", ".join([path.name for path in heads][:_MOST_LISTED])
+        more = f" and {len(heads) - _MOST_LISTED} more" if len(heads) > _MOST_LISTED else ""
+        fix = "join them with undulog log merge" if bag else "name one"
+        what = "files of a rosbag2 folder" if bag else "sessions"
+        raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}{more}")
     return next(iter(heads))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-import tomllib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 
 from ..errors import LogError
+from ..strict_table import read_toml
 from .chunk import PREFIX_SIZE, Block, Buffer
 from .storage import LogFile
 
@@ -62,9 +62,12 @@ class RawLog:
         self.path = path
         self.file = LogFile(path)
         self.warnings = list(self.file.warnings)
+        self._said = set(self.warnings)
         self.paths = [file.path for file in self.file.files]
         self.sha256 = _hash(self.paths)
-        self.start_ns, self.end_ns = self.file.limits
+        filled = [block for block in self.file.blocks if block.end_ns]
+        self.start_ns = min((block.start_ns for block in filled), default=0)
+        self.end_ns = max((block.end_ns for block in filled), default=0)
         self.session_id = self.file.metadata.get("undulog", {}).get("session_id") or path.stem
         self.robot = _robot_name(self.file)
 
@@ -92,7 +95,8 @@ class RawLog:
         Args:
             sentence: What is missing or doubtful.
         """
-        if sentence not in self.warnings:
+        if sentence not in self._said:
+            self._said.add(sentence)
             self.warnings.append(sentence)
 
     def type_name(self, channel: Channel) -> str:
@@ -156,7 +160,7 @@ class RawLog:
     def _block_messages(
         self, block: Block, channel_ids: Collection[int], start_ns: int, stop_ns: int
     ) -> Iterator[RawMessage]:
-        if block.index_at and block.index_at.keys().isdisjoint(channel_ids):
+        if block.index_at and not any(key in channel_ids for key in block.index_at):
             return
         try:
             data, start, stop = self.file.payload_once(block)
@@ -188,7 +192,7 @@ class RawLog:
     def _places(self, block: Block, data: Buffer, start: int, stop: int) -> Iterator[int]:
         """Where the whole message records of a chunk begin."""
         at = start
-        while at + PREFIX_SIZE <= stop:
+        while at + PREFIX_SIZE <= stop and data[at]:
             (length,) = _LENGTH.unpack_from(data, at + 1)
             end = at + PREFIX_SIZE + length
             if end > stop:
@@ -224,6 +228,6 @@ def _robot_name(log_file: LogFile) -> str:
         return stated
     attached = log_file.attachments.get("robot.toml")
     if attached is not None:
-        with suppress(tomllib.TOMLDecodeError, UnicodeDecodeError):
-            return str(tomllib.loads(attached.data.decode()).get("name", ""))
+        with suppress(ValueError):
+            return str(read_toml(attached.data.decode()).get("name", ""))
     return ""

@@ -22,6 +22,7 @@ from .edit import (
 )
 from .part_files import first_part
 from .raw_log import RawLog
+from .wal import wal_folder
 
 RECOVERED_RECORD = "undulog.recovered"
 """Metadata record that says what a recovered log was made from."""
@@ -93,6 +94,10 @@ def recover_log(
         found = source.file.recovered
         if found is not None and found.live:
             raise LogError(path, "this recording is running; end it first")
+        if found is not None:  # without the advice to do what is being done
+            source.warnings = [
+                str(found) if text == found.warning else text for text in source.warnings
+            ]
         with edited_log([source], output, force=force, stop=stop) as log:
             for attachment in source.attachments:
                 log.attach(attachment, attachment.name)
@@ -114,8 +119,16 @@ def recover_log(
                 missing=_missing(source, log),
             )
             _note(source, log, report)
+        cut = any(file.cut for file in source.file.files)
+    first = first_part(path)
+    wal = wal_folder(first)
     if found is None and not source.warnings:
         report.notes.append("the log was whole: nothing had to be recovered")
+    if found is None and cut:
+        report.notes.append(
+            f"there is no {wal.name} beside {first.name}, the write-ahead log that a killed "
+            "recorder leaves: where the file is a copy, copy that folder, too, and recover again"
+        )
     return report
 
 

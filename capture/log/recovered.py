@@ -34,6 +34,12 @@ class Recovered:
             return None
         return max(0, self.accepted - self.in_files - self.from_wal)
 
+    @property
+    def warning(self) -> str:
+        """One sentence, and what to do."""
+        advice = "" if self.live else "; 'undulog log recover' writes a whole file"
+        return f"{self}{advice}"
+
     def __str__(self) -> str:
         """One sentence."""
         total = self.in_files + self.from_wal
@@ -52,5 +58,5 @@ class Recovered:
             missing = "none is missing as far as can be told"
         return (
             f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
-            f"from its write-ahead log; {missing}; 'undulog log recover' writes a whole file"
+            f"from its write-ahead log; {missing}"
         )

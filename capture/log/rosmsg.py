@@ -8,7 +8,7 @@ dependency after a line of ``=`` and a line ``MSG: package/Type``.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..errors import DataError
 
@@ -28,6 +28,17 @@ PRIMITIVES: dict[str, str] = {
     "float64": "<f8",
 }
 """Fixed-size primitive to numpy type string."""
+
+_FLOATS = ("float32", "float64")
+
+_DEEPEST = 64
+"""Types nested in each other, at most; those of ROS are seldom deeper than five."""
+
+_MOST_FIELDS = 4096
+"""Fields of a type and of all nested ones, at most: twenty short lines can spell a million."""
+
+_LONGEST_NUMBER = 9
+"""Digits of an array's length, at most."""
 
 _SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
 _FIELD = re.compile(
@@ -62,10 +73,14 @@ class MessageType:
     Attributes:
         name: Full name, e.g. ``sensor_msgs/msg/JointState``.
         fields: In wire order; constants left out.
+        size: Number of fields, those of nested types among them.
+        has_floats: Whether any of them is a float, which may be NaN.
     """
 
     name: str
     fields: tuple[Field, ...]
+    size: int = field(default=0, compare=False)
+    has_floats: bool = field(default=False, compare=False)
 
 
 def parse_message_type(name: str, text: str) -> MessageType:
@@ -107,16 +122,30 @@ class _Parser:
     def message(self, short: str, path: tuple[str, ...]) -> MessageType:
         if short in path:
             raise DataError(f"schema {self._name}: {short} contains itself")
+        if len(path) == _DEEPEST:
+            raise DataError(f"schema {self._name}: types nested more than {_DEEPEST} deep")
         if short not in self._done:
             if short not in self._bodies:
                 known = ", ".join(sorted(self._bodies))
                 raise DataError(f"schema {self._name}: no definition of {short}; it has {known}")
             lines = self._bodies[short].splitlines()
             parsed = (self._field(line, short, (*path, short)) for line in lines)
-            package, _, type_name = short.partition("/")
-            fields = tuple(field for field in parsed if field is not None)
-            self._done[short] = MessageType(f"{package}/msg/{type_name}", fields)
+            fields = tuple(part for part in parsed if part is not None)
+            self._done[short] = self._type(short, fields)
         return self._done[short]
+
+    def _type(self, short: str, fields: tuple[Field, ...]) -> MessageType:
+        package, _, type_name = short.partition("/")
+        nested = [part.nested for part in fields if part.nested is not None]
+        size = len(fields) + sum(each.size for each in nested)
+        if size > _MOST_FIELDS:
+            raise DataError(
+                f"schema {self._name}: {short} has {size} fields, more than {_MOST_FIELDS}"
+            )
+        floats = any(part.base in _FLOATS for part in fields) or any(
+            each.has_floats for each in nested
+        )
+        return MessageType(f"{package}/msg/{type_name}", fields, size, floats)
 
     def _field(self, line: str, owner: str, path: tuple[str, ...]) -> Field | None:
         line = line.partition("#")[0].strip()
@@ -129,6 +158,8 @@ class _Parser:
             return None  # a constant takes no bytes on the wire
         base, array = match["base"], match["array"]
         digits = array.strip("[]<=") if array else "1"
+        if len(digits) > _LONGEST_NUMBER:
+            raise DataError(f"schema {self._name}: no array has the length {digits[:20]}...")
         length = None if array and (not digits or "<=" in array) else int(digits)
         if base in PRIMITIVES or base in {"string", "wstring"}:
             return Field(match["name"], base, None, length, array is not None)

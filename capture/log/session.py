@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..errors import DataError, RobotFileError
@@ -64,6 +65,7 @@ class Session:
         self.path = Path(path)
         self._file = LogFile(self.path, column_folder)
         self._warnings = list(self._file.warnings)
+        self._warned = set(self._warnings)
         self._topics = Topics(self._file, self._warn, threads=threads)
         self._clock = StampClock(self._topics, self._warn)
         self._joints = JointReader(self.path, self._topics, self._clock, self._warn)
@@ -148,6 +150,11 @@ class Session:
     def duration_s(self) -> float:
         """Time from the first to the last message [s]."""
         return (self.end_ns - self.start_ns) / _NS
+
+    @property
+    def chunk_times_ns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """First and last log time of each chunk [Unix ns], as it states them, shape (n,) each."""
+        return self._file.spans
 
     @property
     def metadata(self) -> Mapping[str, Mapping[str, str]]:
@@ -382,7 +389,8 @@ class Session:
         return join_batches(batches, dtype)
 
     def _warn(self, sentence: str) -> None:
-        if sentence not in self._warnings:
+        if sentence not in self._warned:
+            self._warned.add(sentence)
             self._warnings.append(sentence)
 
     def _groups(self, topic: str, found: Messages) -> list[Group]:

@@ -164,8 +164,12 @@ class _Check:
             damage=(*(text for one in found for text in one.damage), *told),
             truncated=any(one.truncated for one in found),
             indexed=all(one.indexed for one in found),
-            notes=(*(text for one in found for text in one.notes), *self._notes),
-            unfinished="" if recovered is None else str(recovered),
+            notes=(
+                *(text for one in found for text in one.notes),
+                *self._notes,
+                *filter(None, [log_file.foreign_wal]),
+            ),
+            unfinished="" if recovered is None else recovered.warning,
             running=recovered is not None and recovered.live,
         )
 
@@ -180,11 +184,9 @@ class _Check:
         notes = [note for note in file.warnings if note not in skipped and not self._file.recovered]
         damage = [*container.damage, *skipped]
         read = {block.start for block in blocks}
+        known = {note.split(" ", 5)[4] for note in skipped}  # after "the record at byte"
         for place in container.chunks.values():
-            known = any(
-                note.startswith(f"the record at byte {place.record_at} ") for note in skipped
-            )
-            if known or place.start in read:
+            if place.start in read or str(place.record_at) in known:
                 continue
             wrong = check_chunk(path, place)
             damage.append(wrong or f"the chunk at byte {place.start} is missing in the index")
@@ -228,7 +230,7 @@ class _Check:
             f"the summary counts {count} messages of {self._scan.topic(key)}, "
             f"{self._scan.count(key)} are in the file"
             for key, count in self._file.counts.items()
-            if key in self._scan.keys and count != self._scan.count(key)
+            if self._scan.has(key) and count != self._scan.count(key)
         ]
         return replace(file, damage=tuple(wrong))
 
@@ -241,9 +243,13 @@ class _Check:
         if plain and zlib.crc32(data[block.start : block.stop]) != block.crc:
             where = f"the chunk at byte {block.start}"
             raise LogError(path, f"{where} is corrupt (its CRC doesn't fit)")
+        if block.is_empty and not block.index_at:
+            return chunk is not None and bool(chunk.crc)
+        if block.offsets is None and not block.index_at:  # looked for once, for all channels
+            self._file.offsets(block, 0)
         keys = list(block.offsets if block.offsets is not None else block.index_at)
         if not keys:
-            keys = list(self._scan.keys)
+            return chunk is not None and bool(chunk.crc)
         found = [np.sort(self._file.offsets(block, key)) + base for key in keys]
         heads = read_heads(data, np.concatenate(found), stop)
         owners = np.repeat(keys, [len(offsets) for offsets in found])
@@ -253,7 +259,7 @@ class _Check:
             raise LogError(path, f"{where} does not list its messages")
         begin = 0
         for key, offsets in zip(keys, found, strict=True):
-            if len(offsets) and key in self._scan.keys:
+            if len(offsets) and self._scan.has(key):
                 self._scan.add(key, data, offsets, heads[begin : begin + len(offsets)])
             begin += len(offsets)
         return chunk is not None and bool(chunk.crc)
@@ -294,7 +300,7 @@ def _with_name(health: FileHealth, name: str) -> FileHealth:
 def _reasons(text: str) -> tuple[str, ...]:
     try:
         found: Any = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return (text,)
     return tuple(map(str, cast("list[Any]", found))) if isinstance(found, list) else (str(found),)
 

@@ -37,6 +37,9 @@ from .source_health import SourceHealth, judge_source, measure_sources
 from .tallies import NS
 from .undecoded import named_identifiers, undecoded
 
+_MOST_PAIRS = 4096
+"""Pairs of joint sets, measured and commanded, that are looked at for joints that stand still."""
+
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 
 
@@ -122,6 +125,14 @@ class SessionScan:
     def keys(self) -> tuple[int, ...]:
         """The channels defined so far."""
         return tuple(self._scans)
+
+    def has(self, key: int) -> bool:
+        """Whether a channel is defined.
+
+        Args:
+            key: The channel.
+        """
+        return key in self._scans
 
     def define(
         self,
@@ -313,6 +324,8 @@ class SessionScan:
         closed = _closed(scans)
         for other, scan in scans:
             for command in scan.series.values() if scan.topic == COMMANDS else ():
+                if len(self._freezes) >= _MOST_PAIRS:
+                    return runs
                 pair = (key, series.names, other, command.names)
                 if pair not in self._freezes:
                     self._freezes[pair] = FreezeTally(series.names, command.names)

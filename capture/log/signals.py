@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -50,6 +51,11 @@ class JointSignals:
     t_ns: tuple[IntArray, ...]
     values: tuple[FloatArray, ...]
 
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        """Name to its first place."""
+        return {name: j for j, name in reversed([*enumerate(self.names)])}
+
     def signal(self, name: str) -> Signal:
         """The samples of one joint.
 
@@ -62,9 +68,9 @@ class JointSignals:
         Raises:
             DataError: If there is no such joint.
         """
-        if name not in self.names:
+        j = self._place.get(name)
+        if j is None:
             raise DataError(f"{self.topic} has no joint {name!r}; it has {', '.join(self.names)}")
-        j = self.names.index(name)
         return Signal(name, self.unit, self.t_ns[j], self.values[j])
 
     def select(self, names: Iterable[str]) -> JointSignals:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..arrays import IntArray
 from ..errors import LogError, NotALogError
 from .block_source import BlockSource
-from .chunk import Block, Buffer
+from .chunk import LAST_NS, Block, Buffer
 from .mcap_file import McapFile
 from .message_heads import read_heads
 from .pages import FilePages
@@ -55,6 +55,7 @@ class LogFile:
         self.attachments: dict[str, Attachment] = {}
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
+        self.foreign_wal = ""  # what to say of a write-ahead log of another session
         self._sources: list[BlockSource] = []
         self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
@@ -65,8 +66,15 @@ class LogFile:
             for file in self.files:
                 self._join(file)
             if wal is not None:
+                self._leave_foreign(wal)
+            if wal is not None and not self.foreign_wal:
                 self._join_wal(wal)
             self.warnings += self.parts.missing
+            if any(block.end_ns > LAST_NS for block in self.blocks):
+                self.warnings.append(
+                    "log times lie beyond the year 2262, which no clock shows: they are read as "
+                    "its April 11"
+                )
             self._require_channels()
         except BaseException:
             self.close()
@@ -90,7 +98,8 @@ class LogFile:
         filled = [block for block in self.blocks if block.end_ns]
         if not filled:
             return 0, 0
-        return min(block.start_ns for block in filled), max(block.end_ns for block in filled)
+        first, last = min(each.start_ns for each in filled), max(each.end_ns for each in filled)
+        return min(first, LAST_NS), min(last, LAST_NS)
 
     def close(self) -> None:
         """Release everything."""
@@ -165,6 +174,19 @@ class LogFile:
         else:
             self.metadata.setdefault(item.name, {}).update(item.metadata)
 
+    def _leave_foreign(self, wal: WalContents) -> None:
+        """Find out whether a write-ahead log belongs to another session: a copy left it behind."""
+        facts = [i for i in wal.definitions if isinstance(i, Metadata) and i.name == "undulog"]
+        ids = {item.metadata["session_id"] for item in facts if "session_id" in item.metadata}
+        own = self.metadata.get("undulog", {}).get("session_id")
+        if own is None or not ids or own in ids:
+            return
+        self.foreign_wal = (
+            f"{wal.folder.name} is the write-ahead log of another session ({min(ids)}) and isn't "
+            f"read; move it to NAME.mcap{wal.folder.suffix}, then 'undulog log recover NAME.mcap'"
+        )
+        self.warnings.append(self.foreign_wal)
+
     def _join_wal(self, wal: WalContents) -> None:
         self._define(wal)
         self._leave_cut_chunk(wal)
@@ -189,7 +211,7 @@ class LogFile:
             gone = [text for text in self.parts.missing if "can't be read" in text]
             self.parts.missing = [text for text in self.parts.missing if text not in gone]
             told = [text for text in told if "no readable header" not in text]
-        self.warnings += [str(self.recovered), *told]
+        self.warnings += [self.recovered.warning, *told]
 
     def _define(self, wal: WalContents) -> None:
         """Take from a write-ahead log what the files don't explain themselves."""

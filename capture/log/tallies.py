@@ -104,7 +104,8 @@ class TimingTally:
         self._first = self._last = self._previous = 0
         self._duplicates = self._backward = 0
         self._longest = (0, 0)
-        self._bins = np.zeros((3, _BINS))  # number, sum and sum of squares of intervals [ns]
+        self._bins = np.empty(0, np.int64)  # those that have intervals, ascending
+        self._sums = np.empty((3, 0))  # number, sum and sum of squares of their intervals [ns]
 
     def add(self, t_ns: IntArray) -> None:
         """Take the next samples.
@@ -134,12 +135,17 @@ class TimingTally:
             self._longest = int(steps[longest]), int(starts[longest])
         size = steps.astype(np.float64)
         bins = np.minimum((np.log2(size) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
-        for row, weight in zip(self._bins, (1.0, size, size**2), strict=True):
-            np.add.at(row, bins, weight)
+        had = len(self._bins)
+        self._bins, place = np.unique(np.concatenate([self._bins, bins]), return_inverse=True)
+        sums = np.zeros((3, len(self._bins)))
+        sums[:, place[:had]] = self._sums
+        for k, weight in enumerate((np.ones_like(size), size, size**2)):
+            sums[k] += np.bincount(place[had:], weight, sums.shape[1])
+        self._sums = sums
 
     def result(self) -> Timing:
         """What the samples so far say."""
-        number, total, squares = self._bins[:, self._bins[0] > 0]
+        number, total, squares = self._sums
         intervals = int(number.sum())
         median = std = p99 = None
         regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0

@@ -61,7 +61,7 @@ class Topics:
         self._file = log_file
         self._threads = threads
         self._warn = warn
-        self._types: dict[str, MessageType] = {}
+        self._types: dict[int, MessageType | DataError] = {}  # by schema
         self._layouts: dict[str, dict[int, Layout]] = {}
         self._ids: dict[str, list[int]] = {}
         for channel in log_file.channels.values():
@@ -118,11 +118,17 @@ class Topics:
             MissingChannelError: If the log has no such topic.
             DataError: If the schema can't be read.
         """
-        if topic not in self._types:
-            schema = self._schema(topic)
-            text = schema.data.decode("utf-8", "replace")
-            self._types[topic] = parse_message_type(schema.name, text)
-        return self._types[topic]
+        schema = self._schema(topic)
+        kind = self._types.get(schema.id)
+        if kind is None:
+            try:
+                kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
+            except DataError as error:
+                kind = error
+            self._types[schema.id] = kind
+        if isinstance(kind, DataError):
+            raise DataError(str(kind))
+        return kind
 
     def first(self, topic: str) -> tuple[int, bytes, MessageType] | None:
         """The first message of a topic.

@@ -30,6 +30,7 @@ blocks is sure of its space.
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import threading
@@ -59,6 +60,8 @@ from .wal_segment import SEGMENT_OVERHEAD, Segment, new_header, sync_folder
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS_SIZE = 1 << 18
 _LEAST_SIZE = 4096
+_HOLD_S = 0.1
+_HELD = 2 << 20  # bytes ahead of the writing: a second of two saturated buses
 
 
 def wal_folder(path: Path | str) -> Path:
@@ -139,8 +142,11 @@ class WriteAheadLog:
             with suppress(OSError):
                 self.folder.rmdir()
             raise
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._work, name=f"sync {folder}", daemon=True)
+        self._holder = threading.Thread(target=self._hold, name=f"hold {folder}", daemon=True)
         self._thread.start()
+        self._holder.start()
 
     def __enter__(self) -> Self:
         """Nothing to do: the log is open."""
@@ -223,6 +229,9 @@ class WriteAheadLog:
         self._check(payload)
         fields = (self._defined + 1, kind, MARK, 0, 0, 0, 0)
         if not self._definitions[-1].put(fields, payload):
+            if self._definitions[-1].cut:
+                self._failure = _cut_error(self._definitions[-1].path)
+                raise self._failure
             with self._files:
                 size = max(_DEFINITIONS_SIZE, _room_for(payload))
                 self._definitions.append(self._reserve(DEFINITIONS, size))
@@ -263,7 +272,9 @@ class WriteAheadLog:
             return
         self._closed = True
         self._wake.set()
+        self._ended.set()
         self._thread.join()
+        self._holder.join()
         done = self._released >= self._position
         spare, self._spare = self._spare, None
         if spare is not None:
@@ -271,7 +282,7 @@ class WriteAheadLog:
         self._drop_released()
         try:
             if not done:
-                self._sync()
+                self._sync(whole=True)
         finally:
             for segment in (*self._definitions, *self._sealed, self._current):
                 segment.close(remove=done)
@@ -297,6 +308,9 @@ class WriteAheadLog:
     def _make_room(self, payload: bytes) -> None:
         """Go to the next segment; changes nothing where that fails."""
         self._check(payload)
+        if self._current.cut:
+            self._failure = _cut_error(self._current.path)
+            raise self._failure
         size = _room_for(payload)
         try:
             following = self._following(size)
@@ -364,21 +378,21 @@ class WriteAheadLog:
                 segment.close(remove=True)
         return bool(gone)
 
-    def _sync(self) -> None:
-        """Bring everything accepted so far to the disk; notes a failure for the next append."""
+    def _sync(self, *, whole: bool = False) -> None:
+        """Bring what was accepted so far to the disk; notes a failure for the next append."""
         with self._disk:
             position = self._position
             with self._files:
-                kept = [*self._definitions, self._current]
-                if self._spare is not None:
-                    kept.append(self._spare)
-                sealed = self._sealed
+                current, sealed = self._current, self._sealed
+                others = [*self._definitions, *([self._spare] if self._spare is not None else [])]
             path = self.folder
             try:
-                named = all(segment.synced for segment in (*kept, *sealed))
-                for segment in kept:
+                named = all(segment.synced for segment in (*others, current, *sealed))
+                for segment in others:
                     path = segment.path
                     segment.sync()
+                path = current.path
+                reached = current.sync(whole=whole)
                 for segment in sealed:
                     path = segment.path
                     if segment.last > self._released:  # looked at again: it goes on meanwhile
@@ -391,7 +405,28 @@ class WriteAheadLog:
                 reason = f"can't be brought to the disk: {os.strerror(error.errno or 0)}"
                 self._failure = LogWriteError(path, reason)
                 return
-            self._synced = position
+            before = sealed[-1].last if sealed else self._synced
+            self._synced = min(position, max(before, reached))
+
+    def _hold(self) -> None:
+        """Take the page faults ahead of the appending thread, which they would hold up."""
+        while not self._ended.wait(_HOLD_S):
+            with self._files:
+                current, spare = self._current, self._spare
+            try:
+                beyond = current.hold(_HELD)
+                if beyond and spare is not None:
+                    spare.hold(beyond)
+            except OSError as error:
+                if error.errno == errno.EFAULT:  # there is no such page any more
+                    self._failure = _cut_error(current.path)
+                return  # or before Linux 5.14: the appending thread takes its own
+
+
+def _cut_error(path: Path) -> LogWriteError:
+    return LogWriteError(
+        path, "was cut short by another program; nothing more can be accepted, all before is kept"
+    )
 
 
 def _room_for(payload: bytes) -> int:

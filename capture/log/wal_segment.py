@@ -2,20 +2,28 @@
 
 A store to a mapped page is in the kernel's page cache at once, so a process that is killed loses
 nothing of it; only power loss does, until :meth:`Segment.sync`.
+
+The first store to a page, and the first after a sync has protected it, is a page fault that the
+file system may hold up for as long as the disk is busy: a journal's commit, 60 ms and more beside
+other writers. So another thread takes the faults ahead of the writing (:meth:`Segment.hold`), and a
+sync of a busy segment leaves out the page that is being written.
 """
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import mmap
 import os
 import secrets
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from zlib import crc32
 
 from ..errors import DataError, LogWriteError
+from .cut_mapping import watch_mapping
 from .wal_format import (
     HEADER_SIZE,
     RECORD_BODY,
@@ -28,6 +36,12 @@ from .wal_format import (
 
 SEGMENT_OVERHEAD = 2 * HEADER_SIZE
 """Bytes of a segment that hold no records."""
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_MS_SYNC = 4
+_MADV_POPULATE_WRITE = 23  # Linux 5.14; Python's mmap.madvise() keeps the interpreter's lock
+_PAGE = mmap.PAGESIZE
+_BUSY = 8 * _PAGE  # so many bytes between two syncs: the last page is young enough to wait
 
 
 def free_bytes(path: Path) -> int:
@@ -85,10 +99,15 @@ class Segment:
         self.path = path
         self.size = header.size
         self.last = 0
+        self.cut = False
+        """Whether somebody cut the file short: what was put since is not in it."""
         self._at = HEADER_SIZE
         self._end = header.size - HEADER_SIZE
         self._salt = header.salt
         self._synced_at = 0
+        self._durable = 0
+        self._page_end = _PAGE
+        self._whole = 0, 0  # where the page begins that is written, last record wholly before it
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._file = os.open(path, flags, 0o666)
@@ -97,6 +116,8 @@ class Segment:
         try:
             os.posix_fallocate(self._file, 0, header.size)
             self._view = mmap.mmap(self._file, header.size)
+            self._address = ctypes.addressof(ctypes.c_char.from_buffer(self._view))
+            self._unwatch = watch_mapping(self._address, header.size, self._note_cut)
         except OSError as error:
             os.close(self._file)
             path.unlink(missing_ok=True)
@@ -122,7 +143,7 @@ class Segment:
         length = len(payload)
         stop = start + RECORD_SIZE + length
         if stop > self._end:
-            return False
+            return False  # nor after the file was cut short
         try:
             body = RECORD_BODY.pack(length, *fields) + payload
         except struct.error as error:
@@ -135,6 +156,9 @@ class Segment:
         view[start + RECORD_CRC.size : stop] = body
         RECORD_CRC.pack_into(view, start, crc32(body, self._salt))
         self._at = (stop + 7) & -8
+        if stop > self._page_end:
+            page = self._at & -_PAGE
+            self._whole, self._page_end = (page, self.last), page + _PAGE
         self.last = fields[0]
         return True
 
@@ -143,22 +167,52 @@ class Segment:
         """Whether it ever was; before, the folder has to be synced too, for its name."""
         return self._synced_at > 0
 
-    def sync(self) -> None:
+    def sync(self, *, whole: bool = True) -> int:
         """Bring what was put so far to the disk; nothing to do if nothing was put since.
 
-        ``fdatasync`` covers pages dirtied through the mapping and lets other threads run.
+        Lets other threads run.
+
+        Args:
+            whole: With the page that is being written, even where much was put since the last
+                sync. The next store to it is a page fault.
+
+        Returns:
+            Number of the last record that is on the disk; 0 for none.
 
         Raises:
             OSError: If the disk fails.
         """
-        at = self._at
+        last, at = self.last, self._at
+        page, before = self._whole
         if at == self._synced_at:
-            return
-        if self._synced_at:
+            return self._durable
+        if not self._synced_at:
+            os.fsync(self._file)
+        elif whole or page - self._synced_at < _BUSY:
             os.fdatasync(self._file)
         else:
-            os.fsync(self._file)
-        self._synced_at = at
+            start = self._synced_at & -_PAGE
+            _call(_LIBC.msync, self._address + start, page - start, _MS_SYNC)
+            last, at = before, page
+        self._synced_at, self._durable = at, last
+        return last
+
+    def hold(self, ahead: int) -> int:
+        """Take the page faults of what is written next; lets other threads run.
+
+        Args:
+            ahead: Bytes from where the next record goes.
+
+        Returns:
+            How many of these bytes are beyond this segment.
+
+        Raises:
+            OSError: If the kernel can't (before Linux 5.14), or the file was cut short.
+        """
+        start = self._at & -_PAGE
+        stop = min(start + ahead, self.size)
+        _call(_LIBC.madvise, self._address + start, stop - start, _MADV_POPULATE_WRITE)
+        return start + ahead - stop
 
     def close(self, *, remove: bool) -> None:
         """Release the mapping.
@@ -167,11 +221,23 @@ class Segment:
             remove: Delete the file too.
         """
         self._end = 0
+        self._unwatch()
         self._view.close()
         os.close(self._file)
         if remove:
             with suppress(OSError):  # someone else may have tidied up
                 self.path.unlink()
+
+    def _note_cut(self) -> None:
+        """Take no more records."""
+        self.cut, self._end = True, 0
+
+
+def _call(function: Callable[..., int], address: int, size: int, flag: int) -> None:
+    """Call a function of the C library on mapped memory, the interpreter's lock released."""
+    if function(ctypes.c_void_p(address), ctypes.c_size_t(size), ctypes.c_int(flag)):
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
 
 
 def new_header(stream: int, number: int, size: int, log_id: bytes) -> SegmentHeader:

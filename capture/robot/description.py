@@ -26,7 +26,6 @@ its message and signal for that joint's name. The keys are the fields of the cla
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +33,7 @@ from typing import Any
 
 from ..errors import Fault, RobotFileError
 from ..shipped import Shelf
-from ..strict_table import Faults, Table
+from ..strict_table import Faults, Table, read_toml
 from .bus_map import read_bus
 from .chain_table import read_joints, read_links
 from .mesh import read_meshes
@@ -152,8 +151,8 @@ def _parse(
     read_mesh: Callable[[str], bytes | None] | None = None,
 ) -> Robot:
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        values = read_toml(text)
+    except ValueError as error:
         raise RobotFileError(source, [Fault("syntax", str(error), "TOML 1.0")]) from error
     faults = Faults()
     top = Table(values, "", faults)

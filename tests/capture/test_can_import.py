@@ -203,7 +203,7 @@ def test_a_cut_blf_is_told(tmp_path: Path):
     ("name", "data", "message"),
     [
         ("x.blf", b"not a blf" * 50, "can't be read: not a BLF file"),
-        ("x.db", b"not a database" * 50, "can't be read after 0 frames: file is not a database"),
+        ("x.db", b"not a database" * 50, "can't be read: file is not a database"),
         ("x.asc", b"", "holds no CAN frames"),
         ("x.mf4", b"not a measurement" * 50, "can't be read: not an MF4 file"),
         ("x.log.gz", b"not gzip", "can't be read: Not a gzipped file"),

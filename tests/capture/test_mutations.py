@@ -2,20 +2,17 @@
 
 Seeded mutations (bits, cuts, blocks moved or zeroed, huge lengths) of MCAP files of several makes,
 of what a killed recorder leaves, and of robot descriptions with their bus databases. They are read
-in a process whose memory is bounded, whatever sizes a header claims.
+in a process whose memory is bounded, whatever sizes a header claims. The fault campaign reads many
+more, by the commands.
 """
 
 import collections
 import json
-import os
 import queue
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-
-import pytest
 
 CHILD = Path(__file__).with_name("mutation_child.py")
 GROWTH = 192 << 20
@@ -80,12 +77,3 @@ def test_a_few_hundred_mutated_files():
     assert came["read"] > 100
     assert came["refused:"] > 20
     assert came["recovered"] > 10
-
-
-@pytest.mark.slow
-def test_twenty_thousand_mutated_files():
-    parts = [(first, first + 5000) for first in range(0, 20_000, 5000)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # each is a process of its own
-        for came in pool.map(lambda part: read_mutated(*part), parts):
-            assert came["read"] > 1500
-            assert came["refused:"] > 300

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 import undulog
-from capture import Session
+from capture import Session, SessionWriter
 from capture.errors import LogError, NotALogError, OutputExistsError, UndulogError, UsageError
 from capture.log.cut import cut_log
 from capture.log.merge import merge_logs
@@ -405,6 +405,60 @@ def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_pat
     times = {m[2] for m in found}
     assert found == [m for m in recorder.truth(6000) if m[2] in times]
     assert 1000 < len(found) < 6000
+
+
+def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, capsys):
+    """Another session is copied over a killed one; what that had can still be recovered."""
+    path = unfinished(tmp_path / "run.mcap", 3000)
+    wal = path.with_name("run.mcap.wal")
+    other = tmp_path / "other.mcap"
+    with SessionWriter(other, session_id="other", epoch_ns=recorder.EPOCH_NS) as writer:
+        channel = writer.string("/gait/mode")
+        for k in range(100):
+            channel.write(recorder.EPOCH_NS + k * 10_000_000, f"mode {k}")
+    truth, _ = read(other)
+    path.unlink()
+    shutil.copy(other, path)
+    found, warnings = read(path)
+    assert found == truth
+    assert len(warnings) == 1
+    assert warnings[0].startswith("run.mcap.wal is the write-ahead log of another session (killed)")
+    health = check_session(path)
+    assert (health.file.unfinished, health.file.damage) == ("", ())
+    assert warnings[0] in health.file.notes
+    assert undulog.run(["log", "recover", str(path), "-o", str(tmp_path / "out.mcap")]) == 0
+    assert warnings[0] in capsys.readouterr().out
+    assert read(tmp_path / "out.mcap")[0] == truth
+    wal.rename(tmp_path / "old.mcap.wal")  # as the warning says
+    assert undulog.run(["log", "recover", str(tmp_path / "old.mcap")]) == 0
+    rescued, warnings = read(tmp_path / "old.recovered.mcap")
+    assert warnings == []
+    assert rescued == [m for m in recorder.truth(3000) if m in rescued]
+    assert recorder.truth(3000)[-1] in rescued
+
+
+def test_a_recovery_gives_no_advice_to_recover_and_asks_for_what_a_copy_left_behind(
+    tmp_path, capsys
+):
+    (tmp_path / "copy").mkdir()
+    path = unfinished(tmp_path / "run.mcap", 6000)
+    with Session(path) as session:
+        assert any("'undulog log recover'" in text for text in session.warnings)
+    assert undulog.run(["log", "recover", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "the recorder did not finish" in out
+    assert "log recover" not in out
+    copy = tmp_path / "copy" / "run.mcap"
+    shutil.copy(path, copy)
+    with Session(copy) as session:
+        assert len(session.warnings) == 1
+    assert undulog.run(["log", "recover", str(copy)]) == 0
+    out = capsys.readouterr().out
+    assert "note: there is no run.mcap.wal beside run.mcap" in out
+    shutil.copytree(path.with_name("run.mcap.wal"), copy.with_name("run.mcap.wal"))
+    assert undulog.run(["log", "recover", str(copy), "--force"]) == 0
+    assert "; none is missing" in capsys.readouterr().out
+    assert read(copy.with_name("run.recovered.mcap")) == (recorder.truth(6000), [])
 
 
 def test_a_whole_file_needs_no_recovery(tmp_path):

@@ -1,0 +1,160 @@
+"""Damaged foreign logs: an import ends in a session or in an error of ours that names the file."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import pytest
+
+from capture import Session, load_robot
+from capture.errors import UndulogError
+from capture.exchange.can_import import import_can
+from capture.exchange.column_map import column_map_from_options
+from capture.exchange.csv_import import import_csv
+
+SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db")
+NUMBERS = (
+    "nan",
+    "inf",
+    "-inf",
+    "1e308",
+    "-1e308",
+    "1e19",
+    "1e999999999",
+    "9" * 400,
+    "-1",
+    "",
+    "\0",
+    "0x",
+    "é",
+)
+CASES = 40
+
+
+def write_trace(path: Path) -> None:
+    with can.Logger(str(path)) as logger:
+        for k in range(60):
+            logger.on_message_received(
+                can.Message(
+                    timestamp=1_700_000_000 + 0.01 * k,
+                    arbitration_id=0x140 + k % 4,
+                    is_extended_id=k % 7 == 0,
+                    data=bytes(range(k % 9)),
+                    channel=k % 2,
+                    is_rx=k % 3 > 0,
+                )
+            )
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("arcsnake-joint")
+
+
+@pytest.fixture(scope="module")
+def traces(tmp_path_factory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("traces")
+    for suffix in SUFFIXES:
+        write_trace(folder / f"run{suffix}")
+    return {suffix: (folder / f"run{suffix}").read_bytes() for suffix in SUFFIXES}
+
+
+def mutated(data: bytes, rng: random.Random, *, text: bool) -> bytes:
+    """One to three changes: bytes, a cut, a piece twice, a number that is none or too large."""
+    for _ in range(rng.randint(1, 3)):
+        at = rng.randrange(len(data) + 1)
+        kind = rng.randrange(5)
+        if kind == 0:
+            data = data[:at] + rng.randbytes(rng.randint(1, 8)) + data[at + 4 :]
+        elif kind == 1:
+            data = data[:at]
+        elif kind == 2:
+            data = data[:at] + data[at // 2 :]
+        elif text:
+            words = data.split(b" " if b"," not in data else b",")
+            words[rng.randrange(len(words))] = rng.choice(NUMBERS).encode()
+            data = (b" " if b"," not in data else b",").join(words)
+        else:
+            width = rng.choice((1, 2, 4, 8))
+            value = rng.choice((b"\xff" * width, b"\0" * width, b"\x7f" + b"\xff" * (width - 1)))
+            data = data[:at] + value + data[at + width :]
+    return data
+
+
+def refusal(work: Callable[[], object]) -> str | None:
+    """The error of ours that some work ends in; None if it is done."""
+    try:
+        work()
+    except UndulogError as error:
+        return str(error)
+    return None
+
+
+def imported(path: Path, robot) -> None:
+    """Import; a session that came of it can be read."""
+    output = path.with_suffix(".mcap")
+    why = refusal(lambda: import_can(path, output, robot, force=True))
+    if why is not None:
+        assert str(path) in why
+        return
+    with Session.open(output) as session:
+        assert session.channels
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_mutated_traces_end_in_a_session_or_an_error_of_ours(suffix, traces, robot, tmp_path):
+    for seed in range(CASES):
+        rng = random.Random(f"{suffix} {seed}")
+        path = tmp_path / f"{seed}{suffix}"
+        path.write_bytes(mutated(traces[suffix], rng, text=suffix not in (".blf", ".db")))
+        imported(path, robot)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("suffix", [".asc", ".trc", ".csv", ".log"])
+def test_each_odd_number_in_a_text(suffix, number, traces, robot, tmp_path):
+    lines = traces[suffix].decode().split("\n")
+    place = len(lines) - 10
+    separator = "," if suffix == ".csv" else " "
+    for column in range(len(lines[place].split(separator))):
+        words = lines[place].split(separator)
+        words[column] = f"({number})" if suffix == ".log" and not column else number
+        path = tmp_path / f"{column}{suffix}"
+        path.write_text("\n".join([*lines[:place], separator.join(words), *lines[place + 1 :]]))
+        imported(path, robot)
+
+
+@pytest.mark.parametrize("value", [None, "text", b"\xff", 1e308, float("inf"), -1, 2**62])
+def test_each_odd_value_in_a_database(value, traces, robot, tmp_path):
+    columns = ("ts", "arbitration_id", "extended", "remote", "error", "dlc", "data")
+    for column in columns:
+        path = tmp_path / f"{column}.db"
+        path.write_bytes(traces[".db"])
+        with sqlite3.connect(path) as base:
+            base.execute(f"UPDATE messages SET {column} = ? WHERE rowid = 30", (value,))
+        base.close()
+        imported(path, robot)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 15, 16, 100, 4000, 4096, 5000])
+def test_a_database_cut_short(cut, traces, robot, tmp_path):
+    path = tmp_path / "cut.db"
+    path.write_bytes(traces[".db"][:cut])
+    imported(path, robot)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_odd_numbers_in_a_csv_of_columns(number, robot, tmp_path):
+    name = robot.joint_names[0]
+    for row in (f"{number},1.0", f"0.01,{number}", f"{number},{number}"):
+        path = tmp_path / "a.csv"
+        path.write_bytes(f"t,a\n0.0,0.5\n{row}\n0.03,0.25\n".encode())
+        options = ["t=time:s", f"a={name}.position:rad"]
+        columns = column_map_from_options(options, robot)
+        output = tmp_path / "a.mcap"
+        why = refusal(lambda c=columns, o=output, p=path: import_csv(p, o, robot, c, force=True))
+        assert why is None or str(path) in why

@@ -1,0 +1,141 @@
+"""Logs whose numbers and types no recorder writes: an answer or an error in words, soon."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import undulog
+from capture import Session
+from capture.errors import DataError
+from capture.log.merge import merge_logs
+from capture.log.rosmsg import parse_message_type
+from capture.log.session_check import check_session
+
+hostile = runpy.run_path(str(Path(__file__).parents[2] / "bench" / "hostile_logs.py"))
+HostileLog, EPOCH_NS, NS = hostile["HostileLog"], hostile["EPOCH_NS"], hostile["NS"]
+joint_state, gait = hostile["joint_state"], hostile["gait"]
+
+RULE = "=" * 80
+
+
+def ticks(count: int = 100, start_ns: int = EPOCH_NS) -> list:
+    return [
+        (channel, t_ns, joint_state(EPOCH_NS + tick * 10_000_000, ["a"], [tick / 100]))
+        for tick in range(count)
+        for t_ns in [start_ns + tick * 10_000_000]
+        for channel in (1, 2)
+    ]
+
+
+def joints() -> object:
+    log = HostileLog()
+    kind = log.schema()
+    for topic in ("/joint_commands", "/joint_states"):
+        log.channel(topic, kind)
+    return log
+
+
+@pytest.mark.parametrize("kind", ["sensor_msgs/msg/JointState", "std_msgs/msg/String"])
+def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(
+    tmp_path: Path, kind: str
+) -> None:
+    log = joints()
+    channel = log.channel("/other", log.schema(kind))
+    log.chunk([*ticks(), (channel, EPOCH_NS, b"")])
+    health = check_session(log.write(tmp_path / "run.mcap"))
+    (other,) = (each for each in health.channels if each.topic == "/other")
+    assert (other.count, other.unread) == (1, 1)
+
+
+@pytest.mark.parametrize("start_ns", [2**63 - NS // 2, 2**63, 2**64 - 10 * NS])
+@pytest.mark.parametrize("whole", [True, False])
+def test_log_times_that_no_signed_number_holds(
+    tmp_path: Path, start_ns: int, whole: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = joints()
+    if not whole:
+        log.chunk(ticks())
+    log.chunk(ticks(300, start_ns))
+    path = log.write(tmp_path / "run.mcap")
+    with Session.open(path) as session:
+        assert any("beyond the year 2262" in text for text in session.warnings)
+        found = session.joints("/joint_states")
+        assert len(found.t_ns[0]) == (300 if whole else 400)
+        assert 0 <= session.start_ns <= session.end_ns < 2**63
+    for verb in (["log", "check"], ["log", "info"], ["analyse"]):
+        assert undulog.run([*verb, str(path)]) in (0, 1)
+    assert undulog.run(["log", "cut", str(path), "-o", str(tmp_path / "cut.mcap")]) == 0
+    assert undulog.run(["report", str(path), "-o", str(tmp_path / "run.html")]) == 0
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def nested(depth: int, fields: str) -> str:
+    """A schema of types in types; each has the fields, with the next type for ``T``."""
+    bodies = [fields.replace("T", f"T{k + 1}") for k in range(depth)]
+    sections = [f"{RULE}\nMSG: p/T{k}\n{body}" for k, body in enumerate([*bodies, "int32 x\n"])]
+    return fields.replace("T", "T0") + "".join(sections)
+
+
+SCHEMAS = {
+    "5,000 types deep": (nested(5000, "T a\n"), "nested more than 64 deep"),
+    "2^40 fields": (nested(40, "T a\nT b\n"), "fields, more than 4096"),
+    "a number of 5,000 digits": (f"int32[{'9' * 5000}] a\n", "no array has the length 999"),
+}
+
+
+@pytest.mark.parametrize("kind", SCHEMAS)
+def test_types_that_no_reader_could_hold_are_refused(tmp_path: Path, kind: str) -> None:
+    text, complaint = SCHEMAS[kind]
+    with pytest.raises(DataError, match=complaint):
+        parse_message_type("p/msg/Top", text)
+    paths = []
+    for name in ("one", "two"):
+        log = joints()
+        channel = log.channel("/odd", log.schema("p/msg/Top", text))
+        message = b"\0\1\0\0\1\0\0\0" + name.encode()
+        log.chunk([*ticks(), (channel, EPOCH_NS, message)])
+        paths.append(log.write(tmp_path / f"{name}.mcap"))
+    health = check_session(paths[0])
+    assert [each.count for each in health.channels if each.topic == "/odd"] == [1]
+    assert any(complaint in note for note in health.notes)
+    report = merge_logs(paths, tmp_path / "both.mcap")
+    assert report.messages["/odd"] == 2
+
+
+def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path: Path) -> None:
+    text = f"E[1000000] a\n{RULE}\nMSG: p/E\nF[1000000] f\n{RULE}\nMSG: p/F\n"
+    log = joints()
+    channel = log.channel("/odd", log.schema("p/msg/Top", text))
+    log.chunk([*ticks(), (channel, EPOCH_NS, b"\0\1\0\0\1\0\0\0")])
+    health = check_session(log.write(tmp_path / "run.mcap"))
+    assert [each.unread for each in health.channels if each.topic == "/odd"] == [1]
+
+
+def test_a_merge_of_more_channels_than_can_be_numbered_is_refused(tmp_path: Path) -> None:
+    paths = []
+    for name in ("one", "two"):
+        log = joints()
+        for k in range(33_000):
+            log.channel(f"/{name}/{k}", 1)
+        log.chunk(ticks())
+        paths.append(log.write(tmp_path / f"{name}.mcap"))
+    with pytest.raises(DataError, match=r"more than 65535.*leave topics out first"):
+        merge_logs(paths, tmp_path / "both.mcap")
+    assert not (tmp_path / "both.mcap").exists()
+
+
+def test_a_summary_that_lists_a_chunk_again_and_again_is_not_believed(tmp_path: Path) -> None:
+    log = joints()
+    log.attachment("notes.txt", bytes(1 << 20), listed=1000)
+    log.chunk(ticks(), listed=1000)
+    path = log.write(tmp_path / "run.mcap")
+    with Session.open(path) as session:
+        assert any("overlap" in text for text in session.warnings)
+        assert session.channels["/joint_states"].count == 100
+        np.testing.assert_allclose(session.joints("/joint_states").values[0], np.arange(100) / 100)
+    assert json.loads(json.dumps(check_session(path).file.damage)) == []
