@@ -11,7 +11,7 @@ DEMO   := out/demo
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo check format bench docs pictures golden lock clean
+.PHONY: help demo test slow zoo campaign check format bench docs pictures golden lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -53,6 +53,9 @@ slow: $(READY)  ## the slow tests
 zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)
 
+campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=2000 for fewer)
+	PYTHONPATH=tests:. $(BIN)/python -m campaign.run $(and $(SEED),--seed $(SEED)) $(and $(CASES),--cases $(CASES))
+
 check: $(READY)  ## lint, format, types, layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -65,6 +68,7 @@ format: $(READY)  ## mend what lint and format can mend
 
 bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/read_jointstate.py
+	$(BIN)/python bench/limits.py
 	$(BIN)/python bench/wal.py
 	$(BIN)/python bench/durable.py
 	$(BIN)/python bench/sources.py

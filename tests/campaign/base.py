@@ -1,0 +1,355 @@
+"""Small whole files of every kind that the commands read.
+
+CAN traces are written by python-can, foreign logs by the ``mcap`` packages.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import can
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+from mcap_ros2.writer import Writer as RosWriter
+
+from capture import SessionWriter, load_robot
+from capture.log.durable_sink import DurableSink
+from capture.log.frames import empty_frames
+from capture.log.schemas import schema_text
+
+EPOCH_NS = 1_700_000_000_000_000_000
+JOINTS = ("joint01", "joint02", "joint03", "joint04")
+PERIOD_NS = 20_000_000
+DBC = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n' + "".join(
+    f"""BO_ {base + number} {name}_{kind}: 8 A
+ SG_ position : 0|16@1- (0.01,0) [-180|180] "deg" A
+ SG_ velocity : 16|16@1- (0.1,0) [-3000|3000] "deg/s" A
+ SG_ current : 32|16@1- (1,0) [-9000|9000] "mA" A
+"""
+    for base, kind in ((0x100, "command"), (0x200, "state"))
+    for number, name in enumerate(JOINTS)
+)
+ROBOT = """
+name = "snake4"
+description = "Four joints."
+clock = "device"
+joints = [
+  { name = "joint01", plane = "horizontal" },
+  { name = "joint02", plane = "vertical" },
+  { name = "joint03", plane = "horizontal" },
+  { name = "joint04", plane = "vertical" },
+]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+[defaults.joint]
+lower = -0.5235987755982988
+upper = 0.5235987755982988
+[bus]
+databases = ["snake4.dbc"]
+bitrate = 1000000
+""" + "".join(
+    f'[[bus.signals]]\nmessage = "{{joint}}_{message}"\nsignal = "{name}"\ndirection = "{way}"\n'
+    f'target = "{{joint}}"\nquantity = "{quantity}"\nunit = "{unit}"\n'
+    for message, name, way, quantity, unit in (
+        ("command", "position", "tx", "command", "deg"),
+        ("state", "position", "rx", "position", "deg"),
+        ("state", "velocity", "rx", "velocity", "deg/s"),
+        ("state", "current", "rx", "current", "mA"),
+    )
+)
+SCENARIO = """
+description = "Four joints on flat ground."
+robot = "snake4.toml"
+duration_s = 0.1
+settle_s = 0.0
+[gait]
+ramp_s = 0.02
+[gait.horizontal]
+amplitude = 0.1
+frequency_hz = 2.0
+lag = 1.0
+[gait.vertical]
+amplitude = 0.05
+frequency_hz = 2.0
+lag = 0.5
+"""
+PLAN = """
+description = "Two segments."
+scenario = "scenario.toml"
+[[segments]]
+duration_s = 0.05
+[[segments]]
+duration_s = 0.05
+transition_s = 0.02
+mode = "fast"
+horizontal = { frequency_hz = 1.0, amplitude = 0.05 }
+"""
+SETTINGS = """
+[record]
+sources = ["twin:scenario.toml"]
+output = "run-{time}.mcap"
+duration = "100ms"
+floor = "1MB"
+fast = true
+quiet = true
+split_size = "1MB"
+operator = "a person"
+metadata = { place = "tank 2" }
+"""
+COLUMNS = """
+[time]
+column = "time"
+unit = "s"
+[[columns]]
+column = "angle"
+joint = "joint01"
+quantity = "position"
+unit = "deg"
+wrap = 360
+[[columns]]
+column = "torque"
+joint = "joint02"
+quantity = "effort"
+unit = "N m"
+"""
+
+
+@dataclass(frozen=True)
+class Base:
+    """Files that belong together.
+
+    Attributes:
+        kind: Which command lines there are for it.
+        name: Of the file, or folder, that a command line names.
+        files: Relative path to content.
+        mutable: The paths that get faults.
+    """
+
+    kind: str
+    name: str
+    files: dict[str, bytes] = field(repr=False)
+    mutable: tuple[str, ...]
+
+
+def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) -> None:
+    """Four joints that follow sines, with frames, events and a reading of every kind."""
+    robot = load_robot(str(path.parent / "snake4.toml"))
+    with SessionWriter(
+        path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, metadata={"operator": "x"}, sink=sink
+    ) as writer:
+        commands = writer.joint_state("/joint_commands", JOINTS, unit="rad")
+        states = writer.joint_state("/joint_states", JOINTS, unit="rad", velocity=True, effort=True)
+        offsets = writer.joint_state("/joint_sample_offset", JOINTS, unit="s")
+        frames, events, mode = writer.frames("/can/can0"), writer.log(), writer.string("/gait/mode")
+        sonar = writer.range("/sonar", frame="head", min_range=0.1, max_range=2, field_of_view=0.1)
+        phase = 2 * np.pi * 1.5 * PERIOD_NS * 1e-9
+        for tick in range(ticks):
+            t_ns = EPOCH_NS + tick * PERIOD_NS
+            turn = phase * tick + 0.7 * np.arange(len(JOINTS))
+            noise = 1e-3 * np.sin(7.3 * turn)
+            commands.write(t_ns, 0.3 * np.sin(turn))
+            states.write(t_ns, 0.27 * np.sin(turn - 0.2) + noise, 2.5 * np.cos(turn), 0.1 * noise)
+            if tick % 4 == 0:
+                offsets.write(t_ns, [0.0, 1e-3, 2e-3, 3e-3])
+                batch = empty_frames(8)
+                batch["t_host_ns"] = batch["t_device_ns"] = t_ns
+                batch["id_flags"] = [base + k for base in (0x100, 0x200) for k in range(4)]
+                batch["dlc"], batch["dir"] = 8, [1] * 4 + [0] * 4
+                frames.write(t_ns, batch)
+            if tick % 50 == 0:
+                mode.write(t_ns, "walk")
+                sonar.write(t_ns, 0.5)
+                events.write(t_ns, "warn", "tests", f"tick {tick}")
+        writer.set_verdict("good", ["no fault"])
+
+
+def foreign_session(path: Path) -> None:
+    """A bag of mcap-ros2-support: one message a servo, without a robot."""
+    with path.open("wb") as stream:
+        writer = RosWriter(stream, chunk_size=4000)
+        kind = "sensor_msgs/msg/JointState"
+        schema = writer.register_msgdef(kind, schema_text(kind))
+        for tick in range(240):
+            t_ns = EPOCH_NS + tick * PERIOD_NS
+            for topic, lag in (("/joint_commands", 0.0), ("/joint_states", 0.2)):
+                for k, name in enumerate(JOINTS[:2]):
+                    seconds, rest = divmod(t_ns + k * 1000, 10**9)
+                    angle = 0.3 * np.sin(0.25 * tick + k - lag)
+                    message = {
+                        "header": {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": ""},
+                        "name": [name],
+                        "position": [float(angle)],
+                        "velocity": [],
+                        "effort": [],
+                    }
+                    writer.write_message(topic, schema, message, log_time=t_ns)
+        writer.finish()
+
+
+def rewrite(source: Path, path: Path, **options: object) -> None:
+    """The same records as another make writes them."""
+    with source.open("rb") as stream, path.open("wb") as out:
+        reader = make_reader(stream)
+        writer = Writer(out, **options)
+        writer.start("ros2", "another make")
+        schemas, channels = {}, {}
+        for schema, channel, one in reader.iter_messages():
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            writer.add_message(
+                channels[channel.id], one.log_time, one.data, one.publish_time, one.sequence
+            )
+        for one in reader.iter_attachments():
+            writer.add_attachment(0, EPOCH_NS, one.name, one.media_type, one.data)
+        writer.finish()
+
+
+def can_messages(count: int = 160) -> Iterator[can.Message]:
+    """Commands and states of the small robot, a servo at a time."""
+    for number in range(count):
+        joint, state = number // 2 % 4, number % 2
+        raw = round(1500 * np.sin(0.1 * number)) & 0xFFFF
+        yield can.Message(
+            timestamp=EPOCH_NS * 1e-9 + number * 0.005,
+            arbitration_id=(0x200 if state else 0x100) + joint,
+            is_extended_id=False,
+            is_rx=bool(state),
+            data=raw.to_bytes(2, "little") + bytes(6),
+            channel=0,
+        )
+
+
+def _trace(path: Path, make: Callable[..., can.Listener] = can.Logger) -> Path:
+    writer = make(str(path))
+    for message in can_messages():
+        writer.on_message_received(message)
+    writer.stop()
+    return path
+
+
+def _texts() -> dict[str, bytes]:
+    rows = "".join(f"{k / 100},{k % 360},{0.1 * k}\n" for k in range(80))
+    texts = {
+        "snake4.toml": ROBOT,
+        "snake4.dbc": DBC,
+        "scenario.toml": SCENARIO,
+        "plan.toml": PLAN,
+        "settings.toml": SETTINGS,
+        "columns.toml": COLUMNS,
+        "table.csv": "time,angle,torque\n" + rows,
+    }
+    return {name: text.encode() for name, text in texts.items()}
+
+
+def _files_below(folder: Path) -> dict[str, bytes]:
+    found = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
+    """Write every base file once.
+
+    Args:
+        folder: An empty folder to work in.
+        result_of: Gives the JSON of ``undulog analyse`` for a session.
+
+    Returns:
+        All of them.
+    """
+    texts = _texts()
+    for name, data in texts.items():
+        (folder / name).write_bytes(data)
+    gait, plain = folder / "gait.mcap", {"compression": CompressionType.NONE, "enable_crcs": False}
+    gait_session(gait)
+    foreign_session(folder / "foreign.mcap")
+    makes = {
+        "lz4": {"compression": CompressionType.LZ4, "chunk_size": 2000},
+        "open": {**plain, "chunk_size": 1500},
+        "bare": {**plain, "use_chunking": False},
+        "lone": {**plain, "index_types": IndexType.NONE, "chunk_size": 3000},
+        "cramped": {"chunk_size": 200},
+    }
+    for name, options in makes.items():
+        rewrite(gait, folder / f"{name}.mcap", **options)
+    bases = [
+        Base("log", f"{name}.mcap", {f"{name}.mcap": data, **texts}, (f"{name}.mcap",))
+        for name in ("gait", "foreign", *makes)
+        for data in [(folder / f"{name}.mcap").read_bytes()]
+    ]
+    bases += _of_recorder(folder, texts)
+    traces = [folder / f"trace.{kind}" for kind in ("log", "blf", "asc", "trc", "csv", "db")]
+    for path in traces:
+        _trace(path)
+    for path in traces:
+        files = {path.name: path.read_bytes(), **texts}
+        bases.append(Base("trace", path.name, files, (path.name,)))
+    trace = {"trace.log": traces[0].read_bytes(), **texts}
+    of_text = {
+        "table": ("table.csv", ("table.csv", "columns.toml")),
+        "robot": ("trace.log", ("snake4.toml", "snake4.dbc")),
+        "scenario": ("scenario.toml", ("scenario.toml", "snake4.toml")),
+        "plan": ("plan.toml", ("plan.toml",)),
+        "settings": ("settings.toml", ("settings.toml",)),
+    }
+    bases += [Base(kind, name, trace, mutable) for kind, (name, mutable) in of_text.items()]
+    files = {"gait.mcap": gait.read_bytes(), "result.json": result_of(gait), **texts}
+    bases.append(Base("result", "gait.mcap", files, ("result.json",)))
+    return bases
+
+
+def _of_recorder(folder: Path, texts: dict[str, bytes]) -> list[Base]:
+    """What a killed recorder leaves, and a session in parts."""
+    work = folder / "recorded"
+    work.mkdir()
+    for name, data in texts.items():
+        (work / name).write_bytes(data)
+    path = work / "run.mcap"
+    sink = DurableSink(path, segment_size=1 << 14, ballast=0)
+    robot = load_robot(str(work / "snake4.toml"))
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink) as writer:
+        states = writer.joint_state("/joint_states", JOINTS, unit="rad")
+        commands = writer.joint_state("/joint_commands", JOINTS, unit="rad")
+        for tick in range(150):
+            for channel in (states, commands):
+                channel.write(
+                    EPOCH_NS + tick * PERIOD_NS, 0.3 * np.sin([tick / 8 + k for k in range(4)])
+                )
+            if tick == 100:
+                shutil.copytree(work, folder / "unfinished")
+        unfinished = _files_below(folder / "unfinished")
+    split = folder / "split"
+    split.mkdir()
+    sink = DurableSink(split / "run.mcap", segment_size=1 << 16, ballast=0)
+    with SessionWriter(
+        split / "run.mcap", session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink
+    ) as writer:
+        states = writer.joint_state("/joint_states", JOINTS, unit="rad")
+        for tick in range(150):
+            states.write(
+                EPOCH_NS + tick * PERIOD_NS, 0.3 * np.sin([tick / 8 + k for k in range(4)])
+            )
+            if tick in {50, 100}:
+                sink.split()
+    parts = _files_below(split)
+    return [
+        Base(
+            "unfinished",
+            "run.mcap",
+            unfinished,
+            tuple(name for name in unfinished if name.startswith("run.mcap")),
+        ),
+        Base("split", next(iter(parts)), {**parts, **texts}, tuple(parts)),
+    ]

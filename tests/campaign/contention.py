@@ -1,0 +1,61 @@
+"""The recorder beside busy loops and a disk that syncs all the time."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from .case import Result
+from .recording import check_kept, end, recorder, senders
+from .stage import Stage
+
+RATE = 9000
+SECONDS = 20.0
+BUSY = "while True: pass"
+
+
+def run(seed: int, stage: Stage) -> Result:
+    """Two buses of 9,000 frames/s, all cores and the disk busy: each accepted frame is there.
+
+    What the kernel refused is a figure, not a failure: the sender was told.
+    """
+    rng = random.Random(seed)
+    per_packet = (1, 9)[seed % 2]
+    result = Result(f"record 2 x {RATE} frames/s, {per_packet} a packet, all cores busy")
+    with stage.fresh() as folder, ExitStack() as stack:
+        for words in [*[[sys.executable, "-c", BUSY]] * 4, _syncing(folder)]:
+            process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            stack.callback(process.wait, 30)
+            stack.callback(process.kill)
+        with (
+            recorder(folder, ("a", "b")) as running,
+            senders(
+                folder, ("a", "b"), rate=RATE, per_packet=per_packet, seconds=SECONDS + rng.random()
+            ) as sending,
+        ):
+            ends = [one.result() for one in sending]
+            time.sleep(1.0)
+            code = end(running)
+        said = (folder / "recorder.err").read_text(errors="replace")
+        if code != 0 or "Traceback" in said:
+            result.failures.append(f"recorder: exit code {code}: {said[-300:]}")
+        for one, told in zip(sending, ends, strict=True):
+            result.failures += check_kept(folder, one, told["accepted"])
+        accepted, refused = (sum(told[key] for told in ends) for key in ("accepted", "refused"))
+        result.figures = {
+            "n_accepted": accepted,
+            "n_refused": refused,
+            "refused_percent": round(100 * refused / max(1, accepted + refused), 3),
+        }
+    return result
+
+
+def _syncing(folder: Path) -> list[str]:
+    """Writes 1 MB blocks and syncs, over and over."""
+    dd = f"dd if=/dev/zero of={folder / 'dd'} bs=1M count=64 conv=fsync"
+    return ["bash", "-c", f"while kill -0 {os.getpid()}; do {dd}; done"]

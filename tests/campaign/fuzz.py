@@ -1,0 +1,274 @@
+"""Mutated files through the commands: a seed is a base file, its faults and a command line."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import random
+import re
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from .base import EPOCH_NS, Base
+from .case import Outcome, Result, front_door, judge, run_forked
+from .commands import COMMANDS, WEIGHTS
+from .mutate import mutate_bytes, mutate_text, remake_database, remake_log
+
+RECORDS_FOR_S = 12.0
+"""A recorder with mutated settings may have been given an hour: it is ended then [s]."""
+TEXTS = {".toml", ".dbc", ".csv", ".log", ".asc", ".trc", ".json"}
+FIELDS = ("position", "velocity", "effort")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Files and the command line to run on them."""
+
+    words: tuple[str, ...]
+    files: dict[str, bytes]
+    ended_after_s: float | None = None
+
+    def as_json(self) -> str:
+        """The case as one text, for a file."""
+        files = {name: base64.b64encode(data).decode() for name, data in self.files.items()}
+        fields = {"words": self.words, "ended_after_s": self.ended_after_s, "files": files}
+        return json.dumps(fields, indent=1) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Case:
+        """A case from such a text."""
+        fields = json.loads(text)
+        files = {name: base64.b64decode(data) for name, data in fields["files"].items()}
+        return cls(tuple(fields["words"]), files, fields["ended_after_s"])
+
+    def run(self, folder: Path, modules: Path | None = None) -> Outcome:
+        """Lay the files out in an empty folder and run the command there.
+
+        Args:
+            folder: The empty folder.
+            modules: A file to list the modules in that it imported.
+
+        Returns:
+            What became of it.
+        """
+        for name, data in self.files.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        work = front_door(self.words)
+        if self.words[0] == "api":
+            work = partial(read_session, folder / self.words[1])
+
+        def listed() -> None:
+            try:
+                work()
+            finally:
+                if modules is not None:
+                    modules.write_text("\n".join(sys.modules))
+
+        return run_forked(listed, folder, end_after_s=self.ended_after_s, end_by=signal.SIGTERM)
+
+
+def make_case(seed: int, bases: list[Base], scratch: Path) -> Case:
+    """The case that a seed stands for."""
+    rng = random.Random(seed)
+    kind = rng.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
+    base = rng.choice([one for one in bases if one.kind == kind])
+    lines = COMMANDS[kind]
+    line = rng.choices([text for _, text in lines], [weight for weight, _ in lines])[0]
+    files = dict(base.files)
+    if "gait0.mcap" in line:
+        files["gait0.mcap"] = next(one for one in bases if one.name == "gait.mcap").files[
+            "gait.mcap"
+        ]
+    for name in {rng.choice(base.mutable) for _ in range(rng.choice([1, 1, 1, 2]))}:
+        files[name] = _mutated(files[name], Path(name).suffix, rng, scratch)
+    if kind in {"unfinished", "split"} and rng.random() < 0.1:
+        del files[rng.choice(base.mutable)]
+    words = shlex.split(line.format(file=base.name))
+    if words == ["api"]:
+        words.append(base.name)
+    return Case(tuple(words), files, RECORDS_FOR_S if words[0] == "record" else None)
+
+
+def _mutated(data: bytes, suffix: str, rng: random.Random, scratch: Path) -> bytes:
+    if suffix in TEXTS:
+        return mutate_text(data, rng)
+    if suffix == ".db" and rng.random() < 0.7:
+        return remake_database(data, rng, scratch)
+    if suffix == ".mcap" and rng.random() < 0.6 and data[-8:] == data[:8]:
+        return remake_log(data, rng, scratch)
+    return mutate_bytes(data, rng)
+
+
+def read_session(path: Path) -> None:
+    """Everything that a session offers; errors of the error tree are answers too."""
+    from capture import Session
+    from capture.errors import UndulogError
+
+    def tried(part: Callable[[], object]) -> None:
+        try:
+            part()
+        except UndulogError as error:
+            str(error)
+
+    def read() -> None:
+        with Session(path) as session:
+            window = {"start_ns": EPOCH_NS + 20_000_000, "stop_ns": EPOCH_NS + 50_000_000}
+            tried(lambda: session.robot)
+            tried(lambda: (session.session_id, session.verdict, session.metadata))
+            tried(lambda: session.attachments)
+            tried(lambda: (session.start_ns, session.end_ns, session.duration_s))
+            for topic in session.channels:
+                tried(lambda t=topic: session.table(t))
+                tried(lambda t=topic: sum(1 for _ in session.messages(t)))
+                tried(lambda t=topic: session.frames(t))
+                for name in FIELDS:
+                    tried(lambda t=topic, n=name: session.joints(t, n))
+                tried(lambda t=topic: session.joints(t, **window))
+
+    tried(read)
+
+
+def check_output(folder: Path) -> list[str]:
+    """Each output that a command left under its final name is whole, by mcap's own reader."""
+    found = []
+    for path in [
+        *folder.glob("new*.mcap"),
+        *folder.glob("new/*.mcap"),
+        *folder.glob("frames.mcap"),
+    ]:
+        try:
+            with path.open("rb") as stream:
+                for _ in make_reader(stream, validate_crcs=True).iter_messages():
+                    pass
+        except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
+            found.append(f"output: {path.name} is no whole file: {type(error).__name__}: {error}")
+    for path in folder.glob("new*.json"):
+        try:
+            json.loads(path.read_bytes())
+        except ValueError as error:
+            found.append(f"output: {path.name}: {error}")
+    return found
+
+
+def run_case(case: Case, folder: Path, modules: Path | None = None) -> tuple[list[str], Outcome]:
+    """Run a case in an empty folder: (failures, what became of the command)."""
+    outcome = case.run(folder, modules)
+    return [*judge(outcome), *check_output(folder)], outcome
+
+
+def run_seed(seed: int, bases: list[Base], folder: Path) -> tuple[Result, Case]:
+    """Make and run the case of a seed, in an empty folder."""
+    case = make_case(seed, bases, folder.parent / "scratch")
+    failures, outcome = run_case(case, folder)
+    result = Result(" ".join(case.words), failures)
+    result.at_most("cpu_s", outcome.cpu_s)
+    result.at_most("peak_mib", outcome.peak / (1 << 20))
+    return result, case
+
+
+def kind_of(failure: str) -> str:
+    """What failures of one cause share: the kind, and for a traceback its error and its place."""
+    if failure.startswith("traceback: "):
+        error, _, place = failure.removeprefix("traceback: ").rpartition(" [")
+        return f"traceback {error.split(':')[0]} {place.rstrip(']')}"
+    return re.sub(r"[\d.]+", "N", failure.split(":", maxsplit=1)[0])
+
+
+def minimise(
+    case: Case,
+    kind: str,
+    bases: list[Base],
+    fresh: Callable[[], AbstractContextManager[Path]],
+    seconds: float = 40.0,
+) -> Case:
+    """A smaller case with the same kind of failure, as far as the time allows.
+
+    Files that aren't needed are left out, faults that aren't needed are undone, then stretches are
+    cut out by halves.
+
+    Args:
+        case: The failing case.
+        kind: Of its failure, see :func:`kind_of`.
+        bases: The whole files.
+        fresh: Gives an empty folder.
+        seconds: How long to try.
+
+    Returns:
+        The smallest case found.
+    """
+    deadline = time.monotonic() + seconds
+    originals = {(one.name, path): data for one in bases for path, data in one.files.items()}
+
+    def fails(files: dict[str, bytes]) -> bool:
+        tried = Case(case.words, files, case.ended_after_s)
+        with fresh() as folder:
+            return any(kind_of(one) == kind for one in run_case(tried, folder)[0])
+
+    files = dict(case.files)
+    for name in list(files):
+        if time.monotonic() > deadline:
+            break
+        fewer = {path: data for path, data in files.items() if path != name}
+        if fails(fewer):
+            files = fewer
+            continue
+        for (_, path), data in originals.items():
+            if path == name and data != files[name] and fails(files | {name: data}):
+                files[name] = data
+                break
+    for name in sorted(files, key=lambda one: -len(files[one])):
+        step = len(files[name]) // 2
+        while step >= 1 and time.monotonic() < deadline:
+            at = 0
+            while at < len(files[name]) and time.monotonic() < deadline:
+                data = files[name]
+                shorter = data[:at] + data[at + step :]
+                if fails(files | {name: shorter}):
+                    files[name] = shorter
+                else:
+                    at += step
+            step //= 2
+    return Case(case.words, files, case.ended_after_s)
+
+
+def warm(cases: Sequence[Case], fresh: Callable[[], AbstractContextManager[Path]]) -> list[str]:
+    """Import here whatever some cases import, so that forked processes needn't.
+
+    Args:
+        cases: Of whole files.
+        fresh: Gives an empty folder.
+
+    Returns:
+        What is wrong with any of them.
+    """
+    wanted: dict[str, None] = {}
+    found = []
+    for case in cases:
+        with fresh() as folder:
+            listing = folder.parent / "modules"
+            failures, outcome = run_case(case, folder, listing)
+            if listing.exists():
+                wanted |= dict.fromkeys(listing.read_text().split("\n"))
+        if outcome.code:
+            failures.append(
+                f"exit code {outcome.code}: {outcome.err.decode(errors='replace')[-300:]}"
+            )
+        found += [f"{' '.join(case.words)}: {fault}" for fault in failures]
+    for name in wanted:
+        if name not in sys.modules and not name.startswith("__"):
+            with contextlib.suppress(Exception):  # parts of a package that only it can import
+                import_module(name)
+    return found

@@ -1,0 +1,250 @@
+"""Armed drives over a connection that stalls: the far end judges by its own arrival times.
+
+The far end is a socketcand server of its own, with servos behind it, and nothing of undulog in it.
+For each joint and any two of its commands, the later one differs from the earlier one by at most
+``max_rate`` times the time between their arrivals, and by the steps that may be on their way
+beside that: one where replies answer requests; where feedback comes unasked, one for each control
+tick until the hold begins, and one more.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+import select
+import socket
+import struct
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from capture import load_robot
+
+from .base import DBC, ROBOT, SCENARIO
+from .case import Result, run_command
+from .stage import Stage
+
+PERIOD_S = 0.01
+MAX_RATE = 4.0
+STEP = MAX_RATE * PERIOD_S
+ROUNDING = math.radians(0.011)
+LIMIT = 0.5235987755982988
+SAFETY = f"""
+[safety]
+max_rate = {MAX_RATE}
+ramp_rate = 1.0
+max_tracking_error = 0.5
+max_current = 5.0
+max_temperature = 60.0
+reply_timeout_s = 1.0
+max_late_s = 1.0
+"""
+DRIVE_S = 60.0
+"""A drive of 3 s that takes so long hangs."""
+POLLED = 0x14B
+
+
+@dataclass
+class FarEnd:
+    """Servos at a socketcand server; the connection stalls when told.
+
+    Attributes:
+        polled: Whether a servo speaks only when it is asked.
+        interval_s: How often unasked states are sent [s].
+        latency_s: Of what is sent back [s].
+        stalls: (Begin after the first command [s], length [s], whether only the way to the bus).
+        bursts: Whether a router takes what comes meanwhile and delivers it at once; else nothing is
+            read from the connection.
+        commands: Joint to (arrival [s], angle [rad]).
+    """
+
+    polled: bool
+    interval_s: float
+    latency_s: float
+    stalls: list[tuple[float, float]]
+    bursts: bool
+    pose: float
+    commands: dict[int, list[tuple[float, float]]] = field(default_factory=dict)
+    first_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Listen."""
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.port = self.server.getsockname()[1]
+        self._angles = dict.fromkeys(range(1 if self.polled else 4), self.pose)
+        self._inbox: deque[bytes] = deque()
+        self._outbox: deque[tuple[float, bytes]] = deque()
+
+    def serve(self, child: int) -> None:
+        """Be the far end, one client after the other, until a process ends."""
+        deadline = time.monotonic() + DRIVE_S
+        self.server.settimeout(0.05)
+        while time.monotonic() < deadline and _alive(child):
+            try:
+                link, _ = self.server.accept()
+            except TimeoutError:
+                continue
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._inbox.clear()
+            self._outbox.clear()
+            with link, suppress(OSError):
+                link.sendall(b"< hi >")
+                self._connected(link, deadline)
+
+    def _connected(self, link: socket.socket, deadline: float) -> None:
+        """Serve one client until it leaves."""
+        text, opened, next_state = b"", False, time.monotonic()
+        while time.monotonic() < deadline:
+            stalled = self._stalled(time.monotonic())
+            if stalled and not self.bursts:
+                time.sleep(0.0005)
+            elif select.select([link], [], [], 0.0005)[0]:
+                data = link.recv(65536)
+                if not data:
+                    return
+                *whole, text = (text + data).split(b">")
+                self._inbox.extend(word.strip() for word in whole)
+            if stalled:
+                continue
+            while self._inbox:
+                word = self._inbox.popleft().strip(b"< ").split()
+                if word[0] == b"send":
+                    self._frame(int(word[1], 16), bytes(int(one, 16) for one in word[3:]))
+                    continue
+                if word[0] == b"rawmode":  # python-can takes its answer and a frame for one text
+                    opened, next_state = True, time.monotonic() + 0.2
+                answers = {b"open": b"< ok >", b"rawmode": b"< ok >", b"echo": b"< echo >"}
+                self._outbox.append((0.0, answers.get(word[0], b"< error unknown command >")))
+            now = time.monotonic()
+            if opened and not self.polled and now >= next_state:
+                next_state = max(next_state + self.interval_s, now - self.interval_s)
+                for joint, angle in self._angles.items():
+                    raw = round(math.degrees(angle) * 100)
+                    self._reply(0x200 + joint, struct.pack("<hhhh", raw, 0, 100, 0))
+            while self._outbox and self._outbox[0][0] <= now:
+                link.sendall(self._outbox.popleft()[1])
+
+    def _stalled(self, now: float) -> bool:
+        if self.first_s is None:
+            return False
+        return any(begin <= now - self.first_s < begin + length for begin, length in self.stalls)
+
+    def _reply(self, identifier: int, data: bytes) -> None:
+        now = time.time()
+        words = f"< frame {identifier:X} {now:.6f} {data.hex().upper()} >"
+        self._outbox.append((time.monotonic() + self.latency_s, words.encode()))
+
+    def _frame(self, identifier: int, data: bytes) -> None:
+        now = time.monotonic()
+        if self.polled and identifier == POLLED and data[0] == 0x92:
+            raw = round(math.degrees(self._angles[0]) * 100)
+            self._reply(POLLED, bytes([0x92]) + raw.to_bytes(7, "little", signed=True))
+            return
+        if self.polled and identifier == POLLED and data[0] == 0xA4:
+            joint, angle = 0, math.radians(struct.unpack("<i", data[4:])[0] / 100)
+            self._reply(POLLED, struct.pack("<BbhhH", 0xA4, 30, 10, 0, 0))
+        elif not self.polled and 0x100 <= identifier < 0x104:
+            joint = identifier - 0x100
+            angle = math.radians(struct.unpack("<h", data[:2])[0] / 100)
+        else:
+            return
+        if self.first_s is None:
+            self.first_s = now
+        self._angles[joint] = angle
+        self.commands.setdefault(joint, []).append((now, angle))
+
+    @property
+    def steps_allowed(self) -> int:
+        """Steps that may be on their way, by the rule above."""
+        ticks = max(3, math.ceil(3 * self.interval_s / PERIOD_S - 1e-9))
+        return 1 if self.polled else ticks + 1
+
+    def check(self, limit: float) -> tuple[list[str], float]:
+        """(What is wrong, the largest number of steps beyond the rate)."""
+        found, worst = [], 0.0
+        for joint, rows in self.commands.items():
+            if (most := max(abs(angle) for _, angle in rows)) > limit + ROUNDING:
+                found.append(
+                    f"position: joint {joint} commanded to {most:.4f} rad, limit {limit:.4f}"
+                )
+            low = high = None
+            for t_s, angle in [(rows[0][0] - PERIOD_S, self.pose), *rows]:
+                up, down = angle - MAX_RATE * t_s, angle + MAX_RATE * t_s
+                low = up if low is None else min(low, up)
+                high = down if high is None else max(high, down)
+                worst = max(worst, up - low, high - down)
+        if worst > self.steps_allowed * STEP + 2 * ROUNDING:
+            found.append(
+                f"step: {worst:.4f} rad beyond the rate, {self.steps_allowed} x {STEP:.2f} allowed"
+            )
+        return found, worst / STEP
+
+
+def run(seed: int, stage: Stage) -> Result:
+    """One armed drive; every fifth is over a healthy bus, which it must finish."""
+    rng = random.Random(seed)
+    polled, healthy = rng.random() < 0.5, seed % 5 == 0
+    interval_s = rng.choice([0.01, 0.01, 0.05])
+    stalls = [
+        (rng.uniform(0.3, 2.0), math.exp(rng.uniform(math.log(0.02), math.log(5.0))))
+        for _ in range(0 if healthy else rng.choice([1, 1, 2, 4]))
+    ]
+    far = FarEnd(
+        polled,
+        interval_s,
+        rng.choice([0.0, 0.0, 0.004, 0.016]),
+        stalls,
+        rng.random() < 0.5,
+        rng.choice([0.0, 0.1]),
+    )
+    how = "polled" if polled else f"states each {1000 * interval_s:.0f} ms"
+    gaps = ", ".join(f"{1000 * length:.0f} ms" for _, length in stalls) or "none"
+    result = Result(f"drive, {how}, stalls: {gaps}{', in bursts' if far.bursts else ''}")
+    with stage.fresh() as folder:
+        _lay_out(folder, polled)
+        on = f"can:socketcand:can0?host=127.0.0.1&port={far.port}"
+        words = ["drive", "scenario.toml", "--on", on, "--arm", "-o", "new.mcap", "--duration", "3"]
+        outcome = run_command(words, folder, meanwhile=far.serve)
+        far.server.close()
+        result.add(outcome)
+        limit = 6283.2 if polled else LIMIT
+        failures, worst = far.check(limit)
+        result.failures += failures
+        result.at_most("steps_beyond_rate_polled" if polled else "steps_beyond_rate_unasked", worst)
+        result.figures["n_commands"] = sum(map(len, far.commands.values()))
+        said = outcome.err.decode(errors="replace")[-200:]
+        if not far.commands:
+            result.failures.append(f"drive: nothing was sent: {said}")
+        elif healthy and outcome.code != 0:
+            result.failures.append(f"drive: a healthy bus, and exit code {outcome.code}: {said}")
+        elif any(length > 1.5 and begin < 1.5 for begin, length in stalls) and outcome.code == 0:
+            result.failures.append("drive: exit code 0 though the bus stood still")
+    return result
+
+
+def _lay_out(folder: Path, polled: bool) -> None:
+    if polled:
+        robot = load_robot("arcsnake-joint")
+        for name, text in dict(robot.databases).items():
+            (folder / name).write_text(text)
+        (folder / "snake4.toml").write_text(robot.toml + SAFETY)
+    else:
+        (folder / "snake4.dbc").write_text(DBC)
+        (folder / "snake4.toml").write_text(ROBOT + SAFETY)
+    scenario = SCENARIO.replace("duration_s = 0.1", "duration_s = 60.0").replace(
+        "ramp_s = 0.02", "ramp_s = 0.5"
+    )
+    scenario = scenario.replace("frequency_hz = 2.0", "frequency_hz = 1.5").replace(
+        "amplitude = 0.1", "amplitude = 0.38"
+    )
+    if polled:
+        scenario = scenario[: scenario.index("[gait.vertical]")]
+    (folder / "scenario.toml").write_text(scenario)
+
+
+def _alive(child: int) -> bool:
+    """Whether a child process still runs; it is not taken from whoever waits for it."""
+    return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None

@@ -1,0 +1,357 @@
+"""Logs written by hand to take memory or time, or to break a reader's assumptions.
+
+The records are packed here, byte by byte, since no writer would make them.
+"""
+
+from __future__ import annotations
+
+import random
+import shlex
+import struct
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import lz4.frame
+import zstandard
+
+from capture.log.schemas import schema_text
+
+from .base import EPOCH_NS, PERIOD_NS, ROBOT, SCENARIO
+from .case import Result, run_command
+from .fuzz import check_output
+from .stage import Stage
+
+MAGIC = b"\x89MCAP0\r\n"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+GIB = 1 << 30
+
+
+def text(value: str | bytes) -> bytes:
+    data = value.encode() if isinstance(value, str) else value
+    return struct.pack("<I", len(data)) + data
+
+
+def record(kind: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", kind, len(body)) + body
+
+
+HEADER = MAGIC + record(1, text("ros2") + text("hand"))
+END = record(15, struct.pack("<I", 0)) + record(2, struct.pack("<QQI", 0, 0, 0)) + MAGIC
+
+
+def schema(number: int = 1, name: str = JOINT_STATE, data: str | None = None) -> bytes:
+    own = schema_text(name) if data is None else data
+    return record(3, struct.pack("<H", number) + text(name) + text("ros2msg") + text(own))
+
+
+def channel(number: int, topic: str, of: int = 1) -> bytes:
+    return record(
+        4, struct.pack("<HH", number, of) + text(topic) + text("cdr") + struct.pack("<I", 0)
+    )
+
+
+def message(number: int, log_ns: int, payload: bytes, sequence: int = 0) -> bytes:
+    return record(5, struct.pack("<HIQQ", number, sequence, log_ns, log_ns) + payload)
+
+
+def chunk(
+    inside: bytes, *, size: int | None = None, packed: bytes | None = None, kind: str = "zstd"
+) -> bytes:
+    data = zstandard.compress(inside) if packed is None else packed
+    head = struct.pack("<QQQI", EPOCH_NS, EPOCH_NS, len(inside) if size is None else size, 0)
+    return record(6, head + text(kind) + struct.pack("<Q", len(data)) + data)
+
+
+def joint_state(names: list[str], values: list[float], stamp_ns: int = EPOCH_NS) -> bytes:
+    """One JointState as CDR, its velocity and effort empty."""
+    body = bytearray(struct.pack("<iI", *divmod(stamp_ns, 10**9)) + text(b"\0") + b"\0\0\0")
+    body += struct.pack("<I", len(names))
+    for name in names:
+        body += bytes(-len(body) % 4) + text(name.encode() + b"\0")
+    body += bytes(-len(body) % 4) + struct.pack("<I", len(values))
+    body += bytes(-len(body) % 8) + struct.pack(f"<{len(values)}d", *values)
+    body += struct.pack("<II", 0, 0)
+    return b"\0\1\0\0" + bytes(body)
+
+
+PAIR = schema() + channel(1, "/joint_commands") + channel(2, "/joint_states")
+
+
+def sines(ticks: int, jump_ns: int = 0, names: tuple[str, ...] = ("a", "b")) -> Iterator[bytes]:
+    """Commands and states; the clock jumps once, in the middle."""
+    rng = random.Random(1)
+    for tick in range(ticks):
+        t_ns = EPOCH_NS + tick * PERIOD_NS + (jump_ns if tick >= ticks // 2 else 0)
+        for number in (1, 2):
+            values = [
+                0.3 * ((tick * 7 + 3 * k) % 50 / 25 - 1) + rng.gauss(0, 1e-3)
+                for k in range(len(names))
+            ]
+            yield message(
+                number, t_ns % 2**64, joint_state(list(names), values, t_ns % 2**62), tick
+            )
+
+
+def zeros(size: int, *, stated: bool = True) -> bytes:
+    """So many zero bytes in one zstd frame."""
+    packer = zstandard.ZstdCompressor(level=1, write_content_size=stated)
+    stream = packer.compressobj(size=size if stated else -1)
+    block = bytes(1 << 24)
+    return b"".join(stream.compress(block) for _ in range(size >> 24)) + stream.flush()
+
+
+# -- the logs ------------------------------------------------------------------------------
+
+
+def bomb(*, size: int, declared: int, stated: bool = True, cut: int = 0) -> bytes:
+    packed = zeros(size, stated=stated)
+    whole = HEADER + PAIR + chunk(b"", size=declared, packed=packed) + chunk(b"".join(sines(20)))
+    return whole[: len(HEADER + PAIR) + len(packed) - cut] if cut else whole + END
+
+
+def lz4_bomb() -> bytes:
+    stream = lz4.frame.LZ4FrameCompressor()
+    packed = (
+        stream.begin()
+        + b"".join(stream.compress(bytes(1 << 24)) for _ in range(96))
+        + stream.flush()
+    )
+    return HEADER + PAIR + chunk(b"", size=1000, packed=packed, kind="lz4") + END
+
+
+def many_chunks(count: int) -> bytes:
+    return (
+        HEADER + PAIR + chunk(b"", kind="", packed=b"") * count + chunk(b"".join(sines(20))) + END
+    )
+
+
+def chunk_indexed(times: int) -> bytes:
+    start = HEADER + PAIR
+    data = chunk(b"".join(sines(200)))
+    index = struct.pack("<QQQQ", EPOCH_NS, EPOCH_NS + 10**9, len(start), len(data))
+    index += struct.pack("<IQ", 0, 0) + text("zstd") + struct.pack("<QQ", len(data) - 60, 30_000)
+    body = start + data + record(15, struct.pack("<I", 0))
+    summary = PAIR + record(8, index) * times
+    return body + summary + record(2, struct.pack("<QQI", len(body), 0, 0)) + MAGIC
+
+
+def many_channels(count: int, *, joints: bool) -> bytes:
+    inside = schema() if joints else schema(1, "std_msgs/msg/String")
+    payload = joint_state(["a"], [0.1]) if joints else b"\0\1\0\0" + text(b"x\0")
+    for number in range(1, count + 1):
+        inside += channel(number, f"/t{number}") + message(number, EPOCH_NS + number, payload)
+    return HEADER + chunk(inside) + END
+
+
+def many_joints(count: int) -> bytes:
+    names, values = [f"j{k}" for k in range(count)], [0.1] * count
+    inside = PAIR
+    for tick in range(4):
+        payload = joint_state(names, values, EPOCH_NS + tick * PERIOD_NS)
+        inside += message(1, EPOCH_NS + tick * PERIOD_NS, payload)
+        inside += message(2, EPOCH_NS + tick * PERIOD_NS, payload)
+    return HEADER + chunk(inside) + END
+
+
+def many_names() -> bytes:
+    """Every message has a joint of its own."""
+    inside = PAIR
+    for tick in range(20_000):
+        inside += message(1 + tick % 2, EPOCH_NS + tick * 10**6, joint_state([f"j{tick}"], [0.1]))
+    return HEADER + chunk(inside) + END
+
+
+def jump(step_ns: int) -> bytes:
+    return HEADER + PAIR + chunk(b"".join(sines(300, step_ns))) + END
+
+
+def empty_payloads() -> bytes:
+    rows = list(sines(60))
+    return HEADER + PAIR + chunk(b"".join(rows) + message(2, EPOCH_NS + 10**10, b"")) + END
+
+
+def counts_that_lie() -> bytes:
+    good = joint_state(["a"], [0.1])
+    rows = [
+        good[:at] + struct.pack("<I", value) + good[at + 4 :]
+        for at in range(12, len(good) - 4, 4)
+        for value in (2**32 - 1, 2**31, 2**28)
+    ]
+    inside = b"".join(message(1 + k % 2, EPOCH_NS + k * 10**7, row) for k, row in enumerate(rows))
+    return HEADER + PAIR + chunk(inside) + END
+
+
+def schema_of(data: str) -> bytes:
+    return (
+        HEADER
+        + schema(1, "a/msg/B", data)
+        + channel(1, "/joint_states")
+        + message(1, EPOCH_NS, bytes(64))
+        + END
+    )
+
+
+def nested_schema() -> bytes:
+    parts = [f"N{k + 1} x\n{'=' * 80}\nMSG: a/N{k + 1}\n" for k in range(5000)]
+    return schema_of("".join(parts) + "uint8 x\n")
+
+
+def looped_schema() -> bytes:
+    return schema_of(f"B x\n{'=' * 80}\nMSG: a/B\nB x\n")
+
+
+def offsets_that_lie() -> bytes:
+    body = HEADER + PAIR + b"".join(sines(30)) + record(15, struct.pack("<I", 0))
+    return body + PAIR + record(2, struct.pack("<QQI", 2**63, 2**64 - 1, 7)) + MAGIC
+
+
+def lengths_that_lie() -> bytes:
+    rows = HEADER + PAIR + b"".join(sines(10))
+    return rows + b"".join(struct.pack("<BQ", kind, 2**62) for kind in (5, 6, 9, 12)) + bytes(100)
+
+
+def chunk_in_chunk() -> bytes:
+    inside = PAIR + b"".join(sines(5))
+    for _ in range(200):
+        inside = chunk(inside)
+    return HEADER + inside + END
+
+
+def images() -> bytes:
+    """Constant images: they pack 10,000 times and more, and are honest."""
+    name = "sensor_msgs/msg/Image"
+    text_of = "uint32 height\nuint32 width\nuint8[] data\n"
+    payload = b"\0\1\0\0" + struct.pack("<III", 1500, 2000, 3_000_000) + bytes(3_000_000)
+    inside = schema(3, name, text_of) + channel(3, "/camera", 3)
+    chunks = [chunk(inside + message(3, EPOCH_NS + k * 10**9, payload)) for k in range(20)]
+    return HEADER + PAIR + b"".join(chunks) + chunk(b"".join(sines(200))) + END
+
+
+def attached(content: str) -> bytes:
+    body = struct.pack("<QQ", 0, 0) + text("robot.toml") + text("application/toml")
+    body += struct.pack("<Q", len(content)) + content.encode() + struct.pack("<I", 0)
+    return HEADER + record(9, body) + PAIR + b"".join(sines(60)) + END
+
+
+READ = (
+    "log info {f}",
+    "log check {f}",
+    "log recover {f} -o new.mcap",
+    "analyse {f}",
+    "log cut {f} --start 0 --stop 1 -o new.mcap",
+)
+MORE = (
+    *READ,
+    "log export {f} -o new.csv",
+    "view {f} --save new.rrd",
+    "report {f} -o new.html",
+    "log info {f} --json",
+    "log merge {f} gait.mcap -o new.mcap",
+    "compare {f} gait.mcap",
+)
+DAY_NS = 86_400 * 10**9
+LOGS: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
+    "4 GiB behind 1,000 bytes": (partial(bomb, size=4 * GIB, declared=1000), READ),
+    "4 GiB, size not stated": (partial(bomb, size=4 * GIB, declared=1000, stated=False), READ),
+    "2 GiB, honest": (partial(bomb, size=2 * GIB, declared=2 * GIB), READ),
+    "2 GiB, cut": (partial(bomb, size=2 * GIB, declared=1000, cut=40), READ),
+    "1.5 GiB of LZ4": (lz4_bomb, READ),
+    "100,000 empty chunks": (partial(many_chunks, 100_000), READ),
+    "a chunk indexed 10,000 times": (partial(chunk_indexed, 10_000), READ),
+    "65,535 channels": (partial(many_channels, 65_535, joints=False), READ),
+    "8,000 joint topics": (partial(many_channels, 8000, joints=True), MORE),
+    "100,000 joints": (partial(many_joints, 100_000), MORE),
+    "20,000 names": (many_names, MORE),
+    "a clock that jumps a day": (partial(jump, DAY_NS), MORE),
+    "a clock that jumps a year": (partial(jump, 365 * DAY_NS), MORE),
+    "a clock that jumps back": (partial(jump, -365 * DAY_NS), MORE),
+    "log times from 2^63": (partial(jump, 2**63 - EPOCH_NS), MORE),
+    "an empty payload": (empty_payloads, MORE),
+    "counts that lie": (counts_that_lie, MORE),
+    "a schema nested 5,000 deep": (nested_schema, MORE),
+    "a schema in itself": (looped_schema, MORE),
+    "offsets that lie": (offsets_that_lie, READ),
+    "lengths that lie": (lengths_that_lie, READ),
+    "chunks in chunks": (chunk_in_chunk, READ),
+    "constant images": (images, READ[:4]),
+    "a robot nested 5,000 deep": (lambda: attached("a = " + "[" * 5000 + "]" * 5000), MORE),
+    "a robot of 1e308 kg": (lambda: attached(ROBOT.replace("mass = 0.1", "mass = 1e308")), MORE),
+}
+WORDS: dict[str, tuple[str, ...]] = {
+    "a folder": tuple(
+        f"{verb} folder{more}"
+        for verb, more in (
+            ("analyse", ""),
+            ("report", " -o new.html"),
+            ("compare", " gait.mcap"),
+            ("view", " --save new.rrd"),
+            ("log info", ""),
+            ("log check", ""),
+        )
+    ),
+    "a folder to plan from": (
+        "plan lag-sweep --like folder -o new",
+        "plan reversal --like folder -o new",
+    ),
+    "no place to write": (
+        "plan multisine --like gait.mcap -o /proc/new",
+        "sim run scenario.toml -o /proc/new.mcap",
+        "log cut gait.mcap -o /proc/new.mcap",
+        "analyse gait.mcap -o /proc/new.json",
+        "report gait.mcap -o /proc/n.html",
+    ),
+    "wrong words": (
+        "--bogus",
+        "--",
+        "log",
+        "",
+        "log info",
+        "log info ''",
+        "sim run ''",
+        "'\x1b[2J'",
+    ),
+    "masses of 1e308": ("sim run heavy.toml -o new.mcap", "drive heavy.toml --on twin -o new.mcap"),
+}
+
+
+COUNT = len(LOGS) + len(WORDS)
+
+
+def run(seed: int, stage: Stage) -> Result:
+    """A hostile log, or hostile words, through one command; each log comes with each in turn."""
+    number = seed % 1_000_000
+    names = [*LOGS, *WORDS]
+    name = names[number % len(names)]
+    lines = LOGS[name][1] if name in LOGS else WORDS[name]
+    line = lines[(number + number // len(names) + seed // 1_000_000) % len(lines)]
+    with stage.fresh() as folder:
+        for path, data in stage.files_of("gait.mcap").items():
+            (folder / path).write_bytes(data)
+        (folder / "folder").mkdir()
+        (folder / "robot.toml").write_text(ROBOT.replace("mass = 0.1", "mass = 1e308"))
+        (folder / "heavy.toml").write_text(SCENARIO.replace("snake4.toml", "robot.toml"))
+        if name in LOGS:
+            (folder / "hostile.mcap").write_bytes(_kept(stage, name))
+        words = shlex.split(line.format(f="hostile.mcap"))
+        outcome = run_command(words, folder)
+        result = Result(f"{line.format(f='hostile.mcap')!r}: {name}")
+        result.add(outcome)
+        result.failures += check_output(folder)
+        if name == "constant images" and b"error:" in outcome.err:
+            result.failures.append(f"refused: {outcome.err.decode(errors='replace')[-200:]}")
+        if name in WORDS and outcome.code == 0 and line != "''":
+            result.failures.append("accepted: exit code 0")
+        if name == "wrong words" and outcome.code == 1 and "''" not in line:
+            result.failures.append("exit code: 1 for wrong usage")
+    return result
+
+
+def _kept(stage: Stage, name: str) -> bytes:
+    """A log, made once."""
+    path = Path(stage.folder) / f"hostile-{list(LOGS).index(name)}"
+    if not path.exists():
+        part = path.with_suffix(".part")
+        part.write_bytes(LOGS[name][0]())
+        part.rename(path)
+    return path.read_bytes()

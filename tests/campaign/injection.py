@@ -1,0 +1,225 @@
+"""Text that acts on a terminal, a page, a spreadsheet or a path, in every name of a file."""
+
+from __future__ import annotations
+
+import csv
+import random
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+from mcap_ros2.writer import Writer as RosWriter
+
+from capture.log.schemas import schema_text
+
+from .base import DBC, EPOCH_NS, JOINTS, PERIOD_NS, PLAN, ROBOT, SCENARIO, can_messages
+from .case import Result, run_command
+from .commands import COMMANDS
+from .fuzz import check_output
+from .mutate import remake_log
+from .stage import Stage
+
+EVIL = [
+    "\x1b]0;owned\x07",
+    "\x1b[2J\x1b[H",
+    "\x1b]52;c;b3duZWQ=\x07",
+    "fine\rerror: forged",
+    "a\nb: good",
+    "\x9b31m",
+    "\u202egnp.exe",
+    "\u2028",
+    "\x00",
+    "\x08\x08\x08",
+    "\x7f",
+    '=HYPERLINK("http://x")',
+    "@SUM(1+1)",
+    "+1+1|cmd",
+    "<script>alert(1)</script>",
+    "<img src=x onerror=alert(1)>",
+    "a|b",
+    "[x](javascript:alert(1))",
+    "`#`",
+    "../../up",
+    "/etc/x",
+    "{{7*7}}",
+    "%s%n",
+    "\ud83d\ude00".encode("utf-16", "surrogatepass").decode("utf-16"),
+    "[bold red]x[/]",
+    "$HOME",
+    "x" * 3000,
+]
+HTML = re.compile(rb"<script>alert\(1\)|<img src=x onerror|href=\"javascript:", re.IGNORECASE)
+TEXTS = ("toml", "dbc", "scenario", "plan", "trace", "columns")
+
+
+def _evil_session(path: Path, rng: random.Random) -> None:
+    """A foreign bag with such names of joints and topics, texts of events, and metadata."""
+
+    favourite = rng.choice(EVIL)
+
+    def evil(name: str) -> str:
+        said = rng.choice([favourite, rng.choice(EVIL)])
+        return rng.choice([name, name + said, said + name])
+
+    names = [evil(name) for name in JOINTS]
+    kind, log = "sensor_msgs/msg/JointState", "rcl_interfaces/msg/Log"
+    with path.open("wb") as stream:
+        writer = RosWriter(stream)
+        schema = writer.register_msgdef(kind, schema_text(kind))
+        events = writer.register_msgdef(log, schema_text(log))
+        other = evil("/joint_other")
+        for tick in range(200):
+            t_ns = EPOCH_NS + tick * PERIOD_NS
+            seconds, rest = divmod(t_ns, 10**9)
+            stamp = {"sec": seconds, "nanosec": rest}
+            for topic, lag in (("/joint_commands", 0.0), ("/joint_states", 0.2), (other, 0.0)):
+                angles = 0.3 * np.sin(0.3 * tick + np.arange(len(names)) - lag)
+                if topic == "/joint_states" and tick > 100:
+                    angles[1] = 0.0  # one that stands still has to be named
+                row = {
+                    "header": {"stamp": stamp, "frame_id": evil("f") if tick == 3 else ""},
+                    "name": names,
+                    "position": angles.tolist(),
+                    "velocity": [],
+                    "effort": [],
+                }
+                writer.write_message(topic, schema, row, log_time=t_ns)
+            if tick % 40 == 0:
+                said = {
+                    "stamp": stamp,
+                    "level": 40,
+                    "name": evil("node"),
+                    "msg": evil("text"),
+                    "file": evil("file"),
+                    "function": "",
+                    "line": 0,
+                }
+                writer.write_message("/rosout", events, said, log_time=t_ns)
+        inner = writer._writer
+        facts = {evil(key): evil("x") for key in ("session_id", "operator", "notes", "robot", "x")}
+        inner.add_metadata("undulog", facts | {"session_id": evil("s")})
+        inner.add_metadata(
+            "undulog.health", {"verdict": evil("good"), "reasons": f'["{evil("r")}"]'}
+        )
+        inner.add_metadata(evil("name"), {"a": evil("b")})
+        inner.add_attachment(0, 0, evil("robot.toml"), evil("text/plain"), b"x")
+        writer.finish()
+
+
+def _spoil(text: str, rng: random.Random) -> str:
+    """Some strings of a TOML or DBC text become evil ones."""
+
+    def worse(found: re.Match[str]) -> str:
+        if rng.random() > 0.15:
+            return found.group()
+        said = found.group(1) + rng.choice(EVIL)
+        if rng.random() < 0.5:  # raw control characters are no TOML: escaped ones are
+            said = "".join(
+                f"\\u{ord(c):04x}" if ord(c) < 0xA0 and not c.isalnum() else c for c in said
+            )
+        return f'"{said}"'
+
+    return re.sub(r'"([^"\n]*)"', worse, text)
+
+
+def run(seed: int, stage: Stage) -> Result:
+    """Evil names in one of the files that commands read, through one command."""
+    rng = random.Random(seed)
+    with stage.fresh() as folder:
+        (folder / "snake4.toml").write_text(ROBOT)
+        (folder / "snake4.dbc").write_text(DBC)
+        (folder / "scenario.toml").write_text(SCENARIO)
+        (folder / "gait0.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
+        kind = rng.choice(["log", "log", "log", "foreign", *TEXTS])
+        line = _lay_out(kind, folder, rng, stage)
+        result = Result(f"{line!r}: {kind}")
+        outcome = run_command(shlex.split(line), folder)
+        result.add(outcome)
+        result.failures += check_output(folder)
+        result.failures += _check_pages(folder)
+        outside = [str(path) for path in folder.parent.iterdir() if path.name.startswith("up")]
+        result.failures += [f"path: wrote {path}" for path in outside]
+    return result
+
+
+def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
+    """Write the spoilt file; the command line to run on it."""
+    trace = folder / "trace.log"
+    trace.write_text(
+        "".join(
+            f"({m.timestamp:.6f}) can0 {m.arbitration_id:03X}#{m.data.hex()}\n"
+            for m in can_messages()
+        )
+    )
+    if kind in {"log", "foreign"}:
+        name = "evil.mcap"
+        if rng.random() < 0.3:
+            name = (
+                "e"
+                + rng.choice([x for x in EVIL if "/" not in x and "\0" not in x and len(x) < 99])
+                + ".mcap"
+            )
+        _evil_session(folder / name, rng)
+        if kind == "foreign":  # with faults besides, so that errors and warnings name things
+            data = (folder / name).read_bytes()
+            (folder / name).write_bytes(
+                remake_log(data, rng, stage.folder / f"scratch{folder.parent.name}")
+            )
+        lines = [line for _, line in COMMANDS["log"] if line != "api"]
+        return rng.choice(lines).format(file=shlex.quote(name))
+    imports = "import trace.log -o new.mcap -r snake4.toml"
+    if kind == "toml":
+        (folder / "snake4.toml").write_text(_spoil(ROBOT, rng))
+    elif kind == "dbc":
+        (folder / "snake4.dbc").write_text(
+            DBC.replace("position", "position" + rng.choice(EVIL), 1)
+        )
+    elif kind == "scenario":
+        (folder / "scenario.toml").write_text(_spoil(SCENARIO + '[x]\ny = "z"\n', rng))
+        return "sim run scenario.toml -o new.mcap"
+    elif kind == "plan":
+        (folder / "plan.toml").write_text(_spoil(PLAN, rng))
+        return "drive plan.toml --on twin -o new.mcap"
+    elif kind == "trace":
+        which = rng.choice(["bus", "text", "id"])
+        evil = rng.choice(EVIL)
+        old, new = {"bus": ("can0", evil), "text": ("#", evil), "id": ("100#", evil + "#")}[which]
+        trace.write_text(
+            trace.read_text().replace(old, new, rng.choice([1, -1])), "utf-8", "replace"
+        )
+    else:
+        evil = rng.choice(EVIL).replace('"', "")
+        (folder / "table.csv").write_text(
+            f"time,{evil},b\n" + "".join(f"{k},{k},{evil}\n" for k in range(9))
+        )
+        column = shlex.quote(evil.replace("\0", ""))
+        imports = "import table.csv -o new.mcap -r snake4.toml --map time=time:s"
+        return f"{imports} --map {column}=joint01.position:deg"
+    return rng.choice([imports, "sim run scenario.toml -o new.mcap", imports + " --json"])
+
+
+def _check_pages(folder: Path) -> list[str]:
+    """No markup from names in a page; no cell of a table that a spreadsheet computes."""
+    found = [
+        f"page: {hit.group()!r} in {path.name}"
+        for path in folder.glob("new*.html")
+        if (hit := HTML.search(path.read_bytes()))
+    ]
+    for path in folder.glob("new*.csv"):
+        with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+            for row in csv.reader(stream):
+                for cell in row:
+                    if cell[:1] in set("=@\t\r") or (
+                        cell[:1] in set("+-") and not _is_number(cell)
+                    ):
+                        return [*found, f"formula: {cell[:40]!r} in {path.name}"]
+    return found
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,137 @@
+"""Kills at random moments: of every command that writes, and of the recorder under load."""
+
+from __future__ import annotations
+
+import os
+import random
+import shlex
+import signal
+import time
+from pathlib import Path
+
+from .base import gait_session
+from .case import Result, judge, run_command
+from .fuzz import check_output
+from .recording import check_kept, recorder, senders
+from .stage import Stage
+
+LINES = [
+    "sim run scenario.toml -o new.mcap --duration 3",
+    "log recover unfinished/run.mcap -o new.mcap",
+    "log recover run.mcap -o new.mcap",
+    "log cut run.mcap --start 0 --stop 9 -o new.mcap",
+    "log merge run.mcap other.mcap -o new.mcap",
+    "log export run.mcap -o new.csv",
+    "log export run.mcap -o new.log",
+    "log export run.mcap -o new.blf",
+    "log export run.mcap -o new.parquet",
+    "log export run.mcap -o newframes.mcap",
+    "analyse run.mcap -o new.json",
+    "report run.mcap -o new.html",
+    "compare run.mcap other.mcap -o new.json",
+    "view run.mcap --save new.rrd",
+    "import trace.log -o new.mcap -r snake4.toml",
+    "import trace.blf -o new.mcap -r snake4.toml",
+    "drive scenario.toml --on twin -o new.mcap --duration 3",
+    "replay run.mcap --on twin:scenario.toml --duration 2 -o new.mcap",
+    "plan lag-sweep --like run.mcap -o new",
+    "plan reversal --like run.mcap -o new",
+    "record twin:scenario.toml --fast --quiet --floor 1MB --socket c.sock -o new.mcap",
+]
+END = {".html": b"</html>", ".rrd": b""}
+
+
+def lay_out(folder: Path, stage: Stage) -> None:
+    """The inputs of all command lines."""
+    path = stage.folder / "bases" / "long.mcap"
+    if not path.exists():
+        part = path.with_name(f"part{os.getpid()}.mcap")
+        gait_session(part, 2000)
+        part.rename(path)
+    long = path.read_bytes()
+    for base in stage.bases:
+        inside = {"unfinished": folder / "unfinished", "trace": folder}.get(base.kind)
+        if inside is not None:
+            for name, data in base.files.items():
+                (inside / name).parent.mkdir(parents=True, exist_ok=True)
+                (inside / name).write_bytes(data)
+    for name, data in (("run.mcap", long), ("other.mcap", stage.files_of("lz4.mcap")["lz4.mcap"])):
+        (folder / name).write_bytes(data)
+
+
+def whole_outputs(folder: Path) -> list[str]:
+    """Whatever lies under its final name is whole."""
+    found = check_output(folder)
+    for suffix, end in END.items():
+        for path in folder.glob(f"new*{suffix}"):
+            data = path.read_bytes()
+            if not data or end not in data[-100:]:
+                found.append(f"output: {path.name} is cut short")
+    return found
+
+
+def run(seed: int, stage: Stage) -> Result:
+    """One command is ended at a random moment, then run again to its end."""
+    rng = random.Random(seed)
+    line = rng.choice(LINES)
+    words = shlex.split(line)
+    by = rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+    recording = words[0] == "record"
+    with stage.fresh() as folder:
+        lay_out(folder, stage)
+        result = Result(f"{line!r} and {by.name}")
+        outcome = run_command(words, folder, end_after_s=rng.random() ** 2 * 1.2, end_by=by)
+        result.add(outcome)
+        if by == signal.SIGINT:  # before the command has begun Python itself answers
+            result.failures = [one for one in result.failures if not one.endswith("[?]")]
+        leaves_a_log = recording and (folder / "new.mcap.wal").exists()
+        if not leaves_a_log:
+            result.failures += whole_outputs(folder)
+        if not outcome.killed:
+            return result
+        if leaves_a_log:
+            words = ["log", "recover", "new.mcap", "-o", "new.recovered.mcap"]
+        elif words[0] == "plan":  # its folder may be there, whole sessions in it
+            words = [*words[: words.index("-o")], "-o", "again"]
+        else:
+            words.append("--force")
+        again = run_command(words, folder)
+        result.failures += [f"again: {fault}" for fault in judge(again)]
+        if again.code and not leaves_a_log:
+            said = again.err.decode(errors="replace")[-200:]
+            result.failures.append(f"again: exit code {again.code}: {said}")
+    return result
+
+
+def run_recorder(seed: int, stage: Stage) -> Result:
+    """The recorder is killed under the load of two senders; what was accepted is there.
+
+    What may be missing is what the kernel had accepted in the last 50 ms.
+    """
+    rng = random.Random(seed)
+    with stage.fresh() as folder:
+        rate, per_packet = rng.choice([500, 2000, 4000]), rng.choice([1, 9, 64])
+        options = rng.choice([(), ("--split-size", "1MB"), ("--robot", "snake25", "--bus", "a")])
+        result = Result(f"record {' '.join(options)} {rate}/s, {per_packet} a packet, SIGKILL")
+        with (
+            recorder(folder, ("a", "b"), options) as running,
+            senders(folder, ("a", "b"), rate=rate, per_packet=per_packet, seconds=60) as sending,
+        ):
+            for one in sending:
+                one.wait_for(200)
+            time.sleep(rng.uniform(0.0, 3.0))
+            killed_ns = time.monotonic_ns()
+            os.kill(running.pid, signal.SIGKILL)
+            running.wait(30)
+            accepted = [one.accepted_before(killed_ns - 50_000_000) for one in sending]
+        (folder / "recovered").mkdir()
+        outcome = run_command(
+            ["log", "recover", folder / "run.mcap", "-o", folder / "recovered" / "r.mcap"], folder
+        )
+        result.add(outcome)
+        if outcome.code:
+            result.failures.append(f"recover: {outcome.err.decode(errors='replace')[-200:]}")
+        for one, least in zip(sending, accepted, strict=True):
+            result.failures += check_kept(folder / "recovered", one, least)
+            result.figures["n_accepted"] = result.figures.get("n_accepted", 0) + least
+    return result

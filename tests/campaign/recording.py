@@ -1,0 +1,164 @@
+"""A recorder, and senders with sequence numbers of their own, held against mcap's own reader."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+ROOT = Path(__file__).parents[2]
+SENDER = Path(__file__).with_name("sender.py")
+RECORD = 32
+AT_DATA = 24
+"""Bytes of a frame's record, and where its data begins (the log contract)."""
+PATIENCE_S = 90.0
+
+
+@contextmanager
+def recorder(
+    folder: Path,
+    buses: Sequence[str],
+    options: Sequence[str] = (),
+    output: Path | None = None,
+    prefix: Sequence[str] = (),
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A recording of what other processes send; what it prints goes to ``recorder.err``."""
+    sources = [f"{name}=unix:{folder / name}.sock" for name in buses]
+    command = [
+        *prefix,
+        sys.executable,
+        "-m",
+        "undulog",
+        "record",
+        *sources,
+        *options,
+        "--quiet",
+        "--floor",
+        "0",
+        "--socket",
+        folder / "control.sock",
+        "-o",
+        output or folder / "run.mcap",
+    ]
+    with (folder / "recorder.err").open("wb") as errors:
+        running = subprocess.Popen([str(one) for one in command], stderr=errors, cwd=ROOT)
+    try:
+        yield running
+    finally:
+        if running.poll() is None:
+            running.kill()
+        running.wait(30)
+
+
+@dataclass
+class Sending:
+    """A sender: its process and the log that it keeps of what the kernel accepted."""
+
+    bus: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def rows(self) -> list[tuple[int, int]]:
+        """(Monotonic time [ns], frames accepted by then)."""
+        data = self.log.read_bytes() if self.log.exists() else b""
+        return list(struct.iter_unpack("<QQ", data[: len(data) // 16 * 16]))
+
+    def accepted_before(self, t_ns: int) -> int:
+        """Frames that were accepted before a moment."""
+        return max((count for at_ns, count in self.rows() if at_ns < t_ns), default=0)
+
+    def wait_for(self, packets: int) -> None:
+        """Wait until so many packets were accepted."""
+        until = time.monotonic() + PATIENCE_S
+        while len(self.rows()) < packets:
+            if time.monotonic() > until or self.process.poll() is not None:
+                raise TimeoutError(f"the sender of {self.bus} found no recorder")
+            time.sleep(0.02)
+
+    def result(self) -> dict[str, int]:
+        """What it reports at its end."""
+        out, _ = self.process.communicate(timeout=PATIENCE_S)
+        return json.loads(out)
+
+
+@contextmanager
+def senders(
+    folder: Path, buses: Sequence[str], *, rate: float, per_packet: int, seconds: float
+) -> Iterator[list[Sending]]:
+    """Senders to a recorder, one a bus."""
+    with ExitStack() as stack:
+        found = []
+        for name in buses:
+            log = folder / f"{name}.accepted"
+            command = [
+                sys.executable,
+                str(SENDER),
+                str(folder / f"{name}.sock"),
+                str(log),
+                str(rate),
+                str(per_packet),
+                str(seconds),
+            ]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE)
+            stack.callback(process.wait, 30)
+            stack.callback(process.kill)
+            found.append(Sending(name, process, log))
+        yield found
+
+
+def numbers_in(paths: Sequence[Path], bus: str) -> list[int]:
+    """The sequence numbers of a bus's frames, in the order of the files, by mcap's own reader."""
+    found = []
+    for path in paths:
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            for _, _, message in reader.iter_messages([f"/can/{bus}"], log_time_order=False):
+                data = message.data
+                # The array is the last field: a length before it, then whole records.
+                size = len(data)
+                start = size - RECORD
+                while (
+                    start >= RECORD and struct.unpack_from("<I", data, start - 4)[0] != size - start
+                ):
+                    start -= RECORD
+                if start < size:
+                    rows = data[start:]
+                    found += [
+                        struct.unpack_from("<Q", rows, at + AT_DATA)[0]
+                        for at in range(0, len(rows), RECORD)
+                    ]
+    return found
+
+
+def check_kept(folder: Path, sending: Sending, least: int) -> list[str]:
+    """Whether each accepted frame is there once, in order, and none that was never sent."""
+    paths = sorted(folder.glob("*.mcap"))
+    if not paths:
+        return ["lost: no session"]
+    try:
+        numbers = numbers_in(paths, sending.bus)
+    except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
+        return [f"output: unreadable: {type(error).__name__}: {error}"]
+    found = []
+    if numbers != list(range(len(numbers))):
+        wrong = next(k for k, number in enumerate(numbers) if k != number)
+        found.append(f"lost: frame {wrong} of {sending.bus} is followed by {numbers[wrong]}")
+    if len(numbers) < least:
+        found.append(f"lost: {least - len(numbers)} of {least} accepted frames of {sending.bus}")
+    return found
+
+
+def end(running: subprocess.Popen[bytes], by: int = signal.SIGTERM) -> int:
+    """Ask a process to end; its exit code."""
+    os.kill(running.pid, by)
+    return running.wait(PATIENCE_S)

@@ -1,0 +1,244 @@
+"""The fault campaign: ``make campaign``.
+
+Every part runs cases from seeds and judges them from outside: by the kernel's account of processor
+time, memory and signals, by the bytes on the terminal, by mcap's own reader, by senders with their
+own sequence numbers and by a listener on the bus. Prints a line for each case, with its seed; a run
+that was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from . import contention, disks, gate, hostile, injection, kills, servers
+from .case import Result
+from .fuzz import kind_of, minimise, run_seed
+from .stage import Stage
+
+STEP = 1_000_000
+"""Seeds of one campaign: from its seed times this."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One kind of attack.
+
+    Attributes:
+        run: Makes and runs the case of a seed.
+        long: Cases of the long form.
+        short: Cases of the form for continuous integration.
+        alone: Whether nothing else may run meanwhile.
+    """
+
+    run: Callable[[int, Stage], Result]
+    long: int
+    short: int
+    alone: bool = False
+
+
+def mutated(seed: int, stage: Stage) -> Result:
+    """A mutated file through a command; a failure is minimised and stored, once for each kind."""
+    with stage.fresh() as folder:
+        result, case = run_seed(seed, stage.bases, folder)
+    for kind in dict.fromkeys(map(kind_of, result.failures)):
+        name = "".join(c if c.isalnum() else "-" for c in f"{case.words[0]} {kind}")[:120]
+        if stage.failing is not None and not (stage.failing / f"{name}.json").exists():
+            stage.keep(name, case)  # at once, so that no other worker minimises the same
+            stage.keep(name, minimise(case, kind, stage.bases, stage.fresh))
+    return result
+
+
+PARTS = {
+    "contention": Part(contention.run, 6, 1, alone=True),
+    "gate": Part(gate.run, 40, 3, alone=True),
+    "servers": Part(servers.run, 60, len(servers.ATTACKS)),
+    "hostile": Part(hostile.run, 11 * hostile.COUNT, hostile.COUNT),
+    "injection": Part(injection.run, 400, 40),
+    "disks": Part(disks.run, 400, 30),
+    "kills": Part(kills.run, 1500, 40),
+    "recorder": Part(kills.run_recorder, 50, 2),
+    "mutated": Part(mutated, 47_000, 350),
+}
+LONG = 50_000
+
+_stage: Stage | None = None
+
+
+def _work(part: str, seed: int) -> tuple[str, int, Result, float]:
+    assert _stage is not None
+    began = time.monotonic()
+    try:
+        result = PARTS[part].run(seed, _stage)
+    except Exception as error:  # noqa: BLE001 - a case that can't be judged is a failure, too
+        result = Result("", [f"campaign: {type(error).__name__}: {error}"])
+    return part, seed, result, time.monotonic() - began
+
+
+def plan(
+    names: Sequence[str], seed: int, cases: int | None, *, short: bool
+) -> list[tuple[str, int]]:
+    """Every case: (part, seed), those that need the machine for themselves first."""
+    jobs: list[tuple[str, int]] = []
+    for name in sorted(names, key=lambda one: not PARTS[one].alone):
+        part = PARTS[name]
+        count = part.short if short else part.long
+        if cases is not None and name == "mutated":
+            count = max(0, cases - len(jobs))
+        jobs += [(name, seed * STEP + number) for number in range(count)]
+    return jobs
+
+
+def run_all(
+    jobs: Sequence[tuple[str, int]], workers: int
+) -> Iterator[tuple[str, int, Result, float]]:
+    """Run cases: parts that need the machine alone one by one, then the others side by side."""
+    alone = [job for job in jobs if PARTS[job[0]].alone]
+    beside = [job for job in jobs if not PARTS[job[0]].alone]
+    for job in alone:
+        yield _work(*job)
+    if not beside:
+        return
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        for start in range(0, len(beside), 2000):
+            waiting = [pool.submit(_work, *job) for job in beside[start : start + 2000]]
+            for one in waiting:
+                yield one.result()
+
+
+class Records:
+    """The results of a campaign, a line of JSON each, in a file that a later run goes on with."""
+
+    def __init__(self, path: Path) -> None:
+        """Read what is there."""
+        self.path, self.rows = path, []
+        if path.exists():
+            text = path.read_text()
+            whole = text[: text.rfind("\n") + 1]
+            self.rows = [json.loads(line) for line in whole.splitlines()]
+            if whole != text:
+                path.write_text(whole)
+
+    def add(self, row: dict[str, object]) -> None:
+        """Append a line."""
+        self.rows.append(row)
+        with self.path.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+
+    @property
+    def cases(self) -> list[dict]:
+        """All but the first line, which has the seed."""
+        return self.rows[1:]
+
+
+def summary(records: Records) -> list[str]:
+    """A table by part, then the failures by kind with a seed each."""
+    rows: dict[str, list[dict]] = defaultdict(list)
+    for row in records.cases:
+        rows[row["part"]].append(row)
+    lines = [
+        "| part | cases | failed | skipped | most processor time [s] | most memory [MiB] | other |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for part, own in rows.items():
+        most: dict[str, float] = defaultdict(float)
+        total: dict[str, float] = defaultdict(float)
+        for row in own:
+            for name, value in row["figures"].items():
+                most[name] = max(most[name], value)
+                total[name] += value
+        other = ", ".join(
+            f"{name} {total[name]:g}" if name.startswith("n_") else f"{name} {value:g}"
+            for name, value in most.items()
+            if name not in {"cpu_s", "peak_mib"}
+        )
+        failed = sum(bool(row["failures"]) for row in own)
+        skipped = sum(bool(row["skipped"]) for row in own)
+        lines.append(
+            f"| {part} | {len(own)} | {failed} | {skipped} | {most['cpu_s']:.1f} "
+            f"| {most['peak_mib']:.0f} | {other} |"
+        )
+    kinds: dict[tuple[str, str], list[tuple[int, str, str]]] = defaultdict(list)
+    for row in records.cases:
+        for failure in row["failures"]:
+            verb = " ".join(row["case"].split()[:2])
+            kinds[row["part"], f"{verb}: {kind_of(failure)}"].append(
+                (row["seed"], row["case"], failure)
+            )
+    lines.append("")
+    for (part, kind), found in sorted(kinds.items(), key=lambda item: -len(item[1])):
+        seed, case, failure = found[0]
+        lines.append(f"{len(found):5} x {part}: {kind}\n        {part}:{seed} `{case}`: {failure}")
+    reasons = Counter(row["skipped"] for row in records.cases if row["skipped"])
+    lines += [f"skipped {count} x: {why}" for why, count in reasons.items()]
+    return lines
+
+
+def main() -> int:
+    """Run what the command line asks for; exit code 1 where a case failed."""
+    parser = argparse.ArgumentParser(prog="campaign", description=__doc__)
+    parser.add_argument("--seed", type=int, help="of the campaign; a new one by default")
+    parser.add_argument("--cases", type=int, help=f"in all; {LONG} in the long form")
+    parser.add_argument("--short", action="store_true", help="the form for continuous integration")
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--case", metavar="PART:SEED", help="one case again, with its output")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count())
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/campaign"))
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="cmp", ignore_cleanup_errors=True) as name:
+        return _run(options, Path(name))
+
+
+def _run(options: argparse.Namespace, folder: Path) -> int:
+    global _stage  # noqa: PLW0603 - the workers are forked with it
+    os.environ["XDG_RUNTIME_DIR"] = str(folder)
+    _stage = Stage(folder, options.output / "failing")
+    for failure in _stage.warm_failures:
+        print(f"warm-up: {failure}", flush=True)
+    if options.case:
+        part, seed = options.case.split(":")
+        *_, result, took_s = _work(part, int(seed))
+        print(json.dumps(asdict(result), indent=1), f"{took_s:.1f} s")
+        return int(bool(result.failures))
+    records = Records(options.output / "results.jsonl")
+    if not records.rows:
+        seed = int(time.time()) % 10**9 if options.seed is None else options.seed
+        records.add({"seed": seed, "short": options.short})
+    seed = records.rows[0]["seed"]
+    cases = options.cases or (None if options.short or len(options.parts) < len(PARTS) else LONG)
+    jobs = plan(options.parts, seed, cases, short=options.short)
+    done = {(row["part"], row["seed"]) for row in records.cases}
+    left = [job for job in jobs if job not in done]
+    print(f"campaign {seed}: {len(jobs)} cases, {len(jobs) - len(left)} done before", flush=True)
+    began = time.monotonic()
+    for part, number, result, took_s in run_all(left, options.jobs):
+        records.add({"part": part, "seed": number, **asdict(result), "took_s": round(took_s, 3)})
+        said = "; ".join(result.failures) or (
+            f"skipped: {result.skipped}" if result.skipped else "ok"
+        )
+        print(f"{part}:{number} {took_s:.2f} s `{result.case}` {said}", flush=True)
+    lines = summary(records)
+    (options.output / "summary.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+    failed = sum(bool(row["failures"]) for row in records.cases) + len(_stage.warm_failures)
+    print(
+        f"campaign {seed}: {len(records.cases)} cases, {failed} failed, "
+        f"{time.monotonic() - began:.0f} s"
+    )
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

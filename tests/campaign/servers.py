@@ -1,0 +1,273 @@
+"""Clients that send garbage, stay silent or leave half-way; then a good client is served."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import re
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from .base import DBC, ROBOT, SCENARIO
+from .case import Result, run_command
+from .stage import Stage
+
+PATIENCE_S = 30.0
+MORE = 4
+"""So many descriptors more than before may stay: of threads and files opened on the first use."""
+WORDS = (
+    b"< open can0 >",
+    b"< rawmode >",
+    b"< send 123 2 11 F1 >",
+    b"< send 123 8 1 >",
+    b"<>",
+    b"> <",
+    b"< bcmmode >",
+    b"< send 1AAAAAAAA 0 >",
+    b"<" * 5000,
+    b"< send " + b"F" * 100_000,
+    b"\x1b[2J",
+    b'{"do": "status"}\n',
+    b'{"do": "mark", "text": "\\u001b[2J"}\n',
+    b"[" * 20_000 + b"\n",
+    b'{"do": []}\n',
+    b"{" * 9000,
+    b"GET / HTTP/1.1\r\n",
+    b"\0" * 4096,
+    b"\xff\xfe\n",
+)
+
+
+def _connect(address: tuple[str, int] | str) -> socket.socket:
+    kind = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
+    link = socket.socket(kind, socket.SOCK_STREAM)
+    link.settimeout(PATIENCE_S)
+    deadline = time.monotonic() + PATIENCE_S
+    while True:  # a full backlog refuses at once
+        try:
+            link.connect(address)
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                link.close()
+                raise
+            time.sleep(0.01)
+            continue
+        link.settimeout(PATIENCE_S)
+        return link
+
+
+@contextmanager
+def _closing() -> Iterator[list[socket.socket]]:
+    links: list[socket.socket] = []
+    try:
+        yield links
+    finally:
+        for link in links:
+            with suppress(OSError):
+                link.close()
+
+
+def attack(address: tuple[str, int] | str, rng: random.Random, links: list[socket.socket]) -> None:
+    """Forty clients: some garbage, some silence, some half-open, some that are gone at once."""
+    for _ in range(40):
+        kind = rng.choice(["garbage", "silent", "half", "gone", "deaf"])
+        with suppress(OSError):
+            link = _connect(address)
+            if kind == "gone":
+                link.close()
+                continue
+            links.append(link)
+            link.settimeout(0.2)
+            if kind == "garbage":
+                for _ in range(rng.randrange(1, 12)):
+                    link.sendall(rng.choice([*WORDS, rng.randbytes(rng.randrange(1, 3000))]))
+            elif kind == "half":
+                link.sendall(rng.choice(WORDS)[: rng.randrange(1, 9)])
+                link.shutdown(socket.SHUT_WR)
+            elif kind == "deaf":  # takes the bus and never reads
+                link.sendall(b"< open can0 >< rawmode >")
+
+
+def _heard(link: socket.socket, until: Callable[[bytes], bool]) -> bytes:
+    data = b""
+    deadline = time.monotonic() + PATIENCE_S
+    while not until(data) and time.monotonic() < deadline:
+        with suppress(TimeoutError):
+            got = link.recv(65536)
+            if not got:
+                break
+            data += got
+    return data
+
+
+def _wait(condition: Callable[[], object]) -> object:
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := condition()):
+        if time.monotonic() > deadline:
+            raise TimeoutError("the server did not start")
+        time.sleep(0.02)
+    return found
+
+
+def _descriptors(pid: int) -> int:
+    return len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
+
+
+def _watched(
+    result: Result,
+    pid: int,
+    address: tuple[str, int] | str,
+    rng: random.Random,
+    good: Callable[[], str],
+) -> None:
+    """Attack a server; a good client comes while the bad ones stay and after they left."""
+    before = _descriptors(pid)
+    with _closing() as links:
+        attack(address, rng, links)
+        if said := good():
+            result.failures.append(f"locked out: beside {len(links)} clients: {said}")
+    if said := good():
+        result.failures.append(f"locked out: after the attack: {said}")
+    with suppress(TimeoutError):
+        _wait(lambda: _descriptors(pid) <= before + MORE)
+    if (left := _descriptors(pid)) > before + MORE:
+        result.failures.append(f"descriptors: {before} before, {left} after")
+
+
+def serve(result: Result, folder: Path, rng: random.Random) -> None:
+    """``sim serve``: the good client gets the robot's frames."""
+    (folder / "long.toml").write_text(SCENARIO.replace("duration_s = 0.1", "duration_s = 600.0"))
+    out = folder.parent / f"{folder.name}.out"
+
+    def meanwhile(pid: int) -> None:
+        try:
+            ready = _wait(lambda: out.exists() and out.read_bytes().split(b"\n")[0])
+            port = json.loads(ready)["port"]
+
+            def good() -> str:
+                with suppress(OSError), _connect(("127.0.0.1", port)) as link:
+                    link.settimeout(0.5)
+                    link.sendall(b"< open can0 >< rawmode >")
+                    data = _heard(link, lambda data: data.count(b"< frame 20") > 10)
+                    return "" if b"< frame 20" in data else f"no frames, only {data[:60]!r}"
+                return "the connection was refused or closed"
+
+            _watched(result, pid, ("127.0.0.1", port), rng, good)
+        except (TimeoutError, ValueError) as error:
+            result.failures.append(f"server: {error}")
+        os.kill(pid, signal.SIGTERM)
+
+    words = ["sim", "serve", "long.toml", "--socketcand", "0", "--json"]
+    outcome = run_command(words, folder, meanwhile=meanwhile)
+    result.add(outcome)
+
+
+def control(result: Result, folder: Path, rng: random.Random) -> None:
+    """A recorder's control socket, and its source: status is answered, senders are heard."""
+    path, source = str(folder / "c.sock"), str(folder / "s.sock")
+
+    def meanwhile(pid: int) -> None:
+        try:
+            _wait(lambda: Path(path).exists() and Path(source).exists())
+
+            def good() -> str:
+                with suppress(OSError), _connect(path) as link:
+                    link.sendall(b'{"do": "status"}\n')
+                    data = _heard(link, lambda data: b"\n" in data)
+                    return "" if b'"ok": true' in data or b'"ok":true' in data else f"{data[:80]!r}"
+                return "the connection was refused or closed"
+
+            _watched(result, pid, path, rng, good)
+            before = _descriptors(pid)
+            silent = []
+            for _ in range(100):
+                with suppress(OSError):
+                    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+                    link.settimeout(0.5)
+                    link.connect(source)
+                    with suppress(OSError):
+                        link.send(rng.randbytes(rng.choice([1, 31, 33, 48, 8192])))
+                    silent.append(link)
+            if said := good():
+                result.failures.append(f"locked out: beside {len(silent)} senders: {said}")
+            for link in silent:
+                link.close()
+            with suppress(TimeoutError):
+                _wait(lambda: _descriptors(pid) <= before + MORE)
+            if (left := _descriptors(pid)) > before + MORE:
+                result.failures.append(f"descriptors: {before} before, {left} after senders")
+        except TimeoutError as error:
+            result.failures.append(f"server: {error}")
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGTERM)
+
+    words = [
+        "record",
+        f"unix:{source}",
+        "--quiet",
+        "--floor",
+        "1MB",
+        "--socket",
+        path,
+        "-o",
+        "new.mcap",
+    ]
+    outcome = run_command(words, folder, meanwhile=meanwhile)
+    result.add(outcome)
+    if outcome.code != 0:
+        result.failures.append(f"recorder: exit code {outcome.code}: {outcome.err[-200:]!r}")
+
+
+def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> None:
+    """The page of ``view --web``: it is still served."""
+    (folder / "gait.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
+    out = folder.parent / f"{folder.name}.out"
+
+    def meanwhile(pid: int) -> None:
+        try:
+            found = _wait(
+                lambda: out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
+            )
+            port = int(found.group(1))
+
+            def good() -> str:
+                with suppress(OSError), _connect(("127.0.0.1", port)) as link:
+                    link.settimeout(0.5)
+                    link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+                    data = _heard(link, lambda data: b"\n" in data)
+                    return "" if data.startswith(b"HTTP/1") else f"{data[:60]!r}"
+                return "the connection was refused or closed"
+
+            _watched(result, pid, ("127.0.0.1", port), rng, good)
+        except TimeoutError as error:
+            result.failures.append(f"server: {error}")
+        os.kill(pid, signal.SIGINT)
+
+    outcome = run_command(["view", "gait.mcap", "--web"], folder, meanwhile=meanwhile)
+    result.add(outcome)
+
+
+ATTACKS = ("sim serve", "record", "view --web")
+
+
+def run(seed: int, stage: Stage) -> Result:
+    """One server under attack."""
+    rng = random.Random(seed)
+    name = ATTACKS[seed % len(ATTACKS)]
+    result = Result(f"{name}: forty bad clients")
+    with stage.fresh() as folder:
+        for path, text in (("snake4.toml", ROBOT), ("snake4.dbc", DBC)):
+            (folder / path).write_text(text)
+        if name == "sim serve":
+            serve(result, folder, rng)
+        elif name == "record":
+            control(result, folder, rng)
+        else:
+            viewer(result, folder, rng, stage)
+    return result

@@ -1,0 +1,86 @@
+"""Where the cases of all parts run: whole files, empty folders, a place for failing cases."""
+
+from __future__ import annotations
+
+import gc
+import shlex
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .base import make_bases
+from .case import run_command
+from .commands import COMMANDS
+from .fuzz import Case, warm
+
+WHOLE = {"log", "trace", "scenario", "robot"}
+"""Kinds whose command lines end with exit code 0 on whole files."""
+
+
+class Stage:
+    """A folder of the campaign.
+
+    Attributes:
+        bases: The whole files.
+        failing: Where minimised failing cases go; None to keep none.
+    """
+
+    def __init__(self, folder: Path, failing: Path | None = None) -> None:
+        """Write the whole files; import what the commands need."""
+        self.folder, self.failing = folder, failing
+        self._number = 0
+        (folder / "bases").mkdir()
+        self.bases = make_bases(folder / "bases", self._result_of)
+        self.warm_failures = self._warm()
+
+    def _result_of(self, gait: Path) -> bytes:
+        """The JSON of ``undulog analyse`` for a session."""
+        output = gait.with_suffix(".json")
+        with self.fresh() as folder:
+            run_command(["analyse", gait, "--json", "-o", output], folder)
+        return output.read_bytes()
+
+    def _warm(self) -> list[str]:
+        """Run every command line once on whole files, and import here what it imported."""
+        cases, seen = [], set()
+        for kind, lines in COMMANDS.items():
+            base = next(one for one in self.bases if one.kind == kind)
+            files = base.files | {"gait0.mcap": self.files_of("lz4.mcap")["lz4.mcap"]}
+            for _, line in lines:
+                verb = tuple(line.split()[:2])
+                if (
+                    kind in WHOLE
+                    and verb not in seen
+                    and "--null" not in line
+                    and verb[0] not in {"predict", "api"}
+                ):
+                    seen.add(verb)
+                    cases.append(Case(tuple(shlex.split(line.format(file=base.name))), files))
+        found = warm(cases, self.fresh)
+        gc.collect()
+        gc.freeze()  # forked processes share what is here
+        return found
+
+    @contextmanager
+    def fresh(self) -> Iterator[Path]:
+        """An empty folder, gone afterwards."""
+        with tempfile.TemporaryDirectory(prefix="c", dir=self.folder) as name:
+            folder = Path(name) / "w"
+            folder.mkdir()
+            yield folder
+
+    def keep(self, name: str, case: Case) -> None:
+        """Store a failing case."""
+        if self.failing is not None:
+            self.failing.mkdir(parents=True, exist_ok=True)
+            (self.failing / f"{name}.json").write_text(case.as_json())
+
+    def files_of(self, name: str) -> dict[str, bytes]:
+        """The files of a base."""
+        return next(one for one in self.bases if one.name == name and one.kind == "log").files
+
+    def close(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)

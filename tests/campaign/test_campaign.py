@@ -1,0 +1,40 @@
+"""The fault campaign with a fixed seed; every case that once failed, again."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from campaign.fuzz import Case, run_case
+
+ROOT = Path(__file__).parents[2]
+KEPT = sorted((Path(__file__).parent / "kept").glob("*.json"))
+
+
+@pytest.mark.slow
+def test_the_short_campaign_finds_nothing(tmp_path):
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    words = ["--short", "--seed", "1", "-o", tmp_path / "campaign"]
+    done = subprocess.run(
+        [sys.executable, "-m", "campaign.run", *words],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: path.stem)
+def test_a_case_that_failed_once(path, tmp_path):
+    folder = tmp_path / "w"
+    folder.mkdir()
+    failures, _ = run_case(Case.from_json(path.read_text()), folder)
+    assert failures == []
+
+
+def test_a_case_comes_back_from_its_file():
+    case = Case(("log", "info", "x.mcap"), {"x.mcap": bytes(range(256))}, 1.0)
+    assert Case.from_json(case.as_json()) == case
