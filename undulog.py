@@ -115,6 +115,7 @@ def build(arguments: Sequence[str] = ()) -> App:
         help_epilogue="Example: `undulog sim run flat -o run.mcap && undulog analyse run.mcap`",
         default_parameter=Parameter(negative=()),
         result_action="return_value",
+        suppress_keyboard_interrupt=False,  # run() says so, and ends with 1
     )
     groups = {name: _group(name, arguments) for name in _GROUPS}
     for group in groups.values():
@@ -154,6 +155,8 @@ def run(arguments: Sequence[str]) -> int:
         The exit code: 0 done, 1 the work failed, 2 wrong usage.
     """
     try:
+        if "" in arguments:  # as a path it would be this folder
+            raise UsageError("an argument is empty; is it a variable of the shell that isn't set?")
         arguments = _without_chunk_limit(arguments)
         result = build(arguments)(arguments, exit_on_error=False, print_error=False)
     except UnknownCommandError:  # its own text would import every verb
@@ -175,6 +178,8 @@ def run(arguments: Sequence[str]) -> int:
 def main() -> None:
     """Run the process's own command line and exit."""
     defer()
+    if not sys.stderr.isatty():
+        os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
     try:
         code = run(sys.argv[1:])
         sys.stdout.flush()

@@ -91,9 +91,9 @@ def _print(health: SessionHealth) -> None:
     _print_stored(health)
     _print_series(health)
     for bus in health.buses:
-        say(_bus_line(bus))
+        say("", _bus_line(bus))
     for source in health.sources:
-        say(_source_line(source))
+        say("", _source_line(source))
     _print_sequences(health)
     file = health.file
     say(
@@ -160,7 +160,7 @@ def _print_sequences(health: SessionHealth) -> None:
 def _source_line(source: SourceHealth) -> str:
     lost = "losses unknown" if source.dropped is None else f"{source.dropped} lost before us"
     return (
-        f"\nsource {source.name}, as its recorder counted: {source.frames} frames, {lost}, "
+        f"source {source.name}, as its recorder counted: {source.frames} frames, {lost}, "
         f"{source.malformed} unreadable, connected again {source.reconnects} times"
     )
 
@@ -175,6 +175,6 @@ def _bus_line(bus: BusHealth) -> str:
             f"(busiest second {bus.peak_load[0]:.1%} to {bus.peak_load[1]:.1%})"
         )
     return (
-        f"\n{bus.topic}: {bus.frames} frames{rate}, {bus.error_frames} error frames, "
+        f"{bus.topic}: {bus.frames} frames{rate}, {bus.error_frames} error frames, "
         f"longest silence {bus.longest_s:.3g} s{load}"
     )

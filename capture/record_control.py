@@ -43,7 +43,7 @@ def status(*, socket: Path | None = None, json: bool = False) -> int:
     if json:
         emit_json({"recordings": found, "silent": silent})
     for recording in [] if json else found:
-        say(_summary(recording))
+        say(*_summary(recording))
     for error in silent:
         complain(f"error: {error}")
     return int(bool(silent))
@@ -164,7 +164,7 @@ def _recorder(socket: Path | None, *, for_ever: bool = False) -> ControlClient:
     return ControlClient(socket, patience_s=None if for_ever else PATIENCE_S)
 
 
-def _summary(recording: Mapping[str, Any]) -> str:
+def _summary(recording: Mapping[str, Any]) -> list[str]:
     """A recording's status: the answer first."""
     lines = [
         f"{recording.get('output')}: {recording.get('state', 'recording')}, {_facts(recording)}"
@@ -172,7 +172,7 @@ def _summary(recording: Mapping[str, Any]) -> str:
     lines += [f"  reason: {reason}" for reason in recording.get("reasons", [])]
     lines += [f"  {_source(source)}" for source in recording.get("sources", [])]
     lines.append(f"  socket: {recording['socket']}")
-    return "\n".join(lines)
+    return lines
 
 
 def _source(source: Mapping[str, Any]) -> str:

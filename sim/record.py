@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Generator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -109,7 +109,7 @@ def open_session(
     refuse_existing(output, force=force)
     part = output.with_name(f"{output.name}.part")
     with ExitStack() as stack:
-        stack.callback(part.unlink, missing_ok=True)
+        stack.callback(_remove, part)
         stack.push(partial(_name, part, output))
         writer = stack.enter_context(
             SessionWriter(
@@ -128,6 +128,11 @@ def open_session(
         if driver is not None:
             writer.explain(driver.attachments, driver.records)
         yield writer
+
+
+def _remove(part: Path) -> None:
+    with suppress(OSError):  # on a disk that can't be written there is none
+        part.unlink()
 
 
 def _name(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -59,6 +59,27 @@ class LogBlock:
         every = np.empty(len(self), dtype=np.int64)
         every[~self.is_fd], every[self.is_fd] = t_ns, self.fd_frames["t_host_ns"]
         return every
+
+    def where(self, keep: BoolArray) -> LogBlock:
+        """Some of the frames.
+
+        Args:
+            keep: Which, shape (n + m,).
+
+        Returns:
+            The block without the others.
+        """
+        if self.is_fd is None:
+            return replace(self, frames=self.frames[keep], bus=self.bus[keep])
+        classic, fd = keep[~self.is_fd], keep[self.is_fd]
+        return LogBlock(
+            self.frames[classic],
+            self.bus[classic],
+            self.done,
+            self.fd_frames[fd],
+            self.fd_bus[fd],
+            self.is_fd[keep],
+        )
 
     def first_bus(self) -> int:
         """Index of the bus of the first frame.

@@ -33,7 +33,7 @@ from ..log.frames import (
 )
 from .candump import read_candump
 from .mf4 import open_mf4
-from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
+from .undated import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 
 if TYPE_CHECKING:
     from can import Message
@@ -95,17 +95,35 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
     if suffix == ".log":
         opener = gzip.open if path.suffix == ".gz" else open
         with cast("TextIO", opener(path, "rt", encoding="ascii", errors="replace")) as lines:
-            yield read_candump(path, _lines(path, lines))
+            yield _datable(read_candump(path, _lines(path, lines)))
         return
     if suffix == ".mf4":
         with open_mf4(path) as log:
-            yield log
+            yield _datable(log)
         return
     reader = _reader(path)
     try:
-        yield _python_can_log(path, reader, suffix)
+        yield _datable(_python_can_log(path, reader, suffix))
     finally:
         reader.stop()
+
+
+def _datable(log: FrameLog) -> FrameLog:
+    """The log without the frames whose time no stamp can hold, which are counted."""
+    log.blocks = _before_the_latest(log.blocks, log.problems)
+    return log
+
+
+def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Iterator[LogBlock]:
+    late = 0
+    for block in blocks:
+        keep = block.times_ns() < LATEST_NS
+        late += len(block) - int(keep.sum())
+        kept = block if keep.all() else block.where(keep)
+        if len(kept):
+            yield kept
+    if late:
+        problems.append(f"{late} frames are stamped after 2038, which no stamp can hold: left out")
 
 
 def log_suffix(path: Path) -> str:

@@ -36,6 +36,7 @@ from ..log.frames import (
     FrameArray,
     holds_fd,
 )
+from .undated import LATEST_NS
 
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
@@ -105,7 +106,8 @@ def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
         flags = ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
     if bus not in buses:
         buses.append(bus)
-    t_ns = int(seconds) * _NS + int(fraction.ljust(9, "0"))
+    # A later time can't be held; whoever takes the blocks leaves such frames out.
+    t_ns = min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LATEST_NS)
     way = DIR_TX if way in {"T", "t"} else DIR_RX
     if fd_flags is not None:
         rows.append_fd(

@@ -25,10 +25,9 @@ from ..units import SESSION_UNIT, TIME_UNITS, unit_for
 from .can_logs import CSV_HEADER
 from .column_map import Column, ColumnMap
 from .import_output import ImportReport, imported_session
-from .undated import RELATIVE_EPOCH_NS
+from .undated import LATEST_NS, RELATIVE_EPOCH_NS
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
-_LATEST_NS = 7_258_118_400 * 1_000_000_000  # the year 2200, and room for an epoch
 _ROWS_PER_UPDATE = 4096
 _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 
@@ -242,11 +241,11 @@ def _time_ns(
     """A time in ns, without going through a double, which can't hold Unix times to the ns."""
     try:
         t_ns = Decimal(cell.strip()) * unit_ns
-        if abs(t_ns) < _LATEST_NS:
+        if abs(t_ns) < LATEST_NS:
             return round(t_ns)
     except (ArithmeticError, ValueError) as error:
         raise where(name, f"{cell!r} is not a time") from error
-    raise where(name, f"{cell[:40]!r} is no time before the year 2200")
+    raise where(name, f"{cell[:40]!r} is no time before 2038, which stamps hold")
 
 
 def _number(cell: str, where: Callable[[str, str], ImportFormatError], name: str) -> float:

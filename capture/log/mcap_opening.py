@@ -151,8 +151,8 @@ class _Summary:
         """Refuse chunks and message indexes that share bytes: each byte is to be read once."""
         blocks = self._held.blocks
         blocks.sort(key=lambda block: block.start)
-        bounds = [*(block.start for block in blocks[1:]), summary_start]
-        for block, bound in zip(blocks, bounds, strict=True):
+        starts = [block.start for block in blocks]
+        for block, bound in zip(blocks, [*starts, summary_start][1:], strict=True):
             places = block.index_at.values()
             if block.stop > bound or (
                 places and not block.stop <= min(places) <= max(places) < bound

@@ -119,7 +119,7 @@ def replay(
         if comparison is not None and not (again.same and again.same.exact):
             _show(comparison)
         comparable = comparison is not None
-        say(what_next(file, again.recording.path, comparable=comparable))
+        say(*what_next(file, again.recording.path, comparable=comparable))
     return 0
 
 

@@ -91,5 +91,5 @@ def replay_on_bus(
             show(comparison)
         elif run.complete:
             say(f"Not compared: {why}")
-        say(what_next(file, run.plan.output, comparable=comparison is not None))
+        say(*what_next(file, run.plan.output, comparable=comparison is not None))
     return run.complain()

@@ -142,7 +142,7 @@ def compared(first: Session, second: Session) -> tuple[Comparison | None, str | 
         return None, str(error)
 
 
-def what_next(original: Path, again: Path, *, comparable: bool) -> str:
+def what_next(original: Path, again: Path, *, comparable: bool) -> list[str]:
     """What to do with a session and its repetition.
 
     Args:
@@ -155,4 +155,5 @@ def what_next(original: Path, again: Path, *, comparable: bool) -> str:
     """
     both = shlex.join([str(original), str(again)])
     verbs = ("view", "compare") if comparable else ("view",)
-    return "Next: " + "\n      ".join(f"undulog {verb} {both}" for verb in verbs)
+    leads = ("Next: ", "      ")
+    return [f"{lead}undulog {verb} {both}" for lead, verb in zip(leads, verbs, strict=False)]

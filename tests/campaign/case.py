@@ -29,6 +29,7 @@ that survives a refused allocation is still seen to need it."""
 WALL_S = 120.0
 """A command that takes so long without using the processor hangs."""
 LARGEST_FILE = 1 << 30
+_ENDING = {signal.SIGINT, signal.SIGTERM}
 STRAY = 120
 """Exit code of a process whose command let an exception out."""
 MIB = 1 << 20
@@ -118,6 +119,7 @@ def _be_child(work: Callable[[], int | None], folder: Path, streams: tuple[Path,
         sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
         _limit(ADDRESS_ROOM)
         try:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
             work()
             code = 0
         except SystemExit as end:
@@ -169,9 +171,12 @@ def run_forked(
         path.unlink(missing_ok=True)
     sys.stdout.flush()
     sys.stderr.flush()
+    # A signal before the child is itself would be the worker's exception.
+    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     child = os.fork()
     if not child:
         _be_child(work, folder, (stdout or streams[0], streams[1]))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     if meanwhile is not None:
         meanwhile(child)
     began = time.monotonic()

@@ -204,6 +204,7 @@ def main() -> int:
 def _run(options: argparse.Namespace, folder: Path) -> int:
     global _stage  # noqa: PLW0603 - the workers are forked with it
     os.environ["XDG_RUNTIME_DIR"] = str(folder)
+    os.environ.setdefault("NO_COLOR", "1")  # as the front door does before anything is imported
     _stage = Stage(folder, options.output / "failing")
     for failure in _stage.warm_failures:
         print(f"warm-up: {failure}", flush=True)

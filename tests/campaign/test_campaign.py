@@ -23,6 +23,7 @@ def test_the_short_campaign_finds_nothing(tmp_path):
         capture_output=True,
         text=True,
         check=False,
+        timeout=1200,
     )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
 

@@ -149,12 +149,13 @@ def test_a_recorder_that_is_killed_while_we_wait_is_told(recorder, capsys):
     assert "run.sock: " in err
 
 
-def test_a_second_recording_of_that_name_is_refused_and_leaves_nothing(recorder, place):
+def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorder, place):
     recorder("run")
     (place / "b").mkdir()
+    socket = place / "r" / "undulog" / "run.sock"
     command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/b.frames"]
     done = subprocess.run(
-        [*command, "-o", str(place / "b" / "run.mcap")],
+        [*command, "-o", str(place / "b" / "run.mcap"), "--socket", str(socket)],
         capture_output=True,
         text=True,
         check=False,
@@ -163,7 +164,7 @@ def test_a_second_recording_of_that_name_is_refused_and_leaves_nothing(recorder,
     assert done.returncode == 1
     assert "another recorder listens there; end it, or name another with --socket" in done.stderr
     assert list((place / "b").iterdir()) == []
-    with ControlClient(place / "r" / "undulog" / "run.sock") as client:
+    with ControlClient(socket) as client:
         assert client.ask({"do": "status"})["output"] == f"{place}/run.mcap"
 
 

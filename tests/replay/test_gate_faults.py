@@ -215,7 +215,7 @@ def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
         "error: snake4 can't be armed: its description lacks max_rate, ramp_rate, "
         "max_tracking_error, reply_timeout_s, max_late_s, max_current in [safety]"
     )
-    assert "\n[safety]\nmax_rate = " in said
+    assert "\n  [safety]\n  max_rate = " in said
 
 
 @pytest.mark.slow

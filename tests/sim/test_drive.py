@@ -195,7 +195,7 @@ def test_wrong_usage_says_what_would_be_right(words, told, capsys, tmp_path, mon
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number):
+def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     path = tmp_path / "stopped.mcap"
     process = subprocess.Popen(
         [
@@ -206,8 +206,10 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number):
         stderr=subprocess.PIPE,
         text=True,
     )
+    request.addfinalizer(process.kill)
     deadline = time.monotonic() + 60
-    while not (path.exists() and path.stat().st_size > 0):
+    unfinished = tmp_path / "stopped.mcap.part"
+    while not (unfinished.exists() and unfinished.stat().st_size > 0):
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < deadline
         time.sleep(0.05)

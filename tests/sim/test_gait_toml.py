@@ -25,8 +25,14 @@ from sim.gait.toml import gait_table, read_gait
 
 ROBOT = load_robot("snake13")  # 6 joints in each plane
 
+
+def within(least, most):
+    """A number as a file can have it: 0, or not much smaller than any length of the robot."""
+    return st.floats(least, most).map(lambda number: 0.0 if abs(number) < 1e-12 else number)
+
+
 positive = st.floats(1e-3, 25.0)
-angle = st.floats(-10.0, 10.0)
+angle = within(-10.0, 10.0)
 common = {
     "amplitude": st.floats(1e-3, 2.0),
     "frequency_hz": positive,
@@ -37,7 +43,7 @@ common = {
 
 
 def numbers(count, most=100.0):
-    one = st.floats(-most, most)
+    one = within(-most, most)
     return one | st.lists(one, min_size=count, max_size=count).map(tuple)
 
 
@@ -50,23 +56,21 @@ def planes(part):
 rate = st.floats(1e-3, 100.0)
 chain = {
     **common,
-    "lag": st.floats(0.0, 7.0),
+    "lag": within(0.0, 7.0),
     "forward": numbers(5),
     "backward": numbers(5),
     "detuning": numbers(6),
     "start_phase": numbers(6),
     "approach_rate": rate,
-    "feedback": st.floats(0.0, 100.0),
+    "feedback": within(0.0, 100.0),
     "feedback_bias": numbers(6),
-    "kick_every_s": st.floats(0.0, 10.0),
-    "kick_size": st.floats(0.0, 7.0),
+    "kick_every_s": within(0.0, 10.0),
+    "kick_size": within(0.0, 7.0),
 }
-ramp = st.floats(0.0, 10.0)
+ramp = within(0.0, 10.0)
 gaits = st.one_of(
-    st.builds(Serpentine, planes(st.builds(PlaneGait, **common, lag=st.floats(0.0, 7.0))), ramp),
-    st.builds(
-        DelayBlocks, planes(st.builds(DelayLine, **common, delay_s=st.floats(0.0, 10.0))), ramp
-    ),
+    st.builds(Serpentine, planes(st.builds(PlaneGait, **common, lag=within(0.0, 7.0))), ramp),
+    st.builds(DelayBlocks, planes(st.builds(DelayLine, **common, delay_s=within(0.0, 10.0))), ramp),
     st.builds(
         OscillatorChains,
         planes(
