@@ -431,9 +431,11 @@ def plain_server(answers, stream=()):
                         word = message.strip(" <").split()[0]
                         heard.append(word)
                         client.sendall(answers.get(word, b""))
-                    for piece in stream if heard[-1] == "rawmode" else ():
-                        client.sendall(piece)
-                        time.sleep(0.01)
+                    if heard[-1] == "rawmode":
+                        time.sleep(0.2)  # python-can takes what comes with "ok" for a refusal
+                        for piece in stream:
+                            client.sendall(piece)
+                            time.sleep(0.01)
 
         thread = threading.Thread(target=serve)
         thread.start()
