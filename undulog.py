@@ -9,7 +9,6 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
@@ -190,9 +189,11 @@ def main() -> None:
         if error.errno not in _FULL or error.filename is not None:
             raise
         _discard_output()
-        with suppress(OSError):  # the error output may be on the same disk
-            _complain(f"the output can't be written: {error.strerror}", 1)
         code = 1
+        try:
+            _complain(f"the output can't be written: {error.strerror}", code)
+        except OSError:  # the error output may be on the same disk
+            _discard_output()
     sys.exit(code)
 
 

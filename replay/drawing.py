@@ -31,7 +31,7 @@ from .samples.quantities import SIGNALS, topic_entity
 from .samples.stretches import Span, Stretch
 from .samples.survey import GAIT, Survey, survey
 from .samples.timeline import Clock
-from .samples.tracks import Track, read_columns
+from .samples.tracks import Track, drawn_topics, read_columns
 from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
 from .scene.stage import Scene
 from .views import body_title
@@ -75,6 +75,8 @@ class Sources:
             missing.append("no robot description in the session: the body can't be drawn")
         if joints.MEASURED not in found.samples:
             missing.append("no measured joint angles on /joint_states")
+        if left_out := drawn_topics(session)[1]:
+            missing.append(f"{left_out} more joint topics are not shown")
         return cls(session, found, missing)
 
     @property

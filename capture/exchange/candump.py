@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..arrays import IntArray
 from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 from ..errors import ImportFormatError
+from ..log.chunk import LAST_NS
 from ..log.frames import (
     DIR_RX,
     DIR_TX,
@@ -36,7 +37,6 @@ from ..log.frames import (
     FrameArray,
     holds_fd,
 )
-from .undated import LATEST_NS
 
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
@@ -106,8 +106,8 @@ def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
         flags = ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
     if bus not in buses:
         buses.append(bus)
-    # A later time can't be held; whoever takes the blocks leaves such frames out.
-    t_ns = min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LATEST_NS)
+    # No block holds a later time; nor does a stamp, so such frames are left out anyway.
+    t_ns = min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LAST_NS)
     way = DIR_TX if way in {"T", "t"} else DIR_RX
     if fd_flags is not None:
         rows.append_fd(

@@ -38,6 +38,7 @@ from .log_export import refuse_same
 DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())
 """The topics written unless others are named, those of them that the session has."""
 
+_MOST_TOPICS = 500
 _ROWS_PER_BLOCK = 100_000
 _FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
 """How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
@@ -127,7 +128,8 @@ def export_columns(
         What was done.
 
     Raises:
-        UsageError: If the suffix is no format that can be written, or the output is the session.
+        UsageError: If the suffix is no format that can be written, the output is the session, or
+            so many topics would make too wide a table.
         OutputExistsError: If the output is there and ``force`` is not given.
         MissingChannelError: If the session has no such topic, or none of the default ones.
         DataError: If a topic is not of JointStates.
@@ -142,7 +144,13 @@ def export_columns(
     refuse_same(source, output)
     refuse_existing(output, force=force)
     with Session.open(source) as session:
-        wanted = {topic: _columns(session, topic) for topic in _topics(session, topics)}
+        chosen = _topics(session, topics)
+        if len(chosen) > _MOST_TOPICS:
+            raise UsageError(
+                f"{source} has {len(chosen)} joint topics; a table takes at most {_MOST_TOPICS}: "
+                "name those that you want with --topics"
+            )
+        wanted = {topic: _columns(session, topic) for topic in chosen}
         columns = [name for found in wanted.values() for name in found.values()]
         report = ColumnReport(source, output, ["t_ns", "topic", "joint", *columns])
         with (

@@ -10,6 +10,7 @@ import numpy as np
 
 from capture import Session
 from capture.arrays import FloatArray, IntArray
+from capture.bus.decoded_topics import JOINT_TOPIC
 from capture.errors import DataError, MissingChannelError
 from capture.log.signals import JointSignals
 
@@ -56,6 +57,30 @@ class Table:
     values: FloatArray
 
 
+MOST_TOPICS = 100
+"""JointState topics that are drawn."""
+
+
+def drawn_topics(session: Session) -> tuple[list[str], int]:
+    """The JointState topics of a picture.
+
+    Args:
+        session: The session.
+
+    Returns:
+        At most :data:`MOST_TOPICS`, the contract's before others, in the session's order; and how
+        many are left out.
+    """
+    topics = [
+        topic
+        for topic, channel in session.channels.items()
+        if channel.type_name == JOINT_STATE and channel.count and topic not in OFFSETS
+    ]
+    usual = set(JOINT_TOPIC.values())
+    first = set(sorted(topics, key=lambda topic: topic not in usual)[:MOST_TOPICS])
+    return [topic for topic in topics if topic in first], len(topics) - len(first)
+
+
 def wanted_fields(session: Session) -> dict[str, list[str]]:
     """What a picture needs of a session's JointState topics.
 
@@ -67,8 +92,7 @@ def wanted_fields(session: Session) -> dict[str, list[str]]:
     """
     return {
         topic: ["position", *(["velocity", "effort"] if topic == "/joint_states" else [])]
-        for topic, channel in session.channels.items()
-        if channel.type_name == JOINT_STATE and channel.count and topic not in OFFSETS
+        for topic in drawn_topics(session)[0]
     }
 
 

@@ -102,7 +102,8 @@ def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[st
             found["page"] = Statement(_plain(_heading(render(analysis))))
         if "rerun" in outputs:
             text = markdown(session, analysis, notes=(), colors="", content=EMPTY, has_cycles=False)
-            found["rerun"] = Statement(text.split("\n\n")[0])
+            shown = re.sub(r"\\(.)", r"\1", text.split("\n\n")[0])  # as Markdown shows it
+            found["rerun"] = Statement(shown)
     return found
 
 
