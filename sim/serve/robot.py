@@ -209,6 +209,7 @@ class VirtualRobot:
                     self._bus.send(self._at_rest())
                     due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
                 self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / _NS))
+            self._bus.send(self._at_rest())  # nothing is told at tick 0: it would be a long silence
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS // 2)
         else:
