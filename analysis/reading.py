@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from capture import Session
-from capture.errors import MissingChannelError
+from capture.errors import DataError, MissingChannelError
 from capture.log.power_topics import PowerTopic
 from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
@@ -20,6 +20,9 @@ COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"
 CURRENT_TOPIC = "/joint_current"
 VOLTAGE_TOPIC = "/joint_voltage"
+
+MOST_JOINTS = 5000
+"""Of a session that is analysed; a file that claims more of them describes no robot."""
 
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage", "reference")
 """What is read of each joint."""
@@ -105,7 +108,7 @@ def read_columns(
         MissingChannelError: If neither topic is there, or one that was chosen is not; the message
             lists those that are.
             those that are.
-        DataError: If a topic is not of JointStates.
+        DataError: If a topic is not of JointStates, or there are too many joints.
     """
     wanted = {
         "command": (command_topic, "position"),
@@ -158,6 +161,11 @@ def read_columns(
     for key in ("command", "position"):
         if key in found:
             seen |= dict.fromkeys(found[key].names)
+    if len(seen) > MOST_JOINTS:
+        raise DataError(
+            f"{session.path.name}: {len(seen)} joints on {response_topic} and {command_topic}; at "
+            f"most {MOST_JOINTS} are analysed"
+        )
     by_name = {
         key: {name: signals.signal(name) for name in signals.names}
         for key, signals in found.items()

@@ -34,6 +34,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+_MOST_LISTED = 100  # names in a message
+
 
 class UndulogError(Exception):
     """Base of all errors that undulog raises on purpose."""
@@ -213,7 +215,9 @@ class MissingChannelError(LogError, KeyError):
         """
         self.wanted = wanted
         self.available = tuple(available)
-        listed = ", ".join(available) if available else "nothing"
+        listed = ", ".join(available[:_MOST_LISTED]) if available else "nothing"
+        if len(available) > _MOST_LISTED:
+            listed += f" and {len(available) - _MOST_LISTED} more"
         LogError.__init__(self, path, f"has no {wanted}; it has {listed}")
 
     def __str__(self) -> str:

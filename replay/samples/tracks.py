@@ -57,6 +57,8 @@ class Table:
     values: FloatArray
 
 
+MOST_JOINTS = 1000
+"""Of a topic that is drawn."""
 MOST_TOPICS = 100
 """JointState topics that are drawn."""
 
@@ -114,6 +116,9 @@ def read_columns(
     Returns:
         (topic, field) to a track for each joint that has at least one sample, in the session's
         order; without what never comes.
+
+    Raises:
+        DataError: If a topic has more than :data:`MOST_JOINTS`.
     """
     fields = wanted_fields(session) if wanted is None else wanted
     window = {"start_ns": start_ns, "stop_ns": stop_ns}
@@ -124,6 +129,10 @@ def read_columns(
         for topic, field in [(one, field) for one in fields for field in fields[one]]:
             with contextlib.suppress(MissingChannelError, DataError):
                 columns[topic, field] = session.joints(topic, field, **window)
+    for (topic, _), signals in columns.items():
+        if (count := len(signals.names)) > MOST_JOINTS:
+            where = f"{session.path.name}: {topic} has {count} joints"
+            raise DataError(f"{where}; at most {MOST_JOINTS} are drawn")
     found = {key: _tracks(signals) for key, signals in columns.items()}
     return {key: tracks for key, tracks in found.items() if tracks}
 

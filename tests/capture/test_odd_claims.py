@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from capture.errors import DataError
 from capture.log.merge import merge_logs
 from capture.log.rosmsg import parse_message_type
 from capture.log.session_check import check_session
+from replay.samples.tracks import drawn_topics
 
 hostile = runpy.run_path(str(Path(__file__).parents[2] / "bench" / "hostile_logs.py"))
 HostileLog, EPOCH_NS, NS = hostile["HostileLog"], hostile["EPOCH_NS"], hostile["NS"]
@@ -139,3 +141,43 @@ def test_a_summary_that_lists_a_chunk_again_and_again_is_not_believed(tmp_path: 
         assert session.channels["/joint_states"].count == 100
         np.testing.assert_allclose(session.joints("/joint_states").values[0], np.arange(100) / 100)
     assert json.loads(json.dumps(check_session(path).file.damage)) == []
+
+
+@pytest.mark.parametrize("verb", ["analyse", "report", "compare", "view"])
+def test_more_joints_than_a_robot_has_are_an_error(
+    tmp_path: Path, verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = gait(tmp_path / "many.mcap", ticks=5, joints=6000)
+    more = {"view": ["--save", "x.rrd"], "report": ["-o", "x.html"], "compare": [path]}
+    words = [verb, path, *more.get(verb, [])]
+    words = [tmp_path / word if str(word).startswith("x.") else word for word in words]
+    assert undulog.run([str(word) for word in words]) == 1
+    assert re.search(r"many\.mcap: .*\b6000 joints.*; at most \d+ are", capsys.readouterr().err)
+    assert not list(tmp_path.glob("x.*"))
+
+
+def test_of_many_joint_topics_some_are_drawn_and_a_table_asks_which(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = HostileLog()
+    kind = log.schema()
+    for number in range(600):
+        log.channel(f"/t{number}", kind)
+    log.channel("/joint_states", kind)
+    rows = [
+        (channel, EPOCH_NS + tick, joint_state(EPOCH_NS + tick, ["a"], [0.1 * tick]))
+        for tick in range(0, 3 * NS, NS // 10)
+        for channel in range(1, 602)
+    ]
+    log.chunk(rows)
+    path = log.write(tmp_path / "many.mcap")
+    with Session.open(path) as session:
+        drawn, left_out = drawn_topics(session)
+    assert (len(drawn), left_out) == (100, 501)
+    assert "/joint_states" in drawn
+    every = [word for topic in range(600) for word in ("--topics", f"/t{topic}")]
+    table = str(tmp_path / "x.csv")
+    assert undulog.run(["log", "export", str(path), "-o", table, *every]) == 2
+    assert "600 joint topics" in capsys.readouterr().err
+    assert undulog.run(["log", "export", str(path), "-o", table, "--topics", "/t7"]) == 0
+    assert len((tmp_path / "x.csv").read_text().splitlines()) == 31
