@@ -8,6 +8,7 @@ command. What makes it an artefact is evidence of motion.
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import binom
 
 from capture.arrays import BoolArray, FloatArray, IntArray
 
@@ -26,6 +27,12 @@ RESOLVED = 4.0
 STALE_SHARE = 0.4
 """Repeats among fast samples above which values are old: every second sample old is 0.5, an encoder
 whose noise is twice its step repeats by chance at 0.14."""
+
+_BY_CHANCE = 0.2
+"""Most that fast samples of any encoder repeat by chance."""
+
+_RARE = 1e-7
+"""Of all windows of all joints of many sessions, hardly one."""
 
 CLIPPED_SHARE = 0.01
 """Part of the range that is missing above a flat top."""
@@ -101,7 +108,8 @@ def stale(position: Series) -> tuple[Span, ...]:
         position: Measured positions.
 
     Returns:
-        Stretches in which more than ``STALE_SHARE`` of the fast samples repeat the one before;
+        Stretches in which more than ``STALE_SHARE`` of the fast samples repeat the one before, and
+        so many of them that chance is ruled out (binomial test);
         slow motion between two of them says nothing and belongs to them.
     """
     value = position.values
@@ -119,7 +127,11 @@ def stale(position: Series) -> tuple[Span, ...]:
     old = of[told] > STALE_SHARE * among[told]
     marked = np.zeros(value.size, dtype=np.bool_)
     for k, stop in zip(*runs(old), strict=True):
-        marked[told[k] + 2 : told[stop - 1] + 3] = True
+        seen = slice(max(told[k] - _BOX // 2, 0), told[stop - 1] + _BOX // 2 + 1)
+        again, quick = int((fast & repeats)[seen].sum()), int(fast[seen].sum())
+        # A few of the many windows of a noisy coarse encoder exceed the share by chance.
+        if binom.sf(again - 1, quick, _BY_CHANCE) < _RARE:
+            marked[told[k] + 2 : told[stop - 1] + 3] = True
     return spans_of(position.t_s, marked)
 
 
