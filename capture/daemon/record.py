@@ -367,6 +367,9 @@ class Recording:
     def _report(self, ending: Ending) -> RecordReport:
         measures = self._health.result()
         files = self._storage.files()
+        if (lost := self._recorder.given_up) and not ending.failed:
+            what = f"{ending.reason}; given up before, see /rosout: {', '.join(lost)}"
+            ending = Ending(what, failed=True)
         return RecordReport(
             files=files,
             session_id=self._session_id,

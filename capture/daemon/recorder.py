@@ -307,6 +307,11 @@ class Recorder:
         self._later.add(source.name)
         return frames[before]
 
+    @property
+    def given_up(self) -> list[str]:
+        """Names of the sources that failed in a way nobody foresaw."""
+        return sorted(self._failed)
+
     def _asked(self, source: Source) -> Polled:
         """What a source has; one that fails in a way nobody foresaw doesn't end the others."""
         if source.name in self._failed:

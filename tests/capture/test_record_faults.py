@@ -330,7 +330,8 @@ def test_a_plug_in_that_fails_later_is_given_up_alone(
         send(bus, frames)
         process.send_signal(signal.SIGTERM)
         report = report_of(process)
-    assert process.returncode == 0
+    assert process.returncode == 1
+    assert "given up before, see /rosout: bad" in report["ended"]
     assert report["sources"]["can0"]["frames"] == len(frames)
     told = [text for name, text in events(tmp_path / "run.mcap") if name == "bad"]
     if where != "stop":
