@@ -186,6 +186,8 @@ def main() -> None:
         _discard_output()
         code = 1
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            sys.exit(_complain(f"{str(error.filename)[:60]} ...: too long for a file's name", 2))
         if error.errno not in _FULL or error.filename is not None:
             raise
         _discard_output()

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from .console import emit_json, say
 from .errors import ImportFormatError, UsageError
+from .input_file import is_file
 
 if TYPE_CHECKING:
     from .exchange.column_map import ColumnMap
@@ -148,7 +149,7 @@ def _column_map(
     """The column map of a CSV log; None for a log of CAN frames."""
     from .exchange.csv_import import is_frame_csv
 
-    if not log.is_file():
+    if not is_file(log):
         raise ImportFormatError(log, "no such file")
     if log.suffix.lower() != ".csv" or is_frame_csv(log):
         if columns is not None or options:

@@ -7,6 +7,21 @@ from pathlib import Path
 from .errors import InputFileError
 
 
+def is_file(path: Path) -> bool:
+    """Whether a name, which a file may have given, is that of a file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        False also for a name that no file system takes.
+    """
+    try:
+        return path.is_file()
+    except OSError:  # too long
+        return False
+
+
 def read_input(path: Path) -> bytes:
     """Read a file that the user named.
 

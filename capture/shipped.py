@@ -8,7 +8,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from .errors import Fault, FaultyFileError, UsageError
-from .input_file import read_input
+from .input_file import is_file, read_input
 from .strict_table import listed
 
 
@@ -68,7 +68,7 @@ class Shelf:
             return Description(text, Path(f"{name_or_path}.toml"), place)
         path = Path(name_or_path)
         is_path = bool(path.suffix) or len(path.parts) > 1
-        if not is_path and not path.is_file():
+        if not is_path and not is_file(path):
             near = listed(self.names(), str(name_or_path))
             raise UsageError(f"no {self.kind} {str(name_or_path)!r}: not a file, nor one of {near}")
         try:

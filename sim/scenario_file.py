@@ -92,6 +92,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from capture.errors import Fault, ScenarioError, UsageError
+from capture.input_file import is_file
 from capture.robot import Plane, Robot
 from capture.robot.description import load_robot, robot_names
 from capture.shipped import Shelf
@@ -269,7 +270,7 @@ def _robot(top: Table, name: str, folder: Path) -> Robot | None:
     """The robot: a shipped name, or a file beside the scenario; None after a fault."""
     if name in robot_names():
         return load_robot(name)
-    if name and (folder / name).is_file():
+    if name and is_file(folder / name):
         return load_robot(folder / name)
     if name:  # a missing name is a fault already
         top.fault(

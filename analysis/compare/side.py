@@ -147,7 +147,7 @@ def _total_energy(measured: Measured) -> FloatArray | None:
 def _cycles(measured: Measured, run: GaitRun) -> dict[str, Quantities]:
     gait, span = measured.gait, measured.span
     found: dict[str, Quantities] = {}
-    if gait is None:
+    if gait is None or not run.names:
         return found
     for group, members in zip(gait.groups, run.by_group, strict=True):
         for k, name in enumerate(group.answered):

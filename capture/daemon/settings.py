@@ -41,7 +41,7 @@ from types import MappingProxyType
 from typing import Any, cast
 
 from ..errors import DataError, SettingsError
-from ..input_file import read_input
+from ..input_file import is_file, read_input
 from ..strict_table import Faults, listed, read_toml, shown
 from .amounts import SIZE_UNITS
 from .setting_values import PARSERS
@@ -274,7 +274,7 @@ def _shown(raw: object) -> str:
 def _beside(file: Path, robot: str) -> str:
     """A robot's file beside the settings, where there is one."""
     there = file.parent / robot
-    return str(there) if there.is_file() else robot
+    return str(there) if is_file(there) else robot
 
 
 def _timed(output: Path, now_ns: int) -> Path:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 from ..errors import ImportFormatError
+from ..input_file import is_file
 from ..log.frames import (
     DIR_RX,
     DIR_TX,
@@ -87,7 +88,7 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
             suffix says, or it holds no frames; also while its blocks are taken.
         MissingExtraError: If the format is MF4 and its extra is not installed.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise ImportFormatError(path, "no such file")
     suffix = log_suffix(path)
     if suffix not in SUFFIXES:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass
+from io import StringIO
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -185,7 +187,8 @@ class Topics:
         self.message_type(topic)  # ours says more of a damaged schema, and says it once
         where = f"{self._file.path}: {topic}"
         try:
-            decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
+            with redirect_stderr(StringIO()):  # its parser prints what it raises
+                decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
         except Exception as error:  # the library's parser has no error tree of its own
             raise DataError(f"{where}: its schema can't be used: {error}") from error
 

@@ -38,6 +38,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.errors import Fault, PlanError
+from capture.input_file import is_file
 from capture.robot import Plane
 from capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 
@@ -102,7 +103,7 @@ def _scenario(top: Table, folder: Path) -> Scenario | None:
     name = top.text("scenario")
     if name in scenario_names():
         return load_scenario(name)
-    if name and (folder / name).is_file():
+    if name and is_file(folder / name):
         return load_scenario(folder / name)
     if name:  # a missing name is a fault already
         near = listed(scenario_names(), name)
