@@ -28,6 +28,7 @@ MULTIPLE = 1e-3
 
 _SCOUTS = 4
 _MOST_SAMPLES = 8192
+_MOST_GAPS = 8  # of an even grid over the samples, as a multiple of these: no clock that jumped
 _STEPS = 4
 
 
@@ -100,7 +101,7 @@ def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | N
     start = max(float(one.t_s[0]) for one in scouts)
     stop = min(float(one.t_s[-1]) for one in scouts)
     count = int((stop - start) / period) + 1 if stop > start else 0
-    if count < 64:
+    if not 64 <= count <= _MOST_GAPS * _MOST_SAMPLES:
         return None
     grid = start + period * np.arange(count)
     length = 1 << int(np.ceil(np.log2(4 * count)))
