@@ -38,6 +38,7 @@ _NS = 1_000_000_000
 PERIOD_NS = _NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
+_BEFORE_NS = 1_000_000
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
 
@@ -209,9 +210,13 @@ class VirtualRobot:
                     self._bus.send(self._at_rest())
                     due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
                 self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / _NS))
-            self._bus.send(self._at_rest())  # nothing is told at tick 0: it would be a long silence
             # Half a period on, so that a controller of the same rate speaks between the ticks.
-            self._pacer.start(self._pacer.now_ns() + PERIOD_NS // 2)
+            start_ns = self._pacer.now_ns() + PERIOD_NS // 2
+            # Nothing is told at tick 0, so the pose is told just before: else it is a long silence.
+            while (left_ns := start_ns - _BEFORE_NS - self._pacer.now_ns()) > 0:
+                self._serve(left_ns / _NS)
+            self._bus.send(self._at_rest())
+            self._pacer.start(start_ns)
         else:
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS)
         self._say("info", f"starts at {self._pacer.start_ns / _NS:.6f} s of its own clock")

@@ -111,12 +111,13 @@ def disk(tmp_path, request):
 
 
 def fill(folder):
-    """Take the rest of a disk, as somebody else would."""
+    """Take the rest of a disk, as somebody else would who leaves the processors to others."""
     with (folder / "hog").open("wb", buffering=0) as hog:
         size = 1 << 20
         while size:
             try:
                 hog.write(bytes(size))
+                time.sleep(0.01)
             except OSError:
                 size //= 2
 

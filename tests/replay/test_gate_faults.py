@@ -107,9 +107,8 @@ def test_the_robots_file_can_say_that_joints_are_held(session, tmp_path):
         on_stage.replay(holding, path) as controller,
     ):
         _, err, written = ended(on_stage, controller, path)
-    assert err.startswith(
-        "error: the robot is lost: no angle for more than 1 s; the joints were he"
-    )
+    assert err.startswith("error: the bus was silent: no joint was received for ")
+    assert "nothing more was sent; the servos hold their last commands" in err
     stage["check_hold"](written, "fault: ")
 
 
