@@ -38,7 +38,7 @@ _NS = 1_000_000_000
 PERIOD_NS = _NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
-_BEFORE_NS = 1_000_000
+_BEFORE_NS = 1_000_000  # the last pose at rest, before the first tick
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
 

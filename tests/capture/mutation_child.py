@@ -8,7 +8,6 @@ import json
 import random
 import resource
 import shutil
-import struct
 import sys
 import tempfile
 import traceback
@@ -30,6 +29,9 @@ from capture.log.session_check import check_session
 from capture.log.wal_recover import recover
 from capture.robot.description import parse_robot
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from campaign.mutate import mutate_bytes
+
 EPOCH_NS = 1_700_000_000_000_000_000
 MIB = 1 << 20
 ROOM = 1 << 30
@@ -39,23 +41,6 @@ GROWTH = 192 * MIB
 
 NAMES = ["joint01", "joint02"]
 FIELDS = ("position", "velocity", "effort")
-HUGE = [
-    0,
-    1,
-    255,
-    2**16,
-    2**24,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**40,
-    2**62,
-    2**63 - 1,
-    2**63,
-    2**64 - 1,
-]
-
-
 # -- whole files ---------------------------------------------------------------------------
 
 
@@ -172,86 +157,6 @@ def make_corpus(folder):
 # -- mutations -----------------------------------------------------------------------------
 
 
-def mutate(data, rng):
-    """Bytes with one to four faults."""
-    data = bytearray(data)
-    for _ in range(rng.choice([1, 1, 1, 2, 4])):
-        if len(data) < 16:
-            break
-        rng.choice(FAULTS)(data, rng)
-    return bytes(data)
-
-
-def flip_bits(data, rng):
-    for _ in range(rng.choice([1, 1, 3, 20])):
-        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-
-
-def cut(data, rng):
-    del data[rng.randrange(len(data)) :]
-
-
-def stretch(data, rng):
-    a, b = sorted(rng.choices(range(len(data)), k=2))
-    return a, min(b, a + rng.choice([4, 64, 1024, 1 << 20]))
-
-
-def zero(data, rng):
-    a, b = stretch(data, rng)
-    data[a:b] = bytes(b - a)
-
-
-def take_out(data, rng):
-    a, b = stretch(data, rng)
-    del data[a:b]
-
-
-def double(data, rng):
-    a, b = stretch(data, rng)
-    data[b:b] = data[a:b]
-
-
-def swap(data, rng):
-    a, b = stretch(data, rng)
-    middle = (a + b) // 2
-    data[a:b] = data[middle:b] + data[a:middle]
-
-
-def set_number(data, rng):
-    """A number anywhere, of any width, aligned or not."""
-    kind = rng.choice(["<H", "<I", "<Q", "<Q"])
-    size = struct.calcsize(kind)
-    at = rng.randrange(len(data) - size)
-    data[at : at + size] = (rng.choice(HUGE) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
-
-
-def set_length(data, rng):
-    """The length, or a number in the first bytes, of a record of the MCAP."""
-    places, at = [], 8
-    while at + 9 <= len(data) and len(places) < 10_000:
-        places.append(at)
-        (length,) = struct.unpack_from("<Q", data, at + 1)
-        at += 9 + length
-    at = rng.choice(places or [0]) + rng.choice([1, 1, 9, 13, 17, 21, 25, 29, 33, 37, 41, 49])
-    if at + 8 <= len(data):
-        size = rng.choice([4, 8])
-        value = rng.choice(HUGE) & ((1 << 8 * size) - 1)
-        data[at : at + size] = value.to_bytes(size, "little")
-
-
-FAULTS = [
-    flip_bits,
-    flip_bits,
-    cut,
-    zero,
-    take_out,
-    double,
-    swap,
-    set_number,
-    set_length,
-    set_length,
-]
-
 WORDS = [
     "", "0", "-1", "1e400", "nan", "99999999999999999999", "[]", "{}", '"', "'", "=", "\0", "\n",
     "{joint}", "@0-", "|", "64|64@0+", "SG_", "BO_", "BU_", "é", "\ufeff", "[[bus]]", "[bus]",
@@ -263,7 +168,7 @@ def mutate_text(text, rng):
     """Text with one to four faults, in characters or in words."""
     for _ in range(rng.choice([1, 1, 2, 4])):
         if rng.random() < 0.3:
-            text = mutate(text.encode(), rng).decode("utf-8", "replace")
+            text = mutate_bytes(text.encode(), rng).decode("utf-8", "replace")
             continue
         a = rng.randrange(len(text) + 1)
         b = min(len(text), a + rng.choice([0, 0, 1, 3, 20]))
@@ -340,7 +245,7 @@ def try_seed(seed, corpus, folder):
             target = place / path.relative_to(files[0].parent)
             target.parent.mkdir(parents=True, exist_ok=True)
             data = path.read_bytes()
-            target.write_bytes(mutate(data, rng) if path == chosen else data)
+            target.write_bytes(mutate_bytes(data, rng) if path == chosen else data)
         if kind == 8:
             return read_log(place / "run.mcap.wal")
         return read_session(place / ("run.mcap" if name == "unfinished" else name))
