@@ -8,7 +8,8 @@ import os
 import threading
 import weakref
 import zlib
-from collections import OrderedDict
+from collections import OrderedDict, deque
+from contextlib import suppress
 from pathlib import Path
 
 import zstandard
@@ -20,13 +21,20 @@ _CACHE_SIZE = 64 << 20
 
 
 class _Cache:
-    """Payloads that were decompressed last, of all open files together."""
+    """Payloads that were decompressed last, of all open files together.
+
+    Attributes:
+        owners: Numbers of files.
+        abandoned: Those that nothing uses any more. The garbage collector adds to it in the middle
+            of anything, also of what holds the lock, which it therefore must not take.
+    """
 
     def __init__(self) -> None:
         self._held: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._size = 0
         self._lock = threading.Lock()
         self.owners = itertools.count()
+        self.abandoned: deque[int] = deque()
 
     def get(self, key: tuple[int, int]) -> bytes | None:
         with self._lock:
@@ -37,6 +45,9 @@ class _Cache:
 
     def put(self, key: tuple[int, int], data: bytes) -> None:
         """Keep a payload; one that is larger than all room is not kept."""
+        with suppress(IndexError):  # empty, perhaps since another thread was faster
+            while True:
+                self.drop(self.abandoned.popleft())
         if len(data) > _CACHE_SIZE:
             return
         with self._lock:
@@ -74,7 +85,7 @@ class McapPayloads:
         self._close_descriptor = weakref.finalize(self, os.close, descriptor)
         self._descriptor = descriptor
         self._owner = next(_cache.owners)
-        weakref.finalize(self, _cache.drop, self._owner)
+        weakref.finalize(self, _cache.abandoned.append, self._owner)
 
     def close(self) -> None:
         """Release the mapping."""
