@@ -1,7 +1,8 @@
 """The fault zoo as a table: ``make zoo``.
 
 Every fault is planted with many seeds into foreign bags; undulog's outputs are judged against the
-truth. Prints a table, one line a fault, and the seeds that fail with what was said.
+truth. Prints a table, one line a fault when it is done, below it the seeds that fail with what was
+said.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -116,23 +118,22 @@ def run_all(
         yield from pool.map(_work, work, chunksize=4)
 
 
-def table(cases: Sequence[Case], outputs: tuple[str, ...] = OUTPUTS) -> list[str]:
-    """One line a fault: share right of each output, share that names a sound joint."""
-    names = list(dict.fromkeys(case.fault for case in cases))
-    width = max(map(len, names))
-    lines = [f"{'fault':<{width}}  " + "  ".join(f"{o:>9}" for o in outputs) + "    sound  narrow"]
-    for name in names:
-        own = [case for case in cases if case.fault == name]
-        shares = [np.mean([case.judged[o].right for case in own]) for o in outputs]
-        sound = np.mean([any(one.sound for one in case.judged.values()) for case in own])
-        narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in own])
-        fine = min(shares) >= RIGHT and sound <= SOUND
-        lines.append(
-            f"{name:<{width}}  "
-            + "  ".join(f"{share:>9.0%}" for share in shares)
-            + f"  {sound:>7.0%} {narrow:>7.0%}  {'' if fine else 'FAILS'}"
-        )
-    return lines
+def header(width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
+    """The head of the table."""
+    return f"{'fault':<{width}}  " + "  ".join(f"{o:>9}" for o in outputs) + "    sound  narrow"
+
+
+def line(cases: Sequence[Case], width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
+    """The share right of each output, and the share that names a sound joint, of one fault."""
+    shares = [np.mean([case.judged[o].right for case in cases]) for o in outputs]
+    sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
+    narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in cases])
+    fine = min(shares) >= RIGHT and sound <= SOUND
+    return (
+        f"{cases[0].fault:<{width}}  "
+        + "  ".join(f"{share:>9.0%}" for share in shares)
+        + f"  {sound:>7.0%} {narrow:>7.0%}  {'' if fine else 'FAILS'}"
+    )
 
 
 def failures(cases: Sequence[Case]) -> Iterator[str]:
@@ -167,19 +168,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     names = [n for n in FAULTS if not chosen.fault or any(part in n for part in chosen.fault)]
     outputs = tuple(chosen.outputs)
-    cases: list[Case] = []
     seeds = range(chosen.first, chosen.first + chosen.seeds)
     print(f"fault zoo, seeds {seeds[0]} to {seeds[-1]}", flush=True)
-    for case in run_all(names, seeds, small=chosen.small, outputs=outputs, jobs=chosen.jobs):
-        cases.append(case)
+    width = max(map(len, names))
+    print(header(width, outputs), flush=True)
+    all_fine = True
+    runs = run_all(names, seeds, small=chosen.small, outputs=outputs, jobs=chosen.jobs)
+    for k, (_, of_one) in enumerate(groupby(runs, lambda case: case.fault)):
+        cases: list[Case] = []
+        for case in of_one:
+            cases.append(case)
+            if sys.stderr.isatty():
+                done = k * len(seeds) + len(cases)
+                print(f"\r{done} of {len(names) * len(seeds)}\r", end="", file=sys.stderr)
+        said = line(cases, width, outputs)
+        all_fine &= not said.endswith("FAILS")
+        print(said, flush=True)
         if not chosen.quiet:
-            for line in failures([case]):
-                print(line, flush=True)
-        if sys.stderr.isatty():
-            print(f"\r{len(cases)} of {len(names) * len(seeds)}", end="", file=sys.stderr)
-    lines = table(cases, outputs)
-    print("\n".join(lines))
-    return int(any(line.endswith("FAILS") for line in lines))
+            for failure in failures(cases):
+                print(failure, flush=True)
+    return int(not all_fine)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from zoo.faults import FAULTS, plant
 from zoo.outputs import OUTPUTS
 from zoo.page import lines
 from zoo.robot import Channels, draw, record
-from zoo.run import DETECTION, RIGHT, SOUND, failures, robot_for, run_all, seed_of, table
+from zoo.run import DETECTION, RIGHT, SOUND, failures, robot_for, run_all, seed_of
 
 SEED = 20250131
 """Of the fast test; printed with what fails."""
@@ -91,13 +91,13 @@ def test_the_manual_lists_the_kinds_of_every_fault():
 
 
 def verdict(cases, outputs):
-    """What fails and the table, as the message of a failure; empty if enough is right."""
+    """What fails, as the message of a failure; empty if enough is right."""
     right = np.mean([all(one.right for one in case.judged.values()) for case in cases])
     sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
     print(f"fault zoo, seed {SEED}: {right:.0%} right, {sound:.0%} name a sound joint")
     if right >= RIGHT and sound <= SOUND:
         return ""
-    return "\n".join([*failures(cases), *table(cases, outputs)])
+    return "\n".join(failures(cases))
 
 
 def test_joints_that_do_not_follow_are_detected():
