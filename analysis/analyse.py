@@ -43,6 +43,7 @@ from .results.analysis import (
     Window,
 )
 from .results.artefact import flags_by_joint
+from .results.dead_band import DeadBand
 from .segments.session import (
     commanded_joints,
     compare_joints,
@@ -109,12 +110,15 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
     return examine_session(session, options).analysis
 
 
-def examine_session(session: Session, options: Options | None = None) -> Examined:
+def examine_session(
+    session: Session, options: Options | None = None, *, with_dead_bands: bool = True
+) -> Examined:
     """Compute what one session tells, and keep the fit.
 
     Args:
         session: An open session.
         options: What the user chose; the defaults choose by themselves.
+        with_dead_bands: See :func:`measure_session`.
 
     Returns:
         The result and the fitted gait.
@@ -124,16 +128,20 @@ def examine_session(session: Session, options: Options | None = None) -> Examine
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
-    measured = measure_session(session, options)
+    measured = measure_session(session, options, with_dead_bands=with_dead_bands)
     return Examined(measured.analysis, measured.gait)
 
 
-def measure_session(session: Session, options: Options | None = None) -> Measured:
+def measure_session(
+    session: Session, options: Options | None = None, *, with_dead_bands: bool = True
+) -> Measured:
     """Compute what one session tells, and keep what it was computed from.
 
     Args:
         session: An open session.
         options: What the user chose; the defaults choose by themselves.
+        with_dead_bands: Whether to fit them, which takes a third of the time of a short session
+            and changes nothing else.
 
     Returns:
         The result, the fitted gait, the responses and the energies.
@@ -173,7 +181,9 @@ def measure_session(session: Session, options: Options | None = None) -> Measure
     faulty = not_following(follows, held, columns.names, whole.duration_s)
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}
-    dead = dead_bands(columns, commands, moving, gait, origin_ns)
+    dead: dict[str, DeadBand] = {}
+    if with_dead_bands:
+        dead = dead_bands(columns, commands, moving, gait, origin_ns)
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)

@@ -67,7 +67,7 @@ def see(session: Session, options: Options, warn: Warn) -> Seen:
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
-    measured = measure_session(session, options)
+    measured = measure_session(session, options, with_dead_bands=False)
     analysis = measured.analysis
     label = Path(analysis.session.path).name
     run = gait_run(label, session.robot, analysis, measured.gait)

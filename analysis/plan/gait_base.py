@@ -49,7 +49,7 @@ def base_gait(session: Session) -> BaseGait:
     Raises:
         UsageError: If it commands no steady gait of sines.
     """
-    gait = examine_session(session).gait
+    gait = examine_session(session, with_dead_bands=False).gait
     if gait is None or not gait.driven:
         raise UsageError(f"{session.path}: it commands no steady gait; name a session that does")
     if gait.others:

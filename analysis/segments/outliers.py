@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import combinations
 from math import comb
 
@@ -143,12 +144,11 @@ def _trimmed(profile: Profile, critical: float) -> State:
     columns = _smooth_columns(profile)[: 2 if m >= 7 else 1 if m >= 5 else 0]
     state = State(_core(profile, columns), columns)
     while not state.active.all():
-        outside = np.flatnonzero(~state.active)
-        ratio = [_excess(profile, state, int(joint), critical) for joint in outside]
-        k = int(np.argmin(ratio))
-        if ratio[k] > 1:
+        ratio = np.where(state.active, np.inf, _excess(profile, state, critical))
+        nearest = int(np.argmin(ratio))
+        if ratio[nearest] > 1:
             break
-        state.active[outside[k]] = True
+        state.active[nearest] = True
     if np.count_nonzero(~state.active) <= max(1, m // TRIMMED):
         state.outside.extend(np.flatnonzero(~state.active).tolist())
     return state
@@ -159,44 +159,42 @@ def _core(profile: Profile, columns: Sequence[FloatArray]) -> BoolArray:
     m, p = profile.values.size, 1 + len(columns)
     half = (m + p + 1) // 2
     design = np.stack([np.ones(m), *columns], axis=1)
-    subsets = np.array(
-        list(combinations(range(m), p))
-        if comb(m, p) <= SUBSETS
-        else [np.random.default_rng(k).permutation(m)[:p] for k in range(SUBSETS)]
-    )
-    best, least = everyone(profile), np.inf
-    for subset in subsets:
-        chosen = subset
-        for _ in range(3):  # concentration (Rousseeuw and Van Driessen, 2006)
-            square = _squares(design, profile.values, chosen)
-            chosen = np.argpartition(square, half - 1)[:half]
-        total = float(np.sum(_squares(design, profile.values, chosen)[chosen]))
-        if total < least:
-            best, least = np.isin(np.arange(m), chosen), total
-    return best
+    subsets = _subsets(m, p)
+    for _ in range(3):  # concentration (Rousseeuw and Van Driessen, 2006)
+        square = _squares(design, profile.values, subsets)
+        subsets = np.argpartition(square, half - 1)[:, :half]
+    square = np.take_along_axis(_squares(design, profile.values, subsets), subsets, axis=1)
+    return np.isin(np.arange(m), subsets[int(np.argmin(square.sum(axis=1)))])
 
 
-def _squares(design: FloatArray, values: FloatArray, chosen: IntArray) -> FloatArray:
-    """Squared residuals of all joints from the fit to some of them, shape (m,)."""
-    fit = np.linalg.lstsq(design[chosen], values[chosen], rcond=None)[0]
-    return np.asarray((values - design @ fit) ** 2, dtype=np.float64)
+@cache
+def _subsets(joints: int, size: int) -> IntArray:
+    """All subsets, or as many random ones as are tried at most, shape (s, size)."""
+    if comb(joints, size) <= SUBSETS:
+        return np.array(list(combinations(range(joints), size)))
+    return np.stack([np.random.default_rng(k).permutation(joints)[:size] for k in range(SUBSETS)])
 
 
-def _excess(profile: Profile, state: State, joint: int, critical: float) -> float:
-    """A joint's deviation, in the largest that noise and scatter of the present rest explain."""
+def _squares(design: FloatArray, values: FloatArray, subsets: IntArray) -> FloatArray:
+    """Squared residuals of all joints from the fit to each subset, shape (s, m)."""
+    some: FloatArray = design[subsets]
+    inverse = np.linalg.pinv(some, rtol=max(some.shape[1:]) * float(np.finfo(np.float64).eps))
+    fit = (inverse @ values[subsets][..., np.newaxis])[..., 0]
+    return np.asarray((values - fit @ design.T) ** 2, dtype=np.float64)
+
+
+def _excess(profile: Profile, state: State, critical: float) -> FloatArray:
+    """Deviations of all joints by what noise and scatter of the present rest explain."""
     rows = deviation_weights(profile, state.active, state.shapes)
-    value, error = (
-        float(rows[joint] @ profile.values),
-        float(profile.scatter.variance(rows[[joint]])[0]) ** 0.5,
-    )
     index = np.flatnonzero(state.active)
-    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), 1e-300)
     spare = index.size - 1 - len(state.shapes)
     if spare < 1:
-        return 0.0
-    residual = (rows @ profile.values / reach)[index]
-    limit = _limit(profile, spare) * _scatter(residual, rows, index, spare) * float(reach[joint])
-    return abs(value) / max(critical * error, limit, 1e-300)
+        return np.zeros(len(rows))
+    deviation = rows @ profile.values
+    reach = np.maximum(np.sqrt(np.sum(rows**2, axis=1)), 1e-300)
+    scatter = _limit(profile, spare) * _scatter((deviation / reach)[index], rows, index, spare)
+    explained = np.maximum(critical * np.sqrt(profile.scatter.variance(rows)), scatter * reach)
+    return np.abs(deviation) / np.maximum(explained, 1e-300)
 
 
 def _deviation_of(profile: Profile, state: State, joint: int) -> Deviation:
