@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.special import bdtrc
 
 from ..threads import in_threads
 from .fault import Span, Symptom
@@ -30,6 +31,9 @@ MOSTLY = 0.8
 
 SILENT = 0.02
 """A gap longer than this share of the record is a silence."""
+
+RARE = 1e-6
+"""Chance of so many repeats by which a joint of many sessions is taken to repeat old values."""
 
 LONGEST = 8
 """More repeats in turn than this are a joint that stands or a sensor that froze, not old values."""
@@ -69,13 +73,16 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     result: dict[str, list[Symptom]] = {}
     largest = max((each.command.range for each in sampled), default=0.0)
 
-    def shares(each: JointMotion) -> tuple[float, float, float]:
+    def counts(each: JointMotion) -> tuple[float, int, int, float]:
         moves = each.command.range > SPIKE_SHARE * largest
-        return _lost(each), _repeats(each), _spikes(each) if moves else 0.0
+        return _lost(each), *_repeats(each), _spikes(each) if moves else 0.0
 
-    found = in_threads(shares, sampled, sum(each.position.t_s.size for each in sampled))
-    usual_lost, usual_stale, usual_spikes = np.median(found or [(0.0, 0.0, 0.0)], axis=0).tolist()
-    for each, (missing, repeated, spiky) in zip(sampled, found, strict=True):
+    found = in_threads(counts, sampled, sum(each.position.t_s.size for each in sampled))
+    usual_lost = float(np.median([lost for lost, *_ in found] or [0.0]))
+    usual_stale = float(np.median([again / of for _, again, of, _ in found if of] or [0.0]))
+    usual_spikes = float(np.median([spiky for *_, spiky in found] or [0.0]))
+    expected = min(STALE_SHARE + 2 * usual_stale, 1.0)
+    for each, (missing, again, fast, spiky) in zip(sampled, found, strict=True):
         symptoms: list[Symptom] = []
         if spiky > SPIKES + 2 * usual_spikes:
             text = f"{100 * spiky:.2g} % of its samples are far from those around them"
@@ -83,8 +90,8 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
         if missing > LOST_SHARE + 2 * usual_lost:
             text = f"{100 * missing:.2g} % of its samples missing"
             symptoms.append(Symptom("lost", _silences(each, missing), text))
-        if repeated > STALE_SHARE + 2 * usual_stale:
-            text = f"{100 * repeated:.2g} % of its samples repeat the one before"
+        if bdtrc(again - 1, fast, expected) < RARE:
+            text = f"{100 * again / fast:.2g} % of its fast samples repeat the one before"
             symptoms.append(Symptom("stale", (), text))
         if symptoms:
             result[each.name] = symptoms
@@ -162,24 +169,24 @@ def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:
     return tuple(zip(t_s[long].tolist(), t_s[long + 1].tolist(), strict=True))
 
 
-def _repeats(each: JointMotion) -> float:
-    """Share of the samples during fast motion that repeat the one before."""
+def _repeats(each: JointMotion) -> tuple[int, int]:
+    """How many samples during fast motion repeat the one before, and of how many."""
     samples: Samples = each.position
     values = samples.values
     step = np.abs(np.diff(values))
     moved = step[step > 0]
     if moved.size < 10 or values.size < 4 * AROUND:
-        return 0.0
+        return 0, 0
     # Its own motion over a few samples: a joint that stands repeats its values rightly.
     travel = np.abs(values[2 * AROUND :] - values[: -2 * AROUND]) / (2 * AROUND)
     travel = np.pad(travel, (AROUND, AROUND - 1), mode="edge")
     fast = travel > max(2 * float(moved.min()), FAST * float(np.percentile(travel, 95)))
     if np.count_nonzero(fast) < 20:
-        return 0.0
+        return 0, 0
     repeated = step == 0
     # A joint that stands repeats, too, and for longer.
     edges = np.flatnonzero(np.diff(np.concatenate(([False], repeated, [False])).astype(np.int8)))
     for first, stop in edges.reshape(-1, 2).tolist():
         if stop - first > LONGEST:
             repeated[first:stop] = False
-    return float(np.count_nonzero(fast & repeated) / np.count_nonzero(fast))
+    return int(np.count_nonzero(fast & repeated)), int(np.count_nonzero(fast))

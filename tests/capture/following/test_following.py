@@ -65,6 +65,21 @@ def test_sound_joints_are_not_named(joints, step):
         assert Chain(joints, seed, step).judged("velocity", "effort", "second") == {}
 
 
+def coarse(seed, encoder=2 * np.pi / 4096):
+    """26 joints that move by one or two steps of a noisy encoder between two samples."""
+    chain = Chain(26, seed)
+    rate = np.where(np.arange(26) % 2, 1.0, 1.8) * encoder / np.max(np.abs(np.diff(chain.true)))
+    chain.command, chain.true = rate[:, None] * chain.command, rate[:, None] * chain.true
+    noisy = chain.true + chain.rng.normal(0, 1.1 * encoder, chain.true.shape)
+    chain.position = encoder * np.round(noisy / encoder)
+    return chain
+
+
+def test_a_noisy_coarse_encoder_repeats_values_by_chance():
+    for seed in range(20):
+        assert coarse(seed).judged() == {}
+
+
 def test_the_windowed_response_is_gain_and_lag(chain):
     command, position = Samples(chain.t, chain.command[0]), Samples(chain.t, chain.true[0])
     assert cycle_s(command) == pytest.approx(2 * np.pi / OMEGA, rel=0.01)
