@@ -88,6 +88,12 @@ def joints(log: HostileLog, count: int) -> None:
     log.chunk(_ticks(20, count, start_s=2))
 
 
+def joint_lists(log: HostileLog, count: int) -> None:
+    """Messages that each name another joint."""
+    times = [EPOCH_NS + 2 * NS + k * 10_000 for k in range(count)]
+    log.chunk([(2, t, joint_state(t, [f"joint{t}"], [0.5])) for t in times])
+
+
 def listed_again(log: HostileLog, count: int) -> None:
     """A chunk that the summary lists again and again."""
     log.chunk(_ticks(500, start_s=2), listed=count)
@@ -105,6 +111,7 @@ DIMENSIONS: dict[str, tuple[Callable[[HostileLog, int], None], int]] = {
     "messages": (messages, 20_000),
     "channels": (channels, 8_000),
     "joints": (joints, 5_000),
+    "lists of joints": (joint_lists, 10_000),
     "chunk listed again": (listed_again, 5_000),
     "decompressed MiB": (decompressed, 512),
 }

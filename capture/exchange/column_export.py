@@ -29,7 +29,8 @@ from ..bus.decoded_topics import JOINT_TOPIC
 from ..console import progress, refuse_existing
 from ..errors import MissingChannelError, MissingExtraError, UsageError
 from ..interruption import StopRequest
-from ..log.joint_reader import JOINT_STATE, UNITS
+from ..log.joint_reader import UNITS
+from ..log.schemas import JOINT_STATE
 from ..log.session import Session
 from ..log.signals import JointSignals
 from ..part_file import check_stop, part_file

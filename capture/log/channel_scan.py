@@ -26,7 +26,7 @@ from .frames import (
     FRAME_TOPIC_PREFIXES,
 )
 from .freeze import RangeTally
-from .groups import fits_layout
+from .groups import MOST_JOINT_LISTS, fits_layout
 from .health import LIMIT_RAD
 from .message_heads import BODY_AT, FIXED_SIZE, gather
 from .rosmsg import MessageType
@@ -328,11 +328,14 @@ class ChannelScan:
                 self.unread += 1
                 rows, matrix = rows[1:], matrix[1:]
                 continue
+            if self._joints and self._layout_count >= MOST_JOINT_LISTS:
+                self.unread += len(rows)
+                return parts
             room = _MAX_LAYOUTS - (self._layout_count if self._text else len(known))
-            if room > 0:
+            if room > 0 or self._joints:
                 known.append(layout)
                 self._layout_count += 1
-            elif not self._joints:  # text: a layout a message, and no numbers worth a look
+            else:  # a layout a message, and no numbers worth a look
                 return parts
             fits = fits_layout(matrix, layout)
             parts.append((_names(layout), rows[fits], layout, matrix[fits]))

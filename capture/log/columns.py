@@ -19,10 +19,11 @@ from ..errors import DataError
 from .batches import Records, Window, blocks_in, record_batches
 from .cdr import Layout, layout_of
 from .chunk import Buffer
-from .groups import Group, Matrix, Stamping, fits_layout
+from .groups import MOST_JOINT_LISTS, Group, Matrix, Stamping, fits_layout
 from .message_heads import BODY_AT, FIXED_SIZE, Places
 from .pages import FilePages
 from .rosmsg import MessageType
+from .schemas import JOINT_STATE
 from .storage import LogFile
 from .stores import TimeStore
 
@@ -55,12 +56,14 @@ class Request:
     """What to read of one topic.
 
     Attributes:
+        topic: Its name.
         channel_ids: The topic's channels.
         message_type: Their type.
         paths: Leaf paths to keep; None for all.
         layouts: One of each length that was seen before, by length; new ones are noted.
     """
 
+    topic: str
     channel_ids: Sequence[int]
     message_type: MessageType
     paths: Sequence[str] | None = None
@@ -99,6 +102,9 @@ def read_messages(
 
     Returns:
         The messages, one entry a request.
+
+    Raises:
+        DataError: If a topic of JointStates has more than :data:`MOST_JOINT_LISTS` lists of joints.
     """
     blocks = blocks_in(log_file, window_ns)
     shared: list[TimeStore] = []
@@ -184,7 +190,8 @@ class _GroupReader:
         stamping: Stamping,
         pages: FilePages | None,
     ) -> None:
-        self._type = request.message_type
+        self._topic, self._type = request.topic, request.message_type
+        self._most = MOST_JOINT_LISTS if self._type.name == JOINT_STATE else None
         self._paths = None if request.paths is None else frozenset(request.paths)
         self._layouts = request.layouts
         self._expected, self._reserve = expected, reserve
@@ -243,18 +250,19 @@ class _GroupReader:
                 matrix, places = matrix[1:], places.take(slice(1, None))
                 log_ns, order = log_ns[1:], order[1:]
                 continue
-            # Text topics have a layout a message: don't hold every later message against each.
-            fits = np.zeros(len(places), dtype=bool)
-            fits[0] = True
+            if self._most is not None and len(self.groups) >= self._most:
+                why = f"{self._topic} has more than {self._most} different lists of joints"
+                raise DataError(f"{why}; give each robot a topic of its own")
             if len(known) < _MAX_LAYOUTS:
                 fits = fits_layout(matrix, layout)
                 group = self._group(layout, self._capacity(length, int(fits.sum())))
                 known.append(group)
-            else:
+                rest = ~fits
+            else:  # text has a layout a message: don't hold every later message against each
                 group = self._new_group(layout, 1)
+                fits, rest = slice(0, 1), slice(1, None)
             self.groups.append(group)
             group.take(places.take(fits), log_ns[fits], order[fits])
-            rest = ~fits
             matrix, places = matrix[rest], places.take(rest)
             log_ns, order = log_ns[rest], order[rest]
 

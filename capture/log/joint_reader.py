@@ -15,11 +15,11 @@ from .joint_rows import JointRows, merge_rows, rows_of
 from .own_times import Series, own_times
 from .rosmsg import MessageType
 from .sampling_window import NEAR_NS, SLACK_NS, covers, cut, widened
+from .schemas import JOINT_STATE
 from .signals import JointSignals
 from .stamp_clock import StampClock
 from .topics import Topics
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 """Field of a JointState to its unit, where the channel doesn't say otherwise."""
 

@@ -35,10 +35,10 @@ from .edit import (
     refuse_output,
     refuse_stopped,
 )
-from .joint_reader import JOINT_STATE
 from .merge_records import copy_records
 from .raw_log import RawLog, RawMessage
 from .rosmsg import parse_message_type
+from .schemas import JOINT_STATE
 from .topics import Topics
 
 FAR_APART_S = 86400.0

@@ -10,6 +10,8 @@ from functools import cache
 from ..errors import DataError
 from .rosmsg import PRIMITIVES, MessageType, parse_message_type
 
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
 _BODIES: dict[str, str] = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",

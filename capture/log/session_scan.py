@@ -33,6 +33,7 @@ from .health import (
 from .joined import Finding, joined
 from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 from .rosmsg import MessageType
+from .schemas import JOINT_STATE
 from .source_health import SourceHealth, judge_source, measure_sources
 from .tallies import NS
 from .undecoded import named_identifiers, undecoded
@@ -155,7 +156,7 @@ class SessionScan:
         limits: Limits | None = {} if angles else None
         if angles and self._robot is not None:
             limits = {joint.name: (joint.lower, joint.upper) for joint in self._robot.joints}
-        joints = kind is not None and type_name == "sensor_msgs/msg/JointState"
+        joints = kind is not None and type_name == JOINT_STATE
         self._scans[key] = ChannelScan(
             topic, kind, joints=joints, limits=limits, horizon_s=self._horizon_s
         )

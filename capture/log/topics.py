@@ -86,10 +86,12 @@ class Topics:
 
         Raises:
             MissingChannelError: If the log has no such topic.
-            DataError: If a topic's type can't be read.
+            DataError: If a topic's type can't be read, or one of JointStates has too many lists of
+                joints.
         """
         requests = [
             Request(
+                topic,
                 self._channel_ids(topic),
                 self.message_type(topic),
                 paths,
@@ -97,9 +99,12 @@ class Topics:
             )
             for topic, paths in wanted.items()
         ]
-        found = read_messages(
-            self._file, requests, window_ns=window_ns, warn=self._warn, threads=self._threads
-        )
+        try:
+            found = read_messages(
+                self._file, requests, window_ns=window_ns, warn=self._warn, threads=self._threads
+            )
+        except DataError as error:
+            raise DataError(f"{self._file.path}: {error}") from None
         return dict(zip(wanted, found, strict=True))
 
     @property

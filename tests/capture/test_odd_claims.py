@@ -54,6 +54,20 @@ def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(
     assert (other.count, other.unread) == (1, 1)
 
 
+def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = joints()
+    times = [EPOCH_NS + NS + k * 10_000 for k in range(5_000)]
+    log.chunk([*ticks(), *((2, t, joint_state(t, [f"joint{t}"], [0.5])) for t in times)])
+    path = log.write(tmp_path / "run.mcap")
+    (states,) = (each for each in check_session(path).channels if each.topic == "/joint_states")
+    assert states.unread == 5_000 - 255  # with the list of the sound messages, 256
+    assert undulog.run(["analyse", str(path)]) == 1
+    told = "/joint_states has more than 256 different lists of joints"
+    assert f"error: {path}: {told}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("start_ns", [2**63 - NS // 2, 2**63, 2**64 - 10 * NS])
 @pytest.mark.parametrize("whole", [True, False])
 def test_log_times_that_no_signed_number_holds(
