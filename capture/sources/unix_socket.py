@@ -145,8 +145,8 @@ class UnixSource:
         try:
             os.fchmod(listener.fileno(), 0o600)  # before it has a name: no moment without
             listener.bind(str(self._path))
+            listener.listen(_BACKLOG)  # at once: who sees the socket connects
             made = self._path.lstat()
-            listener.listen(_BACKLOG)
         except OSError as error:
             listener.close()
             reason = error.strerror or str(error)

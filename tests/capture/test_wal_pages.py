@@ -52,11 +52,12 @@ def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
     command = [sys.executable, "-m", "undulog", "record", f"bus=unix:{path}", "-o", str(output)]
     command += ["--floor", "0", "--socket", str(tmp_path / "control.sock"), "--quiet"]
     recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    frame, accepted = empty_frames(1), 0
+    frame, accepted = empty_frames(1), 1
     try:
-        wait_for(path.exists, "the recorder")
         with FrameSender(path) as sender:
-            while recorder.poll() is None and sender.refused < 10:
+            wait_for(lambda: sender.send(frame), "the recorder")
+            before = sender.refused
+            while recorder.poll() is None and sender.refused < before + 10:
                 frame["t_device_ns"] = number = accepted
                 accepted += sender.send(frame)
                 if number == 500:
