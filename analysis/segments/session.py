@@ -34,6 +34,7 @@ _OF_FLAG: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("position", "scale_mismatch"): ("scaled_sensor",),
     ("position", "clipped"): ("at_limit", "clipped_sensor"),
     ("position", "frozen"): ("frozen_sensor", "jammed", "dead"),
+    ("position", "stale"): ("stale_sensor", "lost_samples"),
     ("effort", "stalled"): ("stalled", "jammed"),
     ("current", "stalled"): ("stalled", "jammed"),
 }
@@ -50,6 +51,9 @@ _TOGETHER = 0.5
 
 _LASTING = 0.1
 """Share of the window that an artefact holds at least: a joint may press on an obstacle."""
+
+_WHOLE = 0.8
+"""Share of the window that old values in all of it are seen in: ends and turns show little."""
 
 
 def commanded_joints(columns: Columns) -> tuple[str, ...]:
@@ -179,8 +183,9 @@ def not_following(
         # A flat top moves the mean of the position, which by itself is a zero that moved.
         new = known is None or (artefact.flag == "clipped" and _ZERO.issuperset(known.kinds))
         if kinds and new and (share >= _LASTING or artefact.falsifies("position")):
-            since = artefact.spans_s[0][0] if artefact.spans_s else None
-            until = artefact.spans_s[-1][1] if artefact.spans_s else None
+            always = artefact.flag == "stale" and share > _WHOLE
+            spans = () if always else artefact.spans_s
+            since, until = (spans[0][0], spans[-1][1]) if spans else (None, None)
             text = f"{artefact.quantity} {artefact.flag}"
             text += f" ({artefact.note})" if artefact.note else ""
             found[artefact.joint] = NotFollowing(artefact.joint, kinds, since, until, share, text)

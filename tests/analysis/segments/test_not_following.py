@@ -1,0 +1,17 @@
+"""Artefacts of a position that mean that its joint does not follow."""
+
+import pytest
+
+from analysis.results.artefact import Artefact
+from analysis.segments.session import Following, not_following
+
+
+@pytest.mark.parametrize(
+    ("span_s", "since_s", "until_s"), [((1.0, 9.5), None, None), ((4.0, 9.0), 4.0, 9.0)]
+)
+def test_a_joint_whose_values_are_old_is_named(span_s, since_s, until_s):
+    old = Artefact("j2", "/joint_states", "position", "stale", (span_s,))
+    (found,) = not_following(Following((), {}, {}), [old], ("j1", "j2"), 10.0)
+    assert found.joint == "j2"
+    assert set(found.kinds) == {"stale_sensor", "lost_samples"}
+    assert (found.since_s, found.until_s) == (since_s, until_s)
