@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from capture import Session
 from capture.errors import DataError, MissingChannelError
+from capture.following.session import MOST_JOINTS
 from capture.log.power_topics import PowerTopic
 from capture.log.signals import JointSignals, Signal
 from capture.robot import Robot
@@ -20,9 +21,6 @@ COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"
 CURRENT_TOPIC = "/joint_current"
 VOLTAGE_TOPIC = "/joint_voltage"
-
-MOST_JOINTS = 5000
-"""Of a session that is analysed; a file that claims more of them describes no robot."""
 
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage", "reference")
 """What is read of each joint."""

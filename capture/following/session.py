@@ -17,6 +17,9 @@ from .motion import JointMotion, Samples
 
 COMMANDS = "/joint_commands"
 STATES = "/joint_states"
+MOST_JOINTS = 5000
+"""Of a session whose joints are judged; a file that claims more of them describes no robot."""
+
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
 
 
@@ -29,6 +32,9 @@ def faults_in_session(session: Session) -> tuple[Fault, ...]:
     Returns:
         The faults, in chain order, times from the session's start; none where the session lacks
         commands or states. Of a session with breaks the longest unbroken stretch is looked at.
+
+    Raises:
+        DataError: If a topic has more than :data:`MOST_JOINTS`.
     """
     quantities = {
         "command": (COMMANDS, "position"),
@@ -45,6 +51,9 @@ def faults_in_session(session: Session) -> tuple[Fault, ...]:
             signals = session.joints(topic, field)
         except (MissingChannelError, DataError, LogError):
             continue  # the health check itself reports a channel that can't be read
+        if (count := len(signals.names)) > MOST_JOINTS:
+            why = f"{topic} has {count} joints; at most {MOST_JOINTS} are judged"
+            raise DataError(f"{session.path}: {why}")
         columns[quantity] = {name: signals.signal(name) for name in signals.names}
     if "command" not in columns or "position" not in columns:
         return ()

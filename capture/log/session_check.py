@@ -121,8 +121,12 @@ class _Check:
         """
         if file.damage:
             return []
-        with Session(self._file.path) as session:
-            faults = faults_in_session(session)
+        try:
+            with Session(self._file.path) as session:
+                faults = faults_in_session(session)
+        except DataError as error:
+            why = str(error).removeprefix(f"{self._file.path}: ")
+            return [Finding(0, f"whether joints follow their command is not known: {why}")]
         return [
             judge_following(fault)
             for fault in faults

@@ -68,6 +68,15 @@ def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(
     assert f"error: {path}: {told}" in capsys.readouterr().err
 
 
+def test_more_joints_than_are_judged_are_told(tmp_path: Path) -> None:
+    log = joints()
+    names = [f"j{k}" for k in range(5001)]
+    message = joint_state(EPOCH_NS, names, np.zeros(5001))
+    log.chunk([(channel, EPOCH_NS, message) for channel in (1, 2)])
+    health = check_session(log.write(tmp_path / "run.mcap"))
+    assert any("/joint_commands has 5001 joints; at most 5000" in one for one in health.reasons)
+
+
 @pytest.mark.parametrize("start_ns", [2**63 - NS // 2, 2**63, 2**64 - 10 * NS])
 @pytest.mark.parametrize("whole", [True, False])
 def test_log_times_that_no_signed_number_holds(
