@@ -34,7 +34,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-_MOST_LISTED = 100  # names in a message
+_MOST_LISTED = 20  # names in a message
 
 
 class UndulogError(Exception):
