@@ -1,13 +1,17 @@
 """The tables of docs/faults.md on errors: how often an answer names what is not there.
 
 ``.venv/bin/python docs/answer_tables.py [SESSIONS]`` prints them as Markdown; with 2,000 sessions
-a cell it takes about a quarter of an hour. Nothing is written to files: commands and positions are
-made in memory and given to the same functions as those of a session.
+a cell it takes about twenty minutes on two cores. Nothing is written to files: commands and
+positions are made in memory and given to the same functions as those of a session.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +41,9 @@ SHARED = 0.9
 MARGIN_GAIN, MARGIN_LAG_RAD = 0.02, np.radians(1.0)
 NOISES = ("white", "AR(0.9)", "shared", "quantised")
 STATEMENTS = ("not following", "stands out", "shape")
+QUANTITIES = ("gain", "lag")
+CELLS = tuple(product(NOISES, (1, 2)))
+ODD_CELLS = tuple(product(NOISES, (1, 2), QUANTITIES))
 
 
 class Recorded(NamedTuple):
@@ -195,17 +202,18 @@ def identical(sessions, seed=1):
     Returns:
         Noise and planes to the share with any statement, then with each of ``STATEMENTS``.
     """
-    rows = {}
-    for noise in NOISES:
-        for planes in (1, 2):
-            random = np.random.default_rng([seed, NOISES.index(noise), planes])
-            found = np.zeros(len(STATEMENTS) + 1)
-            for _ in range(sessions):
-                told = stated(session(random, noise, planes))
-                each = [bool(told[kind]) for kind in STATEMENTS]
-                found += [any(each), *each]
-            rows[noise, planes] = found / sessions
-    return rows
+    return {cell: identical_cell(sessions, seed, *cell) for cell in CELLS}
+
+
+def identical_cell(sessions, seed, noise, planes):
+    """The shares of one cell of :func:`identical`."""
+    random = np.random.default_rng([seed, NOISES.index(noise), planes])
+    found = np.zeros(len(STATEMENTS) + 1)
+    for _ in range(sessions):
+        told = stated(session(random, noise, planes))
+        each = [bool(told[kind]) for kind in STATEMENTS]
+        found += [any(each), *each]
+    return found / sessions
 
 
 def one_off(sessions, seed=2):
@@ -218,37 +226,42 @@ def one_off(sessions, seed=2):
     Returns:
         Noise, planes and quantity to both shares.
     """
-    rows = {}
-    for noise in NOISES:
-        for planes in (1, 2):
-            for k, quantity in enumerate(("gain", "lag")):
-                random = np.random.default_rng([seed, NOISES.index(noise), planes, k])
-                found = np.zeros(2)
-                for _ in range(sessions):
-                    odd = int(random.integers(JOINTS * planes))
-                    made = session(random, noise, planes, odd=odd, quantity=quantity)
-                    told = stated(made)
-                    named = {*told["not following"], *told["stands out"]}
-                    own = made.names[odd]
-                    found += [own in named, bool(named - {own})]
-                rows[noise, planes, quantity] = found / sessions
-    return rows
+    return {cell: one_off_cell(sessions, seed, *cell) for cell in ODD_CELLS}
+
+
+def one_off_cell(sessions, seed, noise, planes, quantity):
+    """The shares of one cell of :func:`one_off`."""
+    k = QUANTITIES.index(quantity)
+    random = np.random.default_rng([seed, NOISES.index(noise), planes, k])
+    found = np.zeros(2)
+    for _ in range(sessions):
+        odd = int(random.integers(JOINTS * planes))
+        made = session(random, noise, planes, odd=odd, quantity=quantity)
+        told = stated(made)
+        named = {*told["not following"], *told["stands out"]}
+        own = made.names[odd]
+        found += [own in named, bool(named - {own})]
+    return found / sessions
 
 
 def main(sessions=2000):
-    """Print both tables."""
-    print(f"Identical joints, {sessions:,} sessions a line:\n")
-    print("| noise | planes | any statement | not following | stands out | shape |")
-    print("|---|---|---|---|---|---|")
-    for (noise, planes), shares in identical(sessions).items():
-        print(f"| {noise} | {planes} | " + " | ".join(f"{100 * x:.2f} %" for x in shares) + " |")
-    sessions = max(sessions // 4, 1)
-    print(f"\nOne joint off by three half widths, {sessions:,} sessions a line:\n")
-    print("| noise | planes | by | it is named | another is |")
-    print("|---|---|---|---|---|")
-    for (noise, planes, quantity), shares in one_off(sessions).items():
-        row = " | ".join(f"{100 * x:.1f} %" for x in shares)
-        print(f"| {noise} | {planes} | {quantity} | {row} |")
+    """Print both tables, a process a core."""
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        rows = pool.map(partial(identical_cell, sessions, 1), *zip(*CELLS, strict=True))
+        odd_sessions = max(sessions // 4, 1)
+        odd_rows = pool.map(partial(one_off_cell, odd_sessions, 2), *zip(*ODD_CELLS, strict=True))
+        print(f"Identical joints, {sessions:,} sessions a line:\n")
+        print("| noise | planes | any statement | not following | stands out | shape |")
+        print("|---|---|---|---|---|---|")
+        for (noise, planes), shares in zip(CELLS, rows, strict=True):
+            row = " | ".join(f"{100 * x:.2f} %" for x in shares)
+            print(f"| {noise} | {planes} | {row} |", flush=True)
+        print(f"\nOne joint off by three half widths, {odd_sessions:,} sessions a line:\n")
+        print("| noise | planes | by | it is named | another is |")
+        print("|---|---|---|---|---|")
+        for (noise, planes, quantity), shares in zip(ODD_CELLS, odd_rows, strict=True):
+            row = " | ".join(f"{100 * x:.1f} %" for x in shares)
+            print(f"| {noise} | {planes} | {quantity} | {row} |", flush=True)
 
 
 if __name__ == "__main__":
