@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
 import rerun as rr
@@ -99,7 +100,7 @@ def write_recording(
     clock = clock_of(session)
     identity = recording_id(session.session_id)
     with part_file(path) as draft, rerun_writes(path):
-        rec = open_recording(identity)
+        rec = open_recording(identity, in_file=True)
         try:
             rec.save(draft)
             send_properties(rec, session)
@@ -120,17 +121,21 @@ def write_recording(
     return Recording(path, identity, drawing.content, tuple(told))
 
 
-def open_recording(identity: str) -> rr.RecordingStream:
+def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStream:
     """A recording stream for a session, without a sink.
 
     Args:
         identity: The recording's id.
+        in_file: Cut chunks by their size alone: those that a clock cuts differ from run to run.
 
     Returns:
         The stream.
     """
     rr.set_strict_mode(True)
-    rec = rr.RecordingStream(APPLICATION, recording_id=identity, send_properties=False)
+    batching = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if in_file else None
+    rec = rr.RecordingStream(
+        APPLICATION, recording_id=identity, send_properties=False, batcher_config=batching
+    )
     rec.set_log_time_enabled(False)
     rec.set_log_tick_enabled(False)
     return rec

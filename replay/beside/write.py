@@ -19,7 +19,7 @@ from capture.interruption import StopRequest
 from capture.part_file import check_stop, part_file
 
 from ..plots.joints import log_scalars
-from ..rrd import APPLICATION, Recording, recording_id, require_whole, rerun_writes
+from ..rrd import Recording, open_recording, recording_id, require_whole, rerun_writes
 from ..samples.sampling import decimate
 from ..samples.tracks import Track
 from ..views import body_title
@@ -126,10 +126,8 @@ def write_beside(
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
     with part_file(path) as draft, rerun_writes(path):
-        rec = rr.RecordingStream(APPLICATION, recording_id=identity, send_properties=False)
+        rec = open_recording(identity, in_file=True)
         try:
-            rec.set_log_time_enabled(False)
-            rec.set_log_tick_enabled(False)
             rec.save(draft)
             rec.send_recording_name(", ".join(names))
             rec.send_recording_start_time_nanos(sides[0].start_ns)
