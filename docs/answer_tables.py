@@ -210,8 +210,8 @@ def identical_cell(sessions, seed, noise, planes):
     random = np.random.default_rng([seed, NOISES.index(noise), planes])
     found = np.zeros(len(STATEMENTS) + 1)
     for _ in range(sessions):
-        told = stated(session(random, noise, planes))
-        each = [bool(told[kind]) for kind in STATEMENTS]
+        answer = stated(session(random, noise, planes))
+        each = [bool(answer[kind]) for kind in STATEMENTS]
         found += [any(each), *each]
     return found / sessions
 
@@ -237,8 +237,8 @@ def one_off_cell(sessions, seed, noise, planes, quantity):
     for _ in range(sessions):
         odd = int(random.integers(JOINTS * planes))
         made = session(random, noise, planes, odd=odd, quantity=quantity)
-        told = stated(made)
-        named = {*told["not following"], *told["stands out"]}
+        answer = stated(made)
+        named = {*answer["not following"], *answer["stands out"]}
         own = made.names[odd]
         found += [own in named, bool(named - {own})]
     return found / sessions

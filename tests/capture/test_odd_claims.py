@@ -64,11 +64,11 @@ def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(
     (states,) = (each for each in check_session(path).channels if each.topic == "/joint_states")
     assert states.unread == 5_000 - 255  # with the list of the sound messages, 256
     assert undulog.run(["analyse", str(path)]) == 1
-    told = "/joint_states has more than 256 different lists of joints"
-    assert f"error: {path}: {told}" in capsys.readouterr().err
+    why = "/joint_states has more than 256 different lists of joints"
+    assert f"error: {path}: {why}" in capsys.readouterr().err
 
 
-def test_more_joints_than_are_judged_are_told(tmp_path: Path) -> None:
+def test_more_joints_than_are_judged_are_a_finding(tmp_path: Path) -> None:
     log = joints()
     names = [f"j{k}" for k in range(5001)]
     message = joint_state(EPOCH_NS, names, np.zeros(5001))
