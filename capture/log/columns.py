@@ -251,8 +251,10 @@ class _GroupReader:
                 log_ns, order = log_ns[1:], order[1:]
                 continue
             if self._most is not None and len(self.groups) >= self._most:
-                why = f"{self._topic} has more than {self._most} different lists of joints or frame ids"
-                raise DataError(f"{why}; give each robot a topic of its own")
+                raise DataError(
+                    f"{self._topic} has more than {self._most} different lists of joints or frame "
+                    "ids; give each robot a topic of its own"
+                )
             if len(known) < _MAX_LAYOUTS:
                 fits = fits_layout(matrix, layout)
                 group = self._group(layout, self._capacity(length, int(fits.sum())))

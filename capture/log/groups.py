@@ -20,8 +20,7 @@ _COMPARED = 1 << 17
 """Bytes of constant parts that are compared at once: few enough to stay in the cache."""
 
 MOST_JOINT_LISTS = 256
-"""Lists of joints, with their frame id, that one topic may have: each takes the time of thousands of
-usual messages."""
+"""Lists of joints (with frame id) of one topic: each takes the time of many usual messages."""
 
 _STAMP_KIND = np.dtype([("seconds", "<i4"), ("rest", "<u4")])
 
