@@ -2,8 +2,8 @@
 
 ::
 
-    from analysis import analyse_session
-    from capture import Session
+    from undulog.analysis import analyse_session
+    from undulog.capture import Session
 
     with Session.open("run.mcap") as session:
         result = analyse_session(session)
@@ -12,10 +12,13 @@
 Names are imported when first used, so that ``import analysis`` costs nothing.
 """
 
+# pyright: reportUnusedImport=false
+
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from undulog.capture.lazy import attach
 
 if TYPE_CHECKING:
     from .analyse import analyse_session
@@ -37,51 +40,26 @@ if TYPE_CHECKING:
     from .stretch import Options
     from .text.table import render
 
-__all__ = [
-    "Analysis",
-    "Choices",
-    "Comparison",
-    "Estimate",
-    "Experiment",
-    "Index",
-    "JointResult",
-    "LinearCoupling",
-    "LocalCoupling",
-    "Margins",
-    "Options",
-    "Picture",
-    "Reversal",
-    "analyse_experiment",
-    "analyse_session",
-    "compare_sessions",
-    "load",
-    "render",
-]
-
-_HOMES = {
-    "Analysis": "results.analysis",
-    "Choices": "compare.compare",
-    "Comparison": "compare.result",
-    "Estimate": "results.analysis",
-    "Experiment": "results.experiment",
-    "Index": "results.analysis",
-    "JointResult": "results.analysis",
-    "LinearCoupling": "results.sweep",
-    "LocalCoupling": "results.coupling",
-    "Margins": "compare.decisions",
-    "Options": "stretch",
-    "Picture": "notebook.picture",
-    "Reversal": "results.experiment",
-    "analyse_experiment": "experiment.analyse",
-    "analyse_session": "analyse",
-    "compare_sessions": "compare.compare",
-    "load": "notebook.files",
-    "render": "text.table",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name from its module on first use."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'analysis' has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+__getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
+    __name__,
+    {
+        "Analysis": "results.analysis",
+        "Choices": "compare.compare",
+        "Comparison": "compare.result",
+        "Estimate": "results.analysis",
+        "Experiment": "results.experiment",
+        "Index": "results.analysis",
+        "JointResult": "results.analysis",
+        "LinearCoupling": "results.sweep",
+        "LocalCoupling": "results.coupling",
+        "Margins": "compare.decisions",
+        "Options": "stretch",
+        "Picture": "notebook.picture",
+        "Reversal": "results.experiment",
+        "analyse_experiment": "experiment.analyse",
+        "analyse_session": "analyse",
+        "compare_sessions": "compare.compare",
+        "load": "notebook.files",
+        "render": "text.table",
+    },
+)

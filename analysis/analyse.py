@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray, IntArray
-from capture.environment import base_versions
-from capture.log.signals import Signal
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.environment import base_versions
+from undulog.capture.log.signals import Signal
 
 from .body.motion import body_motion
 from .coupling import one_gait_coupling

@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, cast
 
-from capture import Session
-from capture.robot import Joint, Link, Robot, Servo
-from capture.strict_table import read_toml
+from undulog.capture import Session
+from undulog.capture.robot import Joint, Link, Robot, Servo
+from undulog.capture.strict_table import read_toml
 
 _SERVO_FIELDS = frozenset(field.name for field in dataclasses.fields(Servo))
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress
-from capture.errors import UsageError
+from undulog.capture.console import emit_json, progress
+from undulog.capture.errors import UsageError
 
 from .command_line import check_output, chosen, opened, show
 
@@ -80,7 +80,7 @@ def analyse(
 
 
 def _one(file: Path, options: Options, null: Path | None) -> Analysis:
-    from capture import Session
+    from undulog.capture import Session
 
     from .analyse import analyse_session
 

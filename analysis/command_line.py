@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.console import Progress, refuse_existing, say
-from capture.errors import UsageError
+from undulog.capture.console import Progress, refuse_existing, say
+from undulog.capture.errors import UsageError
 
 if TYPE_CHECKING:
-    from capture import Session
+    from undulog.capture import Session
 
     from .stretch import Options
 
@@ -83,7 +83,7 @@ def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[Sess
     Yields:
         Each of them, open until the next is asked for.
     """
-    from capture import Session
+    from undulog.capture import Session
 
     for k, file in enumerate(files, start=done):
         bar.update(k, note=file.name)

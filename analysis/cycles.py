@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
 
 from .analyse import Measured
 from .estimators.cycle_sums import cycle_sums, weigh

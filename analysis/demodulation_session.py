@@ -9,10 +9,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import BoolArray, ComplexArray, FloatArray
-from capture.errors import DataError, LogError
-from capture.threads import in_threads
+from undulog.capture import Session
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray
+from undulog.capture.errors import DataError, LogError
+from undulog.capture.threads import in_threads
 
 from .estimators.demodulation import (
     Cycles,
@@ -236,7 +236,7 @@ def _rising(t_s: FloatArray, value: FloatArray) -> Phase | None:
 
 
 def _estimates(found: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
-    """Gain and lag with their intervals, as :mod:`analysis.response` has them."""
+    """Gain and lag with their intervals, as :mod:`.analysis.response` has them."""
     factor = t_factor(found.dof) if found.dof > 0 else float("nan")
     gain, lag = np.abs(found.ratio), -np.angle(found.ratio)
     half = factor * np.sqrt(found.variance)

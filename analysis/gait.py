@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray
-from capture.errors import DataError
+from undulog.capture.arrays import BoolArray, ComplexArray
+from undulog.capture.errors import DataError
 
 from .estimators.harmonic import (
     HarmonicFit,

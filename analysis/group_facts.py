@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.robot import Robot
+from undulog.capture.robot import Robot
 
 from .fitting import GaitFit
 from .gait import phase_step, wave_name

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 from .estimators.harmonic import HarmonicFit, fit_at
 from .estimators.series import Series

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtr, chndtrinc, fdtrc, ndtri, stdtr
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from .estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from .response import CONFIDENCE, Response, around, t_factor

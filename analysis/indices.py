@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from capture.robot import Robot
+from undulog.capture.robot import Robot
 
 from .fitting import GaitFit
 from .heterogeneity import ENDS, KINDS, MIDDLE, energy_indices, index, response_indices
@@ -33,7 +33,7 @@ def heterogeneity_indices(
         warn: Told why an index is None.
 
     Returns:
-        Every index of :data:`analysis.heterogeneity.KINDS`, None where it can't be computed. Where
+        Every index of :data:`.analysis.heterogeneity.KINDS`, None where it can't be computed. Where
         both planes are driven each has its own, named e.g. ``gain_cv_horizontal``; where joints of
         one plane have several frequencies each group has its own, e.g. ``gain_cv_vertical_group1``.
     """

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
-from capture.log.power_topics import PowerTopic
-from capture.robot import Robot
-from capture.threads import in_threads
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.log.power_topics import PowerTopic
+from undulog.capture.robot import Robot
+from undulog.capture.threads import in_threads
 
 from .energy.joint import Energy, add_up, integrate, power_of
 from .estimators.series import Series, clean, coverage

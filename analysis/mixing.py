@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import gammainccinv
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from .estimators.harmonic import HarmonicFit, fit_at
 from .estimators.harmonic_moments import HarmonicModel, chunks

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from capture import Session
-from capture.errors import DataError, MissingChannelError
-from capture.following.session import MOST_JOINTS
-from capture.log.power_topics import PowerTopic
-from capture.log.signals import JointSignals, Signal
-from capture.robot import Robot
-from capture.strict_table import read_toml
+from undulog.capture import Session
+from undulog.capture.errors import DataError, MissingChannelError
+from undulog.capture.following.session import MOST_JOINTS
+from undulog.capture.log.power_topics import PowerTopic
+from undulog.capture.log.signals import JointSignals, Signal
+from undulog.capture.robot import Robot
+from undulog.capture.strict_table import read_toml
 
 from .body.null import DRAG_RATIO
 from .remarks import Lacking, Note

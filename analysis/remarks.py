@@ -1,8 +1,9 @@
 """What is missing or doubtful in a result, by what it changes for the reader.
 
-Whoever computes something takes a function of one sentence (:data:`analysis.reading.Warn`). A plain
-sentence is a warning. A :class:`Lacking` is a warning that stands first; a :class:`Note` changes
-nothing that a reader does: an optional topic that was not recorded, a figure that does not apply.
+Whoever computes something takes a function of one sentence (:data:`.analysis.reading.Warn`). A
+plain sentence is a warning. A :class:`Lacking` is a warning that stands first; a :class:`Note`
+changes nothing that a reader does: an optional topic that was not recorded, a figure that does not
+apply.
 """
 
 from __future__ import annotations

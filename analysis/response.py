@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 from .estimators.contrasts import ResponseErrors, response_errors
 from .estimators.spectrum import Noise, ResidualBins

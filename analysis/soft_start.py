@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
 
 from .estimators.cycle_sums import starts_of
 from .estimators.rotation import cos_sin

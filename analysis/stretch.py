@@ -8,11 +8,11 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import IntArray
-from capture.errors import DataError, LogError, UsageError
-from capture.log.signals import Signal
-from capture.log.unbroken import longest_unbroken
+from undulog.capture import Session
+from undulog.capture.arrays import IntArray
+from undulog.capture.errors import DataError, LogError, UsageError
+from undulog.capture.log.signals import Signal
+from undulog.capture.log.unbroken import longest_unbroken
 
 from .estimators.series import clean
 from .gait import MIN_CYCLES

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
-from capture import load_robot
-from capture.log.frames import DIR_RX, DIR_TX, FRAME_DTYPE, empty_frames
-from capture.robot import Direction
-from capture.robot.bus_map import database_messages
-from capture.strict_table import Faults
+from undulog.capture import load_robot
+from undulog.capture.log.frames import DIR_RX, DIR_TX, FRAME_DTYPE, empty_frames
+from undulog.capture.robot import Direction
+from undulog.capture.robot.bus_map import database_messages
+from undulog.capture.strict_table import Faults
 
 LATE_NS = 20_000_000
 STEP_S = 0.002

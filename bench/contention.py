@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capture import Session
+from undulog.capture import Session
 
 HERE = Path(__file__).parent
 BUSES = ("front", "rear")

@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
-from capture import load_robot
-from capture.daemon.live_feed import LiveFeed
-from capture.log.cdr import encode, layout_of
-from capture.log.schemas import message_type, schema_text
-from replay.viewer import LOOPBACK, free_ports, viewer_binary
+from undulog.capture import load_robot
+from undulog.capture.daemon.live_feed import LiveFeed
+from undulog.capture.log.cdr import encode, layout_of
+from undulog.capture.log.schemas import message_type, schema_text
+from undulog.replay.viewer import LOOPBACK, free_ports, viewer_binary
 
 TICK_S = 0.005
 RATE_HZ = 100

@@ -35,11 +35,11 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap_ros2.decoder import DecoderFactory
 
-from capture import Session
-from capture.console import progress
-from capture.log.joint_reader import OFFSET_TOPICS
-from capture.log.read_ahead import threads_or_default
-from capture.log.signals import JointSignals
+from undulog.capture import Session
+from undulog.capture.console import progress
+from undulog.capture.log.joint_reader import OFFSET_TOPICS
+from undulog.capture.log.read_ahead import threads_or_default
+from undulog.capture.log.signals import JointSignals
 
 Loaded = tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]
 

@@ -21,9 +21,9 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from capture import Session, SessionWriter
-from capture.arrays import FloatArray
-from capture.log.read_ahead import threads_or_default
+from undulog.capture import Session, SessionWriter
+from undulog.capture.arrays import FloatArray
+from undulog.capture.log.read_ahead import threads_or_default
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{i:02d}" for i in range(1, 26)]

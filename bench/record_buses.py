@@ -25,7 +25,7 @@ from pathlib import Path
 
 import contention
 
-from capture import Session
+from undulog.capture import Session
 
 HERE = Path(__file__).parent
 RATE = 9000.0

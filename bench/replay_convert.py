@@ -31,11 +31,11 @@ import numpy as np
 import rerun as rr
 from analyse_hour import cost, verdict
 
-from capture import Session
-from replay.samples.quantities import quantities
-from replay.samples.tracks import read_columns, wanted_fields
-from replay.scene.body import capsule_poses, capsule_shape
-from replay.scene.motion import assemble, frames_of, read_head
+from undulog.capture import Session
+from undulog.replay.samples.quantities import quantities
+from undulog.replay.samples.tracks import read_columns, wanted_fields
+from undulog.replay.scene.body import capsule_poses, capsule_shape
+from undulog.replay.scene.motion import assemble, frames_of, read_head
 
 HOUR_S = 3600
 CONVERT_S, SIZE_MB, PEAK_MB = 30.0, 350.0, 500.0
@@ -45,8 +45,8 @@ CONVERT = """
 import json, resource, sys, time
 from pathlib import Path
 start = time.perf_counter()
-from capture import Session
-from replay import write_recording
+from undulog.capture import Session
+from undulog.replay import write_recording
 with Session.open(sys.argv[1]) as session:
     write_recording(session, Path(sys.argv[2]))
 took = time.perf_counter() - start

@@ -25,12 +25,12 @@ import rerun as rr
 from hour_session import write_session
 from rerun.chunk import Chunk, LazyChunkStream
 
-from capture import Session
-from replay.beside.alignment import Align, align
-from replay.beside.merge import chunks_of, send
-from replay.beside.side import convert, read_side
-from replay.beside.write import Converted, write_beside
-from replay.viewer import viewer_binary
+from undulog.capture import Session
+from undulog.replay.beside.alignment import Align, align
+from undulog.replay.beside.merge import chunks_of, send
+from undulog.replay.beside.side import convert, read_side
+from undulog.replay.beside.write import Converted, write_beside
+from undulog.replay.viewer import viewer_binary
 
 BAR_S = 3.0
 """For the merge of the two recordings; what is written beside it is told."""

@@ -31,11 +31,11 @@ from typing import Any
 import can
 import numpy as np
 
-from capture import SessionWriter
-from capture.log.frames import FRAME_DTYPE, empty_frames
-from capture.sources.address import parse_address
-from capture.sources.contract import SourceContext
-from capture.sources.registry import open_source
+from undulog.capture import SessionWriter
+from undulog.capture.log.frames import FRAME_DTYPE, empty_frames
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import SourceContext
+from undulog.capture.sources.registry import open_source
 
 TICK_S = 0.005
 STREAM_S = 60.0

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from sim import load_scenario
-from sim.physics.engine import Kernels
-from sim.physics.ledger import TERMS
-from sim.scenario import CONTROL_RATE_HZ
-from sim.twin import Twin
+from undulog.sim import load_scenario
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.scenario import CONTROL_RATE_HZ
+from undulog.sim.twin import Twin
 
 FOLLOW, WALK = "target-following", "random-walk"
 UNTUNED = range(101, 131)

@@ -22,13 +22,13 @@ from collections.abc import Callable
 
 import pybullet
 
-from capture.robot import Plane, Robot
-from sim.gait import SerpentineGait
-from sim.physics.engine import EngineKind, Kernels
-from sim.readings import Readings
-from sim.scenario import CONTROL_RATE_HZ, Scenario
-from sim.scenario_file import load_scenario
-from sim.twin import Twin
+from undulog.capture.robot import Plane, Robot
+from undulog.sim.gait import SerpentineGait
+from undulog.sim.physics.engine import EngineKind, Kernels
+from undulog.sim.readings import Readings
+from undulog.sim.scenario import CONTROL_RATE_HZ, Scenario
+from undulog.sim.scenario_file import load_scenario
+from undulog.sim.twin import Twin
 
 LENGTHS = (12, 25, 50, 100)
 BUILT_IN = "PyBullet contacts + motors"

@@ -2,7 +2,7 @@
 
 ::
 
-    from capture import Session
+    from undulog.capture import Session
 
     with Session.open("run.mcap") as session:
         measured = session.joints("/joint_states", "position")
@@ -11,10 +11,13 @@
 Names are imported when first used, so that ``import capture`` costs nothing.
 """
 
+# pyright: reportUnusedImport=false
+
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from .lazy import attach
 
 if TYPE_CHECKING:
     from .log.session import Session
@@ -24,31 +27,16 @@ if TYPE_CHECKING:
     from .robot import Robot
     from .robot.description import load_robot, robot_names
 
-__all__ = [
-    "Channel",
-    "JointSignals",
-    "Robot",
-    "Session",
-    "SessionWriter",
-    "Signal",
-    "load_robot",
-    "robot_names",
-]
-
-_HOMES = {
-    "Channel": "log.topics",
-    "JointSignals": "log.signals",
-    "Robot": "robot",
-    "Session": "log.session",
-    "SessionWriter": "log.writer",
-    "Signal": "log.signals",
-    "load_robot": "robot.description",
-    "robot_names": "robot.description",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name from its module on first use."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'capture' has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+__getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
+    __name__,
+    {
+        "Channel": "log.topics",
+        "JointSignals": "log.signals",
+        "Robot": "robot",
+        "Session": "log.session",
+        "SessionWriter": "log.writer",
+        "Signal": "log.signals",
+        "load_robot": "robot.description",
+        "robot_names": "robot.description",
+    },
+)

@@ -16,7 +16,7 @@ def part_file(output: Path) -> Generator[Path]:
 
     Args:
         output: The file wanted; one of that name is replaced, so callers that must not replace it
-            ask :func:`capture.console.refuse_existing` before they start.
+            ask :func:`.capture.console.refuse_existing` before they start.
 
     Yields:
         Where to write.

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from analysis.estimators.series import Series
-from analysis.fitting import fit_gait
-from analysis.segments.examine import Chain, examine
-from capture.following import JointMotion, joints_not_following
-from capture.following.motion import Samples
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.fitting import fit_gait
+from undulog.analysis.segments.examine import Chain, examine
+from undulog.capture.following import JointMotion, joints_not_following
+from undulog.capture.following.motion import Samples
 
 GAIN, LAG = 0.95, np.radians(10.0)
 JOINTS = 9

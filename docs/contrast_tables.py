@@ -10,11 +10,11 @@ import sys
 import numpy as np
 from scipy.signal import lfilter
 
-from analysis.estimators.contrasts import contrast_variance, lag_contrast_variance
-from analysis.estimators.harmonic import fit_at
-from analysis.estimators.series import Series
-from analysis.estimators.spectrum import Noise, residual_spectrum
-from analysis.response import respond, t_factor
+from undulog.analysis.estimators.contrasts import contrast_variance, lag_contrast_variance
+from undulog.analysis.estimators.harmonic import fit_at
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.estimators.spectrum import Noise, residual_spectrum
+from undulog.analysis.response import respond, t_factor
 
 JOINTS, RATE, OMEGA = 9, 100.0, 2 * np.pi * 0.97
 AMPLITUDE, GAIN, LAG = 0.5, 0.9, 0.3

@@ -11,14 +11,14 @@ import dataclasses
 import tempfile
 from pathlib import Path
 
-from analysis.analyse import measure_session
-from analysis.energy.ledger import TERMS, booked_energies, whole_robot
-from analysis.joints import joint_energies
-from analysis.reading import RESPONSE_TOPIC, read_columns
-from capture import Session
-from sim import load_scenario, scenario_names
-from sim.physics.engine import Kernels
-from sim.record import record
+from undulog.analysis.analyse import measure_session
+from undulog.analysis.energy.ledger import TERMS, booked_energies, whole_robot
+from undulog.analysis.joints import joint_energies
+from undulog.analysis.reading import RESPONSE_TOPIC, read_columns
+from undulog.capture import Session
+from undulog.sim import load_scenario, scenario_names
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.recording import record
 
 BAR = 0.005
 """Largest error of an energy of the whole robot."""

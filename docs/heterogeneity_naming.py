@@ -21,14 +21,14 @@ from pathlib import Path
 import numpy as np
 from heterogeneity_tables import LEVEL, WAYS
 
-from analysis import analyse_session
-from analysis.reversal.mirror import mirror_test
-from analysis.reversal.modules import ordered_pairs
-from capture import Session
-from sim import Wave, load_scenario, parse_scenario
-from sim.modules import Modules
-from sim.physics.engine import Kernels
-from sim.record import record
+from undulog.analysis import analyse_session
+from undulog.analysis.reversal.mirror import mirror_test
+from undulog.analysis.reversal.modules import ordered_pairs
+from undulog.capture import Session
+from undulog.sim import Wave, load_scenario, parse_scenario
+from undulog.sim.modules import Modules
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.recording import record
 
 WEAKENED = (0.2, 0.1, 0.05)
 SCATTER = (0.05, 0.1, 0.3)

@@ -22,14 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis import analyse_session
-from analysis.reversal.mirror import mirror_test
-from analysis.reversal.modules import SIGNIFICANT, ordered_pairs
-from analysis.reversal.tilt import tilt_check
-from capture import Session
-from sim import load_scenario
-from sim.physics.engine import Kernels
-from sim.record import record
+from undulog.analysis import analyse_session
+from undulog.analysis.reversal.mirror import mirror_test
+from undulog.analysis.reversal.modules import SIGNIFICANT, ordered_pairs
+from undulog.analysis.reversal.tilt import tilt_check
+from undulog.capture import Session
+from undulog.sim import load_scenario
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.recording import record
 
 TILTS_DEG = (0.3, 1.0, 2.0)
 DIRECTIONS = {"fore-aft": 0.0, "sideways": math.pi / 2}

@@ -15,19 +15,19 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from analysis import analyse_session
-from analysis.reversal.mirror import (
+from undulog.analysis import analyse_session
+from undulog.analysis.reversal.mirror import (
     Strata,
     family_wise_p,
     label_scores,
     mirror_test,
     parts,
 )
-from analysis.reversal.modules import ordered_pairs
-from capture import Session
-from sim import load_scenario
-from sim.modules import Modules
-from sim.record import record
+from undulog.analysis.reversal.modules import ordered_pairs
+from undulog.capture import Session
+from undulog.sim import load_scenario
+from undulog.sim.modules import Modules
+from undulog.sim.recording import record
 
 LEVEL = 0.05
 WAYS = ("weak-servo-pi3", "weak-servo-pi3-reverse")

@@ -23,16 +23,16 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
-from analysis import analyse_session
-from analysis.results.analysis import Analysis, BodyPoint, Estimate
-from capture import Session
-from capture.arrays import FloatArray
-from capture.palette import joint_hex
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
-from sim import load_scenario
-from sim.control.laws import amplitude, bend, frequency
-from sim.record import record
-from sim.world import Cylinder, Wall, World
+from undulog.analysis import analyse_session
+from undulog.analysis.results.analysis import Analysis, BodyPoint, Estimate
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.palette import joint_hex
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.sim import load_scenario
+from undulog.sim.control.laws import amplitude, bend, frequency
+from undulog.sim.recording import record
+from undulog.sim.world import Cylinder, Wall, World
 
 GREY = "#8c8c8c"
 STONE = "#c9cdd3"

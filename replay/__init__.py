@@ -3,8 +3,8 @@
 ::
 
     from pathlib import Path
-    from capture import Session
-    from replay import write_recording
+    from undulog.capture import Session
+    from undulog.replay import write_recording
 
     with Session.open("run.mcap") as session:
         recording = write_recording(session, Path("run.rrd"))
@@ -13,22 +13,23 @@
 Names are imported when first used, so that ``import replay`` costs nothing.
 """
 
+# pyright: reportUnusedImport=false
+
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from undulog.capture.lazy import attach
 
 if TYPE_CHECKING:
     from .content import Content
     from .rrd import Recording, write_recording
 
-__all__ = ["Content", "Recording", "write_recording"]
-
-_HOMES = {"Content": "content", "Recording": "rrd", "write_recording": "rrd"}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name from its module."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+__getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
+    __name__,
+    {
+        "Content": "content",
+        "Recording": "rrd",
+        "write_recording": "rrd",
+    },
+)

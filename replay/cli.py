@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import UsageError
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import UsageError
 
 from .beside.options import BesideOptions
 from .clip.cli import ClipOptions, view_clip
@@ -133,8 +133,8 @@ def _view_file(
 
 
 def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording, float]:
-    from analysis.stretch import Options
-    from capture import Session
+    from undulog.analysis.stretch import Options
+    from undulog.capture import Session
 
     from .results import computed, saved
     from .samples.renamed import COMMANDS, STATES, RenamedSession

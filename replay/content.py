@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from capture.robot import Robot
+from undulog.capture.robot import Robot
 
 from .cycles.heat_maps import HeatMap
 from .cycles.mean_cycle import MeanCycle

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rerun as rr
 
-from capture import Session
-from capture.errors import DataError
-from capture.robot import Robot
-from capture.robot.kinematics import rotation_from_quaternion
+from undulog.capture import Session
+from undulog.capture.errors import DataError
+from undulog.capture.robot import Robot
+from undulog.capture.robot.kinematics import rotation_from_quaternion
 
 from . import facts
 from .content import Content, Signal, Start, signal_title

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 
 import rerun as rr
 
-from analysis.results.analysis import Analysis, GroupFacts
-from analysis.text.formats import utc
-from capture import Session
-from capture.console import plain
+from undulog.analysis.results.analysis import Analysis, GroupFacts
+from undulog.analysis.text.formats import utc
+from undulog.capture import Session
+from undulog.capture.console import plain
 
 from .content import Content
 from .layer import Named

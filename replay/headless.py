@@ -13,7 +13,7 @@ from typing import Self
 
 from rerun.experimental import View, ViewerClient
 
-from capture.errors import UndulogError
+from undulog.capture.errors import UndulogError
 
 from .samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .viewer import Viewer

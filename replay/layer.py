@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from analysis.cycles import CycleMaps
-from analysis.results.analysis import Analysis
+from undulog.analysis.cycles import CycleMaps
+from undulog.analysis.results.analysis import Analysis
 
 
 @dataclass(frozen=True)

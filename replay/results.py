@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from analysis.analyse import measure_session
-from analysis.compare.result import Comparison
-from analysis.cycles import cycle_maps
-from analysis.notebook.files import load
-from analysis.null_model.result import ModelledAnalysis
-from analysis.results.analysis import Analysis
-from analysis.results.experiment import Experiment
-from analysis.stretch import Options
-from analysis.text.formats import told_p
-from capture import Session
-from capture.errors import DataError, MissingChannelError, UndulogError
+from undulog.analysis.analyse import measure_session
+from undulog.analysis.compare.result import Comparison
+from undulog.analysis.cycles import cycle_maps
+from undulog.analysis.notebook.files import load
+from undulog.analysis.null_model.result import ModelledAnalysis
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.results.experiment import Experiment
+from undulog.analysis.stretch import Options
+from undulog.analysis.text.formats import told_p
+from undulog.capture import Session
+from undulog.capture.errors import DataError, MissingChannelError, UndulogError
 
 from .layer import Layer, Named
 

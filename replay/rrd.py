@@ -19,11 +19,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
-from analysis.cycles import CycleMaps
-from analysis.results.analysis import Analysis
-from capture import Session
-from capture.errors import LogWriteError
-from capture.part_file import part_file
+from undulog.analysis.cycles import CycleMaps
+from undulog.analysis.results.analysis import Analysis
+from undulog.capture import Session
+from undulog.capture.errors import LogWriteError
+from undulog.capture.part_file import part_file
 
 from .blueprint import build_blueprint
 from .content import Content

@@ -20,8 +20,8 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import quote
 
-from capture.errors import MissingExtraError, UndulogError, UsageError
-from capture.interruption import StopRequest, interruptible
+from undulog.capture.errors import MissingExtraError, UndulogError, UsageError
+from undulog.capture.interruption import StopRequest, interruptible
 
 LOOPBACK = "127.0.0.1"
 

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 from rerun.encodings import EntityPathLike
 
-from capture.robot import Plane, Robot
+from undulog.capture.robot import Plane, Robot
 
 from . import facts
 from .content import Content, Start

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import UsageError
-from capture.interruption import interruptible
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import UsageError
+from undulog.capture.interruption import interruptible
 
 if TYPE_CHECKING:
-    from .record import Recording
+    from .recording import Recording
     from .scenario import Scenario
 
 _UNWRAPPED = 1000  # columns: one scenario a line, for grep and the like
@@ -74,7 +74,7 @@ def run(
         json: Print one JSON object instead of text.
     """
     from .physics.engine import Kernels
-    from .record import record
+    from .recording import record
     from .scenario_file import load_scenario, read_changes
 
     if output.suffix != ".mcap":

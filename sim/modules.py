@@ -11,8 +11,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TypeAlias
 
-from capture.robot import Link, Robot, Servo
-from capture.strict_table import Table
+from undulog.capture.robot import Link, Robot, Servo
+from undulog.capture.strict_table import Table
 
 Fields: TypeAlias = Mapping[str, float]
 """Parameter name to value."""

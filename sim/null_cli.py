@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import UsageError
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import UsageError
 
 
 def null(
@@ -39,7 +39,7 @@ def null(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
-    from capture.null_model import write_null_model
+    from undulog.capture.null_model import write_null_model
 
     from .null_model import null_model
     from .physics.engine import Kernels

@@ -19,8 +19,8 @@ from itertools import combinations
 
 import numpy as np
 
-from capture.arrays import ComplexArray, frozen
-from capture.null_model import NullModel, SharedParameter
+from undulog.capture.arrays import ComplexArray, frozen
+from undulog.capture.null_model import NullModel, SharedParameter
 
 from .null_runs import (
     GROUND,

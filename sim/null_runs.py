@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.errors import UsageError
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.errors import UsageError
 
 from .gait import Serpentine
 from .modules import MASS_FACTOR, Modules

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from capture.arrays import FloatArray, frozen
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray, frozen
+from undulog.capture.robot import Robot
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Scenarios: what the twin is to run, complete.
 
-The TOML form is described in :mod:`sim.scenario_file`.
+The TOML form is described in :mod:`.sim.scenario_file`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import tomlkit
 
-from capture.errors import UsageError
-from capture.robot import Robot
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Robot
 
 from .control.parameters import Controller
 from .control.toml import controller_table

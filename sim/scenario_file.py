@@ -91,12 +91,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from capture.errors import Fault, ScenarioError, UsageError
-from capture.input_file import is_file
-from capture.robot import Plane, Robot
-from capture.robot.description import load_robot, robot_names
-from capture.shipped import Shelf
-from capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
+from undulog.capture.errors import Fault, ScenarioError, UsageError
+from undulog.capture.input_file import is_file
+from undulog.capture.robot import Plane, Robot
+from undulog.capture.robot.description import load_robot, robot_names
+from undulog.capture.shipped import Shelf
+from undulog.capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 
 from .control.toml import read_controller
 from .gait.toml import read_gait
@@ -109,7 +109,7 @@ from .world.push import read_pushes
 from .world.toml import read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
-_SHELF = Shelf("scenario", "sim", "scenarios", ScenarioError)
+_SHELF = Shelf("scenario", "undulog.sim", "scenarios", ScenarioError)
 
 
 def scenario_names() -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 What the sensors tell is written when it arrives at the robot's computer: ``header.stamp`` is the
 sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
 joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
-means over one control period (:mod:`sim.sensing.polling`). Their products miss what happens within
+means over one control period (:mod:`.sim.sensing.polling`). Their products miss what happens within
 a period, so each joint's powers are logged besides, accumulated at the physics rate. Commands,
 gait, odometry, powers and ledger are the twin's own; powers carry the middle of their period, the
 others the tick. Time is simulated: nothing of the machine's clock enters the file, and the same
@@ -19,10 +19,10 @@ from importlib.metadata import version
 
 import numpy as np
 
-from capture.log.power_topics import PowerTopic
-from capture.log.sensor_channels import open_sensor
-from capture.log.writer import SessionWriter
-from capture.robot.kinematics import rotation_from_quaternion
+from undulog.capture.log.power_topics import PowerTopic
+from undulog.capture.log.sensor_channels import open_sensor
+from undulog.capture.log.writer import SessionWriter
+from undulog.capture.robot.kinematics import rotation_from_quaternion
 
 from .physics.energy_flows import JOINT_TERMS
 from .physics.engine import Kernels
@@ -44,7 +44,7 @@ _POWER_TERMS = {
     PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
     PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
 }
-"""Rows of :attr:`sim.twin.Sample.joint_energy` whose rates of change are logged."""
+"""Rows of :attr:`.sim.twin.Sample.joint_energy` whose rates of change are logged."""
 
 _POWER_PER_W = float(2**24)
 """Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes."""

@@ -7,9 +7,9 @@ import time
 from collections.abc import Mapping
 from queue import Empty, Full, Queue
 
-from capture.errors import SimulationError, SourceError, UndulogError, UsageError
-from capture.robot import ClockDomain, Robot
-from capture.sources.contract import (
+from undulog.capture.errors import SimulationError, SourceError, UndulogError, UsageError
+from undulog.capture.robot import ClockDomain, Robot
+from undulog.capture.sources.contract import (
     Polled,
     SourceAddress,
     SourceContext,

@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Plane, Robot
 
 from .physics.servo import COULOMB_SPEED, Servos
 from .scenario import Scenario
@@ -243,7 +243,7 @@ def _obstacle_parts(
     """An obstacle at the end of a link, the one with the least mass behind it.
 
     Obstacles push sideways only. Their friction is at most a damper that stops the link, were it
-    free, within one step, however hard it is pressed (:mod:`sim.world.obstacle_contact`).
+    free, within one step, however hard it is pressed (:mod:`.sim.world.obstacle_contact`).
     """
     if plane is Plane.VERTICAL or not scenario.world.obstacles:
         return

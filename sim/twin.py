@@ -13,8 +13,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import SimulationError
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import SimulationError
 
 from .control.build import build_gait
 from .gait import Gait, GaitTick
@@ -44,10 +44,10 @@ class Sample(NamedTuple):
         step: Body, ground, rotors and servos at this instant.
         sensed: The sensors' samples that have arrived since the tick before; the newest ones
             arrive after the run, by :meth:`Twin.flush`.
-        energy: The ledger up to here [J], as :data:`sim.physics.ledger.TERMS`, shape (23,).
+        energy: The ledger up to here [J], as :data:`.sim.physics.ledger.TERMS`, shape (23,).
         contact_s: For how long each link has touched an obstacle so far [s], shape (n,).
         joint_energy: The part of each joint in it [J], rows as
-            :data:`sim.physics.energy_flows.JOINT_TERMS`, shape (9, m).
+            :data:`.sim.physics.energy_flows.JOINT_TERMS`, shape (9, m).
     """
 
     tick: int

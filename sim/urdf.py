@@ -13,9 +13,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Joint, Link, Plane, Robot
-from capture.robot.kinematics import rotation_from_quaternion
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Joint, Link, Plane, Robot
+from undulog.capture.robot.kinematics import rotation_from_quaternion
 
 _AXES = {Plane.HORIZONTAL: "0 0 1", Plane.VERTICAL: "0 1 0"}
 _ALONG_X = "0 1.5707963267948966 0"  # a URDF cylinder lies along z

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from capture.errors import DataError, LogError
-from capture.robot import Plane, Robot
+from undulog.capture import Session
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.errors import DataError, LogError
+from undulog.capture.robot import Plane, Robot
 
 from ..estimators.series import Series
 from ..fitting import GaitFit

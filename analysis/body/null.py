@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray
+from undulog.capture.robot import Plane, Robot
 
 DRAG_RATIO = 10.0
 """K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.robot import Plane, Robot
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.robot import Plane, Robot
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from ..estimators.harmonic import HarmonicFit, HarmonicModel, fit_at
 from ..estimators.series import Series

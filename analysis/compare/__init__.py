@@ -2,8 +2,8 @@
 
 ::
 
-    from analysis import compare_sessions
-    from capture import Session
+    from undulog.analysis import compare_sessions
+    from undulog.capture import Session
 
     with Session.open("before.mcap") as before, Session.open("after.mcap") as after:
         print(compare_sessions(before, after))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.errors import DataError
+from undulog.capture.errors import DataError
 
 from ..experiment.runs import (
     SAME_COMMAND,

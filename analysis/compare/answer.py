@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.analysis import Estimate, leaves_out_zero
 from ..text import formats

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.answer import Answer, NotFollowing, StandOut
 from ..segments.examine import OFFSET_RAD

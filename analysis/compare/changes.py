@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-from capture import Session
-from capture.strict_table import read_toml
+from undulog.capture import Session
+from undulog.capture.strict_table import read_toml
 
 from .result import Change
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress
-from capture.errors import UsageError
-from capture.part_file import write_text
+from undulog.capture.console import emit_json, progress
+from undulog.capture.errors import UsageError
+from undulog.capture.part_file import write_text
 
 from ..command_line import PAGES, check_output, chosen, opened, show
 

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from capture import Session
-from capture.environment import base_versions
-from capture.errors import UsageError
+from undulog.capture import Session
+from undulog.capture.environment import base_versions
+from undulog.capture.errors import UsageError
 
 from ..reading import Warn
 from ..response import CONFIDENCE, around, t_factor

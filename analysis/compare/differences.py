@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
-from capture.arrays import FloatArray
-from capture.errors import UsageError
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import UsageError
 
 from ..response import CONFIDENCE, welch_satterthwaite
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
-from capture.errors import DataError, LogError
-from capture.robot import Robot
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import DataError, LogError
+from undulog.capture.robot import Robot
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from ..body.motion import ODOMETRY_TOPIC, head_poses
 from ..estimators.series import Series

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
 
 from ..analyse import Measured, measure_session
 from ..experiment.runs import GaitRun, gait_run

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..command_line import UNLIMITED
 from ..text import formats

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.log.signals import Signal
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.log.signals import Signal
 
 from ..estimators.series import Series, clean, shared_times
 from ..fitting import GaitFit

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..response import t_factor
 from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
@@ -56,7 +56,7 @@ class Fitted:
     """One joint's fit.
 
     Attributes:
-        parameters: As :data:`analysis.dead_band.model.PARAMETERS`, shape (5,).
+        parameters: As :data:`.analysis.dead_band.model.PARAMETERS`, shape (5,).
         gain: Of the position over the follower.
         travel: W after top and bottom, with lower and upper end [rad], shape (2, 3).
         step: b of both, the same [rad of the command], shape (2, 3).

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
-from capture.log.signals import Signal
+from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.log.signals import Signal
 
 from ..estimators.series import Series
 from ..reading import Columns

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 
 def rested(command: FloatArray, width: float, top: float, bottom: float) -> FloatArray:

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
 
 from ..joints import Energies, Span
 from ..reading import Columns, Warn

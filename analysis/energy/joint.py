@@ -3,7 +3,7 @@
 E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
 can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
 times motor current, signed and clipped. Where the log has the powers themselves, accumulated within
-each sampling interval (:class:`capture.log.power_topics.PowerTopic`), their means are added up;
+each sampling interval (:class:`.capture.log.power_topics.PowerTopic`), their means are added up;
 else sampled factors are multiplied, and what the two do within an interval is lost. Gaps are not
 bridged: no time inside them counts.
 """
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray
-from capture.log.signals import Signal
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.log.signals import Signal
 
 from ..estimators.cycle_sums import Weighed, cycle_sums, weigh
 from ..estimators.series import Series, clean

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from capture import Session
-from capture.errors import DataError, LogError
+from undulog.capture import Session
+from undulog.capture.errors import DataError, LogError
 
 from ..estimators.series import clean
 from ..joints import Energies, Span

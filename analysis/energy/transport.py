@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 from ..compare.motion import GRAVITY, body_steps
 from ..estimators.series import Series

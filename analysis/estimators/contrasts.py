@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.arrays import ComplexArray, FloatArray, IntArray
 
 from .spectrum import ResidualBins
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import DataError
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import DataError
 
 from .rotation import cos_sin
 from .series import Series

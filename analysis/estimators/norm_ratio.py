@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from scipy.special import chdtri
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 from ..response import CONFIDENCE
 from ..results.analysis import Estimate

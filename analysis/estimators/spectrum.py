@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from capture.threads import in_threads
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.threads import in_threads
 
 from .harmonic import HarmonicFit
 from .harmonic_moments import (

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import ComplexArray
-from capture.environment import base_versions
-from capture.errors import UsageError
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.arrays import ComplexArray
+from undulog.capture.environment import base_versions
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Robot
 
 from ..analyse import Examined, examine_session
 from ..coupling import one_gait_coupling

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from capture.arrays import ComplexArray
+from undulog.capture.arrays import ComplexArray
 
 from ..heterogeneity import spread
 from ..results.analysis import Index, Interval

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray, frozen
-from capture.errors import UsageError
+from undulog.capture.arrays import ComplexArray, FloatArray, frozen
+from undulog.capture.errors import UsageError
 
 from ..response import Response
 

@@ -14,8 +14,8 @@ from itertools import zip_longest
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray, IntArray
-from capture.robot import Robot
+from undulog.capture.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.robot import Robot
 
 from ..fitting import GaitFit
 from ..gait import phase_step, wave_name

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..command_line import UNLIMITED
 from ..kicks.answer import kick_detail

@@ -8,10 +8,10 @@ from itertools import chain
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
-from capture.log.signals import Signal
-from capture.threads import in_threads
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.log.signals import Signal
+from undulog.capture.threads import in_threads
 
 from ..estimators.series import Series, clean_together
 from ..gait import DRIVEN_SHARE

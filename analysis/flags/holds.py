@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import binom
 
-from capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import Series
 from ..results.artefact import Span

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import Series
 from ..results.artefact import Span

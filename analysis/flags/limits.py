@@ -9,10 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
-from capture.robot import Joint, Servo
-from capture.strict_table import read_toml
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Joint, Servo
+from undulog.capture.strict_table import read_toml
 
 from ..estimators.series import Series
 from ..results.artefact import Span

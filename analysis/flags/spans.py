@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import GAP_FACTOR
 from ..results.artefact import Span

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import ComplexArray
+from undulog.capture.arrays import ComplexArray
 
 from ..reading import Warn
 from ..response import CONFIDENCE

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 from ..experiment.runs import SAME_FREQUENCY, GaitRun
 from ..fitting import GaitFit

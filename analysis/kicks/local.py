@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.errors import UsageError
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.errors import UsageError
 
 from ..estimators.norm_ratio import noise_draws, norm_ratio
 from ..response import CONFIDENCE, welch_satterthwaite
@@ -200,7 +200,7 @@ def nonlinearity(
 
     Returns:
         ||(G - P, S + R)|| / ||(P, R)|| (Frobenius), with what noise adds taken off; interval by
-        :func:`analysis.estimators.norm_ratio.norm_ratio`.
+        :func:`.analysis.estimators.norm_ratio.norm_ratio`.
     """
     m = len(P.value)
     noise = noise_draws(stacked(((P, S), (R, G)), correlation), seed)

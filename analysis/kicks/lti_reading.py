@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 from ..estimators.norm_ratio import noise_draws, norm_ratio
 from ..results.analysis import Estimate

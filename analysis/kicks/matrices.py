@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 from ..response import CONFIDENCE
 from .local import Answers, Measured, RowSums, central_differences, row_sums

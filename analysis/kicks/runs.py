@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray
+from undulog.capture.arrays import BoolArray, ComplexArray
 
 SAME = 0.01
 """A command that deviates by less, in phase [rad] or log amplitude, is the base's still."""

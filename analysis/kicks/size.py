@@ -21,7 +21,7 @@ from .scatter import sides
 
 RESOLVED = 0.1
 """Coupling between joints that kicks should be able to show: what the robot's body brings back with
-more counts as strong (:data:`analysis.oscillators.laplacian.STRONG`)."""
+more counts as strong (:data:`.analysis.oscillators.laplacian.STRONG`)."""
 
 CURVED = 0.3
 """Second order over first order, from which the third may be a tenth of the first."""

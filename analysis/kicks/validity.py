@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 BETTER = 2.0
 """P holds where it predicts so many times better than 'each joint keeps its H_i'."""

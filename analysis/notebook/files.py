@@ -9,10 +9,10 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
-from capture.console import refuse_existing
-from capture.errors import DataError, MissingExtraError
-from capture.input_file import read_input
-from capture.part_file import part_file, write_text
+from undulog.capture.console import refuse_existing
+from undulog.capture.errors import DataError, MissingExtraError
+from undulog.capture.input_file import read_input
+from undulog.capture.part_file import part_file, write_text
 
 from ..command_line import check_output
 from ..compare.result import Comparison
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .shown import Shown
 
 _NAMES = {**vars(oscillators), **vars(result_energy), **vars(result_over_time)}
-"""Types that :mod:`analysis.results.analysis` names for type checkers only."""
+"""Types that :mod:`.analysis.results.analysis` names for type checkers only."""
 
 _KINDS: tuple[type[Shown], ...] = (
     Analysis,
@@ -47,7 +47,7 @@ _KINDS: tuple[type[Shown], ...] = (
 
 
 def save(result: Shown, path: Path, *, force: bool) -> Path:
-    """Write a result as JSON; see :meth:`analysis.notebook.shown.Shown.save`.
+    """Write a result as JSON; see :meth:`.analysis.notebook.shown.Shown.save`.
 
     Args:
         result: The result.
@@ -68,7 +68,7 @@ def save(result: Shown, path: Path, *, force: bool) -> Path:
 
 
 def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
-    """Write the tables as Parquet; see :meth:`analysis.notebook.shown.Shown.to_parquet`.
+    """Write the tables as Parquet; see :meth:`.analysis.notebook.shown.Shown.to_parquet`.
 
     Args:
         result: The result.

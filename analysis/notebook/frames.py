@@ -39,7 +39,7 @@ Frames = dict[str, pd.DataFrame]
 
 @singledispatch
 def frames_of(result: object) -> Frames:
-    """The tables of a result; see :meth:`analysis.notebook.shown.Shown.frames`.
+    """The tables of a result; see :meth:`.analysis.notebook.shown.Shown.frames`.
 
     Args:
         result: A result of this package.

@@ -10,8 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capture.console import plain
-from capture.part_file import write_text
+from undulog.capture.console import plain
+from undulog.capture.part_file import write_text
 
 from ..command_line import check_output
 
@@ -118,4 +118,6 @@ def figure_rules() -> str:
 
 
 def _style() -> str:
-    return files("analysis.report").joinpath("templates/style.css").read_text(encoding="utf-8")
+    return (
+        files("undulog.analysis.report").joinpath("templates/style.css").read_text(encoding="utf-8")
+    )

@@ -7,7 +7,7 @@ from functools import partial, singledispatch
 from itertools import count
 from typing import TYPE_CHECKING
 
-from capture.errors import MissingExtraError, UsageError
+from undulog.capture.errors import MissingExtraError, UsageError
 
 from ..compare.result import Comparison
 from ..results.analysis import Analysis, Coupling
@@ -24,7 +24,7 @@ _number = count(1)
 
 
 def picture_of(result: object, what: str | None = None) -> Picture:
-    """Draw a result; see :meth:`analysis.notebook.shown.Shown.plot`.
+    """Draw a result; see :meth:`.analysis.notebook.shown.Shown.plot`.
 
     Args:
         result: A result of this package.

@@ -16,7 +16,7 @@ _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.DataFrame:
     """Dataclasses of one kind as a table.
 
-    An :class:`~analysis.results.analysis.Estimate` named ``lag_rad`` becomes ``lag_rad``,
+    An :class:`~.analysis.results.analysis.Estimate` named ``lag_rad`` becomes ``lag_rad``,
     ``lag_low_rad`` and ``lag_high_rad``; a field ``ci95`` becomes ``low`` and ``high``; tuples of
     words are joined by spaces. Fields that hold other structures are left out.
 

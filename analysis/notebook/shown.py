@@ -15,7 +15,7 @@ class Shown:
     """A result that prints, plots, becomes tables, and goes to files and back.
 
     The first line printed is the answer. ``frames`` gives the numbers as pandas tables whose
-    columns carry their units; ``analysis.load`` reads what ``save`` wrote.
+    columns carry their units; ``undulog.analysis.load`` reads what ``save`` wrote.
     """
 
     def __str__(self) -> str:
@@ -26,7 +26,7 @@ class Shown:
 
     def __repr__(self) -> str:
         """The answer in one line."""
-        from capture.console import plain
+        from undulog.capture.console import plain
 
         from .text import headline_of
 

@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..compare.result import Comparison
 from ..compare.table import render_comparison

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from capture import Session
-from capture.errors import UsageError
-from capture.null_model import NullModel, read_null_model
+from undulog.capture import Session
+from undulog.capture.errors import UsageError
+from undulog.capture.null_model import NullModel, read_null_model
 
 from ..analyse import Measured, measure_session
 from ..experiment.runs import SAME_COMMAND, SAME_FREQUENCY

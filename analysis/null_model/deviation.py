@@ -2,7 +2,7 @@
 
 Let y = ln(response / command) of m joints have the covariance S, block-diagonal by joints, and let
 the model say f(x) for identical modules whose shared parameters are exp(x) times the assumed ones,
-x known beforehand up to a covariance P (:mod:`capture.null_model`). Then, by generalised least
+x known beforehand up to a covariance P (:mod:`.capture.null_model`). Then, by generalised least
 squares::
 
     Q = min r' S^-1 r + x' P^-1 x,    r = y - f(x) - D z
@@ -24,9 +24,9 @@ from typing import cast
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray, IntArray, frozen
-from capture.errors import DataError
-from capture.null_model import NullModel
+from undulog.capture.arrays import ComplexArray, FloatArray, IntArray, frozen
+from undulog.capture.errors import DataError
+from undulog.capture.null_model import NullModel
 
 from ..response import CONFIDENCE, Response
 from ..reversal.mirror import parts

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtridf
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..estimators.norm_ratio import noise_draws
 from ..response import CONFIDENCE

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import fdtrc
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 from ..response import CONFIDENCE, around, t_factor
 from ..results.analysis import Estimate

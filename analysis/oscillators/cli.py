@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from capture.console import emit_json
-from capture.errors import DataError, UsageError
+from undulog.capture.console import emit_json
+from undulog.capture.errors import DataError, UsageError
 
 from ..command_line import check_output, chosen, show
 
@@ -61,7 +61,7 @@ def predict(
     from dataclasses import asdict
     from json import dumps
 
-    from capture.part_file import write_text
+    from undulog.capture.part_file import write_text
 
     from ..cli import experiment_of
     from .loop_text import render_loop

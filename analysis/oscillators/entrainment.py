@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..estimators.norm_ratio import Noisy
 from ..response import CONFIDENCE

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import eig
 from scipy.optimize import linear_sum_assignment
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 from ..estimators.norm_ratio import Noisy, noise_draws
 from ..response import CONFIDENCE

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import BoolArray, FloatArray, IntArray
-from capture.errors import MissingChannelError
-from capture.log.signals import JointSignals, Signal
+from undulog.capture import Session
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.errors import MissingChannelError
+from undulog.capture.log.signals import JointSignals, Signal
 
 from ..reading import RESPONSE_TOPIC, planes_of
 

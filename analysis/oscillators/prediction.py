@@ -13,8 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import expm
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.errors import DataError, UsageError
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.errors import DataError, UsageError
 
 from ..estimators.norm_ratio import noise_draws
 from ..kicks.local import Measured, stacked

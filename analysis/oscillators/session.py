@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from capture import Session
+from undulog.capture import Session
 
 from .chain import chain_coupling
 from .phase_log import read_phases

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, say
-from capture.errors import UsageError
+from undulog.capture.console import emit_json, say
+from undulog.capture.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -120,7 +120,7 @@ def _plan(
     runs, settle_s, measure_s = numbers
     if runs < 1 or settle_s < 0 or measure_s <= 0:
         raise UsageError("--runs is at least 1, --settle at least 0, --measure more than 0")
-    from capture import Session
+    from undulog.capture import Session
 
     from .gait_base import base_gait
     from .write import write_plan

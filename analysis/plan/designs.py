@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from capture.arrays import ComplexArray
+from undulog.capture.arrays import ComplexArray
 
 from ..reversal.posture import HEADING
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import ComplexArray, FloatArray
-from capture.errors import UsageError
+from undulog.capture import Session
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.errors import UsageError
 
 from ..analyse import examine_session
 from ..reading import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns

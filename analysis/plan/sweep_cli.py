@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from capture.console import say
-from capture.errors import UsageError
+from undulog.capture.console import say
+from undulog.capture.errors import UsageError
 
 from .cli import announce
 
 if TYPE_CHECKING:
-    from capture import Session
+    from undulog.capture import Session
 
     from .designs import PlannedRun
     from .gait_base import BaseGait
@@ -126,7 +126,7 @@ def _plan(
     amplitude, runs, settle_s = numbers
     if amplitude <= 0 or runs < 1:
         raise UsageError("--amplitude is more than 0, --runs at least 1")
-    from capture import Session
+    from undulog.capture import Session
 
     from .gait_base import base_gait
     from .write import write_plan

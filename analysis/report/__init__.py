@@ -2,8 +2,8 @@
 
 ::
 
-    from capture import Session
-    from analysis.report import render
+    from undulog.capture import Session
+    from undulog.analysis.report import render
 
     with Session.open("run.mcap") as session:
         page = render(analysis, session)  # one page; a sequence of both for several sessions
@@ -25,7 +25,7 @@ __all__ = ["render"]
 def __getattr__(name: str) -> Any:
     """Import ``render`` on first use."""
     if name != "render":
-        raise AttributeError(f"module 'analysis.report' has no attribute {name!r}")
+        raise AttributeError(f"module 'undulog.analysis.report' has no attribute {name!r}")
     from .page import render
 
     return render

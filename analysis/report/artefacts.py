@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.analysis import Analysis, JointResult
 from ..results.artefact import KINDS, Artefact, Span

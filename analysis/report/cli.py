@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, say
-from capture.errors import UsageError
-from capture.part_file import write_text
+from undulog.capture.console import emit_json, progress, say
+from undulog.capture.errors import UsageError
+from undulog.capture.part_file import write_text
 
 from ..command_line import PAGES, check_output, chosen
 
@@ -66,7 +66,7 @@ def report(
 
 def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
     """The page on one session, its answer, and how many warnings are in it."""
-    from capture import Session
+    from undulog.capture import Session
 
     from ..analyse import measure_session
     from ..cycles import cycle_maps

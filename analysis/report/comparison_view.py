@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from capture.palette import joint_hex
+from undulog.capture.palette import joint_hex
 
 from ..compare.answer import WORDS, in_people_units, signed
 from ..compare.decisions import SIGNIFICANT

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from capture.palette import joint_hex
+from undulog.capture.palette import joint_hex
 
 from ..results.analysis import Estimate
 from .drawn import WIDTH_IN, Drawing, joint_ticks, key, legend

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from markupsafe import Markup, escape
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 
 def element(name: str, *children: object, **attributes: object) -> Markup:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from capture.arrays import FloatArray, frozen
-from capture.palette import joint_hex
+from undulog.capture.arrays import FloatArray, frozen
+from undulog.capture.palette import joint_hex
 
 from ..results.analysis import Estimate, leaves_out_zero
 from ..results.experiment import Experiment, Reversal

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.palette import joint_hex
+from undulog.capture.arrays import FloatArray
+from undulog.capture.palette import joint_hex
 
 from ..results.analysis import BodyPoint, BodyResult
 from ..text.formats import (

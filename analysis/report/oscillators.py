@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..oscillators.result import BodyOscillators, ChainCoupling
 from ..oscillators.text import chain_detail

@@ -13,10 +13,10 @@ from importlib.resources import files
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from capture import Session
-from capture.console import plain
-from capture.errors import UsageError
-from capture.palette import joint_hex
+from undulog.capture import Session
+from undulog.capture.console import plain
+from undulog.capture.errors import UsageError
+from undulog.capture.palette import joint_hex
 
 from ..compare.result import Comparison
 from ..cycles import CycleMaps
@@ -55,7 +55,7 @@ def render(
         result: The numbers.
         session: The open session of an ``Analysis``, for what is drawn from its samples; None
             where it is not at hand.
-        cycles: Of an ``Analysis``, from :func:`analysis.cycles.cycle_maps`; None goes without maps.
+        cycles: Of an ``Analysis``, from :func:`.analysis.cycles.cycle_maps`; None: no maps.
 
     Returns:
         One HTML page without outside references; the same input gives the same text.
@@ -85,7 +85,9 @@ def _page(
     *,
     left_out: bool,
 ) -> str:
-    style = files("analysis.report").joinpath("templates/style.css").read_text(encoding="utf-8")
+    style = (
+        files("undulog.analysis.report").joinpath("templates/style.css").read_text(encoding="utf-8")
+    )
     if isinstance(result, Experiment):
         template, view = "experiment.html.j2", experiment_view(result)
     elif isinstance(result, Comparison):
@@ -122,7 +124,7 @@ def _shown(value: object) -> object:
 @cache
 def _environment() -> Environment:
     environment = Environment(
-        loader=PackageLoader("analysis.report"),
+        loader=PackageLoader("undulog.analysis.report"),
         autoescape=True,
         finalize=_shown,
         undefined=StrictUndefined,

@@ -7,7 +7,7 @@ from statistics import fmean
 
 import numpy as np
 
-from capture.palette import joint_hex
+from undulog.capture.palette import joint_hex
 
 from ..results.analysis import Estimate, JointResult
 from ..text.formats import degrees, estimate, number

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from capture import Session
-from capture.palette import joint_hex
+from undulog.capture import Session
+from undulog.capture.palette import joint_hex
 
 from ..cycles import CycleMaps
 from ..results.analysis import Analysis, JointResult

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray, frozen
-from capture.errors import DataError, MissingChannelError
-from capture.palette import joint_hex
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray, frozen
+from undulog.capture.errors import DataError, MissingChannelError
+from undulog.capture.palette import joint_hex
 
 from ..results.analysis import Analysis, JointResult
 from ..text.formats import degrees, estimate, short

@@ -19,7 +19,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as _Figure
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 Figure: TypeAlias = Any
 Axes: TypeAlias = Any

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.analysis import Analysis, Estimate, JointResult
 from ..text import formats

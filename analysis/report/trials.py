@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.analysis import Coupling, Estimate, Index
 from ..results.coupling import LocalCoupling, RowCheck

@@ -6,7 +6,7 @@ import re
 
 from markupsafe import Markup, escape
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..text import formats
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.palette import joint_hex
+from undulog.capture.palette import joint_hex
 
 from ..compare.result import Comparison
 from ..text.formats import short

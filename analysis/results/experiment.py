@@ -1,7 +1,7 @@
 """What several sessions of one experiment say together.
 
 ``Experiment.to_dict`` is the object that ``undulog analyse A.mcap B.mcap ... --json`` prints. As in
-:mod:`analysis.results.analysis`, what could not be computed is None (null), and ``warnings`` says
+:mod:`.analysis.results.analysis`, what could not be computed is None (null), and ``warnings`` says
 why.
 """
 
@@ -221,8 +221,8 @@ class Experiment(Shown):
         heterogeneity: Index name to index, from all runs together.
         reversal: None where it can't be tested; a warning says why.
         coupling: Identifiable or not; from kicks around one gait a
-            :class:`analysis.results.coupling.LocalCoupling`, from a sweep without contact a
-            :class:`analysis.results.sweep.LinearCoupling`.
+            :class:`.analysis.results.coupling.LocalCoupling`, from a sweep without contact a
+            :class:`.analysis.results.sweep.LinearCoupling`.
         warnings: One sentence each.
         provenance: How it was made.
         oscillators: From kicks around one gait: how oscillators that feel their servos would

@@ -40,8 +40,8 @@ from typing import Self
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
-from capture.errors import UsageError
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
+from undulog.capture.errors import UsageError
 
 from ..response import CONFIDENCE, welch_satterthwaite
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
+from undulog.capture.arrays import ComplexArray, FloatArray
 
 from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response import around

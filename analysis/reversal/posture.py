@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.robot import Sensor, SensorKind
+from undulog.capture import Session
+from undulog.capture.robot import Sensor, SensorKind
 
 from ..as_run import scenario_of, start_heading_rad
 from ..results.analysis import Window

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from ..response import CONFIDENCE
 from ..results.analysis import Estimate, Interval

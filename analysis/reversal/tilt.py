@@ -13,7 +13,7 @@ It differs from one bad module in three ways:
   make some hundredths. That it doesn't lean excludes nothing: an offset may hide it.
 
 The first two are statements about the size of effects, not theorems: measured on the twin in
-docs/heterogeneity.md. Runs with the robot turned by half a turn (:mod:`analysis.reversal.mirror`)
+docs/heterogeneity.md. Runs with the robot turned by half a turn (:mod:`.analysis.reversal.mirror`)
 need none of them.
 """
 
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.arrays import ComplexArray, FloatArray, IntArray
 
 from ..response import CONFIDENCE, around, t_factor
 from ..results.analysis import Estimate, Interval

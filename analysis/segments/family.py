@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..estimators.contrasts import ResponseErrors
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot import Robot
 
 from ..experiment.pooling import PooledResponse
 from ..reading import by_plane

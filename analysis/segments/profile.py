@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 from .family import Member, Scatter
 

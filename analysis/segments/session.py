@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray
-from capture.following import Fault, JointMotion, joints_not_following
-from capture.following.motion import BLOCKS, Samples
-from capture.following.session import motions_of
-from capture.following.windows import COHERENT
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.following import Fault, JointMotion, joints_not_following
+from undulog.capture.following.motion import BLOCKS, Samples
+from undulog.capture.following.session import motions_of
+from undulog.capture.following.windows import COHERENT
+from undulog.capture.robot import Robot
 
 from ..fitting import GaitFit
 from ..gait import DRIVEN_SHARE

@@ -30,8 +30,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.robot import Servo
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.robot import Servo
 
 from ..estimators.norm_ratio import DRAWS
 from ..response import CONFIDENCE, welch_satterthwaite

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.arrays import ComplexArray
-from capture.errors import DataError
-from capture.robot import Servo
+from undulog.capture.arrays import ComplexArray
+from undulog.capture.errors import DataError
+from undulog.capture.robot import Servo
 
 from ..as_run import robot_as_run
 from ..kicks.lti_reading import SINGULAR, reciprocity

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtrc
 
-from capture import Session
-from capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from capture.errors import DataError
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.errors import DataError
+from undulog.capture.robot import Robot
 
 from ..as_run import physics_step_s, scenario_of, touches
 from ..estimators.series import Series

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import BoolArray, ComplexArray, FloatArray
+from undulog.capture import Session
+from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray
 
 from ..analyse import Examined
 from ..estimators.series import Series, clean

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..estimators.series import Series
 from ..gait import NYQUIST_SHARE

@@ -2,7 +2,7 @@
 
 The model of a channel is y(t) = b + Re sum_l a_l exp(j omega_l t) with the omega_l given, fitted on
 the channel's own sampling times. The noise of each line is read from the residual's periodogram in
-the nearest bins beside it that the fit has left alone, as in :mod:`analysis.estimators.spectrum`.
+the nearest bins beside it that the fit has left alone, as in :mod:`.analysis.estimators.spectrum`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import ComplexArray, FloatArray
-from capture.errors import DataError
+from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.errors import DataError
 
 from ..estimators.harmonic_moments import RELATIVE_FLOOR
 from ..estimators.series import Series, shared_times

@@ -12,8 +12,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from capture.console import plain
-from capture.following import KINDS as FAULT_KINDS
+from undulog.capture.console import plain
+from undulog.capture.following import KINDS as FAULT_KINDS
 
 from ..results.analysis import Estimate, GaitFacts, Index, JointResult
 from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
@@ -134,7 +134,7 @@ def kinds_in_words(kinds: Sequence[str]) -> str:
     """Kinds of fault that fit, as a reader takes them.
 
     Args:
-        kinds: Keys of :data:`capture.following.KINDS`.
+        kinds: Keys of :data:`.capture.following.KINDS`.
 
     Returns:
         For example ``jammed, dead or a frozen sensor``.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from capture import Session
+from undulog.capture import Session
 
 from ..fitting import GaitFit
 from ..reading import Warn

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.analysis import Estimate, GaitFacts, Interval
 

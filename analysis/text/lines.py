@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..results.analysis import Analysis, Estimate
 from ..results.energy import EnergyResult

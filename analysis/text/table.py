@@ -8,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from capture.console import plain
+from undulog.capture.console import plain
 
 from ..command_line import UNLIMITED
 from ..null_model.result import ModelledAnalysis, told_null

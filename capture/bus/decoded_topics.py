@@ -5,7 +5,7 @@ A velocity or effort that comes in frames of its own, as in the replies of RMD m
 times and goes to ``/joint_velocity`` or ``/joint_effort``: putting it beside a position would make
 one of the two up.
 
-Joints that are sampled in turn share a message a round (:mod:`capture.bus.cycles`); their own
+Joints that are sampled in turn share a message a round (:mod:`.capture.bus.cycles`); their own
 times are logged beside it, as sample time minus stamp, on the topic's offset topic.
 """
 
@@ -102,7 +102,7 @@ class DecodedTopics:
         """Take the samples of one block of frames.
 
         Args:
-            samples: As :meth:`capture.bus.decoding.BusDecoder.decode` gives them.
+            samples: As :meth:`.capture.bus.decoding.BusDecoder.decode` gives them.
 
         Returns:
             The messages that are complete now, in no order.

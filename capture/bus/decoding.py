@@ -216,8 +216,8 @@ class BusDecoder:
         """Decode frames.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, or of
-                :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, or of
+                :data:`.capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
 
         Returns:
             The samples of the map entries that occur, and what became of the frames.

@@ -134,7 +134,7 @@ class BusEncoder:
             t_ns: Time of the frames, as host and as device time [ns].
 
         Returns:
-            Records of :data:`capture.log.frames.FRAME_DTYPE`, in the order of the map: every frame
+            Records of :data:`.capture.log.frames.FRAME_DTYPE`, in the order of the map: every frame
             of which a value is given. Its other fields hold what the map names for unknown; else
             they are as they were sent last, at first the DBC's initial value, or zero.
         """

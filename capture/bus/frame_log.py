@@ -97,8 +97,8 @@ class LogBlock:
             bus: Its index.
 
         Returns:
-            Records of :data:`capture.log.frames.FRAME_DTYPE`, or of
-            :data:`capture.log.frames.FD_FRAME_DTYPE` where any is a CAN FD frame.
+            Records of :data:`.capture.log.frames.FRAME_DTYPE`, or of
+            :data:`.capture.log.frames.FD_FRAME_DTYPE` where any is a CAN FD frame.
         """
         own, own_fd = self.bus == bus, self.fd_bus == bus
         if self.is_fd is None or not own_fd.any():
@@ -197,7 +197,7 @@ class BlockBuilder:
 
         Args:
             t_ns: Its time [Unix ns].
-            id_flags: Identifier with the flags of :mod:`capture.log.frames`.
+            id_flags: Identifier with the flags of :mod:`.capture.log.frames`.
             dlc: Length code.
             way: Direction.
             bus: Index of its bus.
@@ -221,7 +221,7 @@ class BlockBuilder:
 
         Args:
             t_ns: Its time [Unix ns].
-            id_flags: Identifier with the flags of :mod:`capture.log.frames`.
+            id_flags: Identifier with the flags of :mod:`.capture.log.frames`.
             fd_flags: Flags that CAN FD alone has.
             way: Direction.
             bus: Index of its bus.

@@ -112,7 +112,7 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
 
 
 def frame_id(message: Message) -> int:
-    """A message's identifier with the flags of :mod:`capture.log.frames`.
+    """A message's identifier with the flags of :mod:`.capture.log.frames`.
 
     Args:
         message: The message.

@@ -20,7 +20,7 @@ def poll_frames(robot: Robot) -> FrameArray:
         robot: The robot.
 
     Returns:
-        Records of :data:`capture.log.frames.FRAME_DTYPE`, without times, in the order of the map;
+        Records of :data:`.capture.log.frames.FRAME_DTYPE`, without times, in the order of the map;
         none where nothing has to be asked.
 
     Raises:

@@ -97,8 +97,8 @@ class BusRecorder:
         """Take frames; they are not written yet.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE` or, CAN FD frames, of
-                :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE` or, CAN FD frames, of
+                :data:`.capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
         """
         self._fresh.append(frames)
 
@@ -106,7 +106,7 @@ class BusRecorder:
         """Write classic frames that are not to be decoded, after those taken before.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,), e.g. commands
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,), e.g. commands
                 that the session has anyway.
             now_ns: The session's clock.
 

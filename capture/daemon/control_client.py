@@ -65,7 +65,7 @@ class ControlClient:
         """Send one request and wait for its reply.
 
         Args:
-            request: See :mod:`capture.daemon.control_requests`.
+            request: See :mod:`.capture.daemon.control_requests`.
 
         Returns:
             The reply without its ``ok``.
@@ -79,7 +79,7 @@ class ControlClient:
         """Send several requests at once and wait for all replies: a recorder answers once a tick.
 
         Args:
-            requests: See :mod:`capture.daemon.control_requests`; some 100 at most, so that neither
+            requests: See :mod:`.capture.daemon.control_requests`; some 100 at most, so that neither
                 side's buffer is full before the other one reads.
 
         Returns:

@@ -179,7 +179,7 @@ class OperatorLog:
 
 
 def request_handler(actions: RecorderActions, log: OperatorLog) -> Handler:
-    """What a :class:`~capture.daemon.control.ControlServer` hands its requests to.
+    """What a :class:`~.capture.daemon.control.ControlServer` hands its requests to.
 
     Args:
         actions: The recorder.

@@ -1,7 +1,7 @@
 """Feeds whoever watches, at no cost to the recording: what nobody takes is dropped.
 
 The recorder must not talk to a viewer itself: one that is frozen makes a send wait for ever. So
-the feed sends datagrams (:mod:`capture.daemon.live_wire`) to a Unix socket that a relay process
+the feed sends datagrams (:mod:`.capture.daemon.live_wire`) to a Unix socket that a relay process
 reads, and never waits: what the socket doesn't take stays in a bounded queue, and what the queue
 doesn't hold is dropped, oldest first. Nothing is sent, and next to nothing is done, while there is
 no relay.

@@ -23,7 +23,7 @@ _STATES = {"std_msgs/msg/String"}
 """Types whose last message holds until the next: told to a relay that comes later."""
 
 Queued = tuple[int, int, int, int, int, bytes]
-"""The fields of a :class:`capture.daemon.live_wire.LiveMessage`."""
+"""The fields of a :class:`.capture.daemon.live_wire.LiveMessage`."""
 
 
 class LiveWords:

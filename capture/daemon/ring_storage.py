@@ -14,7 +14,7 @@ _NS = 1_000_000_000
 
 
 class RingStorage:
-    """The :class:`~capture.daemon.storage.Storage` of a ring."""
+    """The :class:`~.capture.daemon.storage.Storage` of a ring."""
 
     part: int | None = None
     shortage: LogWriteError | None = None

@@ -1,6 +1,6 @@
 """A device's clock against the session's: when a sample was taken, rather than when it came.
 
-Method: the line below all delays, :mod:`capture.daemon.envelope`. What no arrival times can tell
+Method: the line below all delays, :mod:`.capture.daemon.envelope`. What no arrival times can tell
 is the least delay itself: mapped times are late by it, the same for all samples of a source.
 """
 
@@ -123,7 +123,7 @@ class SourceClock:
         Args:
             t_device_ns: On the device's own clock, in the order they came, shape (n,); equal to
                 ``t_host_ns`` where a sample has no time of its own. Times that are not in
-                [0, :data:`~capture.sources.contract.DEVICE_TIMES_END_NS`) are no device's: such
+                [0, :data:`~.capture.sources.contract.DEVICE_TIMES_END_NS`) are no device's: such
                 samples take the time of the one before, or of their arrival where none came
                 within 100 ms, and leave the estimate as it is.
             t_host_ns: Arrival on the session's clock [Unix ns], not decreasing, shape (n,).

@@ -1,7 +1,7 @@
 """A recording's state as the statuses of ``/diagnostics``, one message a second.
 
 ``undulog log check`` reads the counts of the sources again from there; the names of their keys are
-those of :class:`capture.log.source_health.SourceHealth`.
+those of :class:`.capture.log.source_health.SourceHealth`.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def source_state(source: SourceSnapshot) -> tuple[int, str]:
         source: The source.
 
     Returns:
-        Level of :mod:`capture.log.diagnostics` and a few words.
+        Level of :mod:`.capture.log.diagnostics` and a few words.
     """
     if source.finished:
         return OK, "ended"

@@ -37,7 +37,7 @@ def unit_text(program: Path) -> str:
             f"{program}: a unit needs an absolute path of the command, without "
             "quotes, backslashes, *, ? and ["
         )
-    place = resources.files("capture.daemon") / "shipped" / UNIT_NAME
+    place = resources.files("undulog.capture.daemon") / "shipped" / UNIT_NAME
     quoted = text.replace("%", "%%")  # which begins a specifier
     quoted = f'"{quoted}"' if " " in quoted or ";" in quoted else quoted
     return place.read_text(encoding="utf-8").replace(_SHIPPED_PROGRAM, quoted)

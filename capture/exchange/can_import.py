@@ -42,7 +42,7 @@ def import_can(
 
     Every frame is kept raw, on ``/can/<bus>`` or, CAN FD frames, on ``/can_fd/<bus>``. The frames
     of one bus are decoded by the robot's databases and bus map onto the topics of the log contract
-    (:mod:`capture.bus.decoded_topics`); each sample keeps the time of its frame.
+    (:mod:`.capture.bus.decoded_topics`); each sample keeps the time of its frame.
 
     Args:
         source: The log: candump, ASC, BLF, TRC, python-can CSV or SQLite, MF4.

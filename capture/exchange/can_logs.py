@@ -2,7 +2,7 @@
 
 python-can hands out times as floating-point seconds, which at today's Unix time resolve 0.24 us;
 they are rounded to 1 us, the resolution of the formats it reads. Logs whose times count from their
-own start (ASC, some TRC) are put at :data:`capture.exchange.undated.RELATIVE_EPOCH_NS`.
+own start (ASC, some TRC) are put at :data:`.capture.exchange.undated.RELATIVE_EPOCH_NS`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Formats of CAN traces that can be written, by suffix.
 
 A format says what it keeps of frames (:meth:`FrameFormat.kept`) and writes just that, so that what
-is lost can be counted before it is lost. Formats: candump (:mod:`capture.exchange.candump`),
-Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`capture.exchange.ros_frames`).
+is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.candump`),
+Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`.capture.exchange.ros_frames`).
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def export_log(
     Args:
         source: The session.
         output: The trace to write; its suffix is one of
-            :data:`capture.exchange.frame_formats.FRAME_FORMATS`.
+            :data:`.capture.exchange.frame_formats.FRAME_FORMATS`.
         bus: The bus to write; all if None.
         force: Replace an existing file.
         stop: Ends the export, with nothing left behind.

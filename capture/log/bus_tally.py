@@ -19,7 +19,7 @@ def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
     g = 34 for 11-bit and 54 for 29-bit identifiers; the last term is the most stuff bits.
 
     Args:
-        frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+        frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
 
     Returns:
         Fewest and most bits, each of shape (n,); 0 for error frames, which report what happened

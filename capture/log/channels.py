@@ -355,8 +355,8 @@ class FrameChannel:
 
         Args:
             t_ns: Log time of the batch [Unix ns]; each frame has its own times inside.
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, on a channel of CAN FD
-                frames :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, on a channel of CAN FD
+                frames :data:`.capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
 
         Raises:
             DataError: If the records have another layout.

@@ -1,6 +1,6 @@
 """Messages in bulk: all messages of a channel as columns, without a Python loop over them.
 
-Messages that share their length, strings and sequence lengths (:class:`capture.log.cdr.Layout`)
+Messages that share their length, strings and sequence lengths (:class:`.capture.log.cdr.Layout`)
 have every number at the same place, so one numpy call takes one field of hundreds of them out of
 the payload, and another holds their strings against the layout's. So a bag with one message per
 servo costs as many layouts as servos, and a message of any other layout is still read right, only

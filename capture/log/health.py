@@ -1,6 +1,6 @@
 """The health of a recorded session: measures in, a verdict with its reasons out.
 
-The measures come from :mod:`capture.log.tallies`, so the same rules judge a file or the last
+The measures come from :mod:`.capture.log.tallies`, so the same rules judge a file or the last
 seconds of a live recording. Every threshold stands here by name, with why it is what it is.
 """
 

@@ -17,7 +17,7 @@ class Finding:
     """Something that was found.
 
     Attributes:
-        weight: Index into :data:`capture.log.health.VERDICTS`; 0 is worth knowing and no fault.
+        weight: Index into :data:`.capture.log.health.VERDICTS`; 0 is worth knowing and no fault.
         sentence: What, where, how much.
     """
 

@@ -341,7 +341,7 @@ class Session:
             stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
 
         Returns:
-            Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+            Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
 
         Raises:
             MissingChannelError: If the session has no such topic.
@@ -361,7 +361,7 @@ class Session:
             stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
 
         Returns:
-            Records of :data:`capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
+            Records of :data:`.capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
 
         Raises:
             MissingChannelError: If the session has no such topic.

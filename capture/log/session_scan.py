@@ -1,6 +1,6 @@
 """A session's messages to one statement of health, wherever they come from.
 
-The same scan is fed from the chunks of a file (:mod:`capture.log.session_check`) and from the
+The same scan is fed from the chunks of a file (:mod:`.capture.log.session_check`) and from the
 messages of a running recording, so both come to the same verdict.
 """
 
@@ -169,7 +169,7 @@ class SessionScan:
             key: The channel.
             data: Bytes that hold their records.
             offsets: Where the records start, in the order of the session, shape (n,).
-            heads: The records' heads, of :data:`capture.log.message_heads.HEAD`, shape (n,).
+            heads: The records' heads, of :data:`.capture.log.message_heads.HEAD`, shape (n,).
         """
         self._scans[key].add(data, offsets, heads)
 

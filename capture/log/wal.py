@@ -21,7 +21,7 @@ segment ahead of need. How a session writer uses it::
     wal.close()                                        # all is in the MCAP: the folder goes
 
 If a folder is left, the recorder died: an MCAP file cut short holds the first m messages, and
-those of :func:`capture.log.wal_recover.recover` with a position above m are the rest.
+those of :func:`.capture.log.wal_recover.recover` with a position above m are the rest.
 
 Segments are deleted, never written again: a new one is all zeros, so what stands behind the last
 record is nothing or damage, and on a copy-on-write file system only the first write to reserved

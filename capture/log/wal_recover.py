@@ -363,7 +363,7 @@ def recover(folder: Path | str) -> Recovery:
         print(recovery.found, recovery.missing, recovery.warnings)
 
     Args:
-        folder: The log, see :func:`capture.log.wal.wal_folder`.
+        folder: The log, see :func:`.capture.log.wal.wal_folder`.
 
     Returns:
         The messages, with the definitions and a count of what is missing. One message is in

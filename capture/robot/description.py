@@ -21,7 +21,7 @@ than joints, ``link01`` the head, all as the defaults say. ``[defaults.joint]``,
 the robot may be driven, ``[safety_of.joint07]`` what is otherwise for one joint. In an entry of
 ``bus.signals`` whose target is ``{joint}``, the entry stands for one a joint, and ``{joint}`` in
 its message and signal for that joint's name. The keys are the fields of the classes of
-:mod:`capture.robot`. Every fault of a file is reported at once.
+:mod:`.capture.robot`. Every fault of a file is reported at once.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from .repeated import note_repeated
 from .safety_table import read_safety
 from .sensor_table import read_sensors
 
-_SHELF = Shelf("robot", "capture.robot", "shipped", RobotFileError)
+_SHELF = Shelf("robot", "undulog.capture.robot", "shipped", RobotFileError)
 _PARTS = ("links", "joints", "servo", "sensors", "bus")
 
 

@@ -1,6 +1,6 @@
 """Where the links are, given the head's pose and the joint angles.
 
-Frames and signs as in :mod:`capture.robot`. Quaternions are x, y, z, w, as ROS has them.
+Frames and signs as in :mod:`.capture.robot`. Quaternions are x, y, z, w, as ROS has them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What error frames say: a node in trouble, a controller off the bus and back.
 
-An error frame is one with :data:`capture.log.frames.ERROR_FLAG`; its identifier holds the classes
+An error frame is one with :data:`.capture.log.frames.ERROR_FLAG`; its identifier holds the classes
 of error and its data the details, as in ``linux/can/error.h``.
 """
 

@@ -31,7 +31,7 @@ class LinkWithFile(Link, Protocol):
 
 
 class DrainedLink:
-    """The :class:`capture.sources.link.Link` that empties another one."""
+    """The :class:`.capture.sources.link.Link` that empties another one."""
 
     def __init__(self, link: LinkWithFile, tally: Tally, *, pause_s: float) -> None:
         """Take over an open link, and begin.

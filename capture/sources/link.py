@@ -114,7 +114,7 @@ class _Attempt:
 
 
 class LinkedSource:
-    """The :class:`capture.sources.contract.Source` over a link."""
+    """The :class:`.capture.sources.contract.Source` over a link."""
 
     def __init__(
         self,

@@ -24,7 +24,7 @@ def open_source(address: SourceAddress) -> Source:
     """Make the source that an address names; it is not started.
 
     Args:
-        address: From :func:`capture.sources.address.parse_address`.
+        address: From :func:`.capture.sources.address.parse_address`.
 
     Returns:
         The source.

@@ -5,7 +5,7 @@
 128
 
 A process in another language does the same with 20 lines: connect an ``AF_UNIX`` socket of type
-``SOCK_SEQPACKET`` and send packets as :mod:`capture.sources.packets` describes them.
+``SOCK_SEQPACKET`` and send packets as :mod:`.capture.sources.packets` describes them.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class FrameSender:
         """Hand frames over, without waiting.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,). ``t_device_ns``
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,). ``t_device_ns``
                 is the sampling time on the sender's own clock; ``t_host_ns`` is set on receipt.
 
         Returns:

@@ -1,8 +1,8 @@
 """Sources with the scheme ``unix``: frames from other processes of this computer.
 
 The recorder listens at a path; whoever may write there connects and sends packets as
-:mod:`capture.sources.packets` describes them. It is the fast way in: up to 256 frames a packet, and
-the kernel stamps each packet's arrival.
+:mod:`.capture.sources.packets` describes them. It is the fast way in: up to 256 frames a packet,
+and the kernel stamps each packet's arrival.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class _Sender:
 
 
 class UnixSource:
-    """The :class:`capture.sources.contract.Source` that other processes send to."""
+    """The :class:`.capture.sources.contract.Source` that other processes send to."""
 
     def __init__(
         self, address: SourceAddress, clock: ClockDomain, *, directions: bool = False
@@ -189,7 +189,7 @@ class UnixSource:
         return Polled((frames,), self._tally.events.take())
 
     def end(self) -> None:
-        """See :meth:`capture.sources.contract.EndingSource.end`: senders get an error from now on.
+        """See :meth:`.capture.sources.contract.EndingSource.end`: senders get an error from now on.
 
         What they could send before comes with the next polls.
         """

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import UsageError
-from capture.interruption import interruptible
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import UsageError
+from undulog.capture.interruption import interruptible
 
 if TYPE_CHECKING:
-    from analysis.compare.result import Comparison
+    from undulog.analysis.compare.result import Comparison
 
     from .run import Again
     from .sameness import Sameness
@@ -94,7 +94,7 @@ def replay(
         raise UsageError("--arm, --robot and --recorder are for a bus")
     if output is None:
         raise UsageError("a run of the twin is recorded: name the session with -o, e.g. -o b.mcap")
-    from sim.scenario_file import read_changes
+    from undulog.sim.scenario_file import read_changes
 
     from .run import find_repetition, replay_in_twin, what_next
 
@@ -125,8 +125,8 @@ def replay(
 
 def _show(comparison: Comparison) -> None:
     """Print a comparison below what was said."""
-    from analysis.command_line import show
-    from analysis.compare.table import render_comparison
+    from undulog.analysis.command_line import show
+    from undulog.analysis.compare.table import render_comparison
 
     say("")
     show(lambda width, color: render_comparison(comparison, width=width, color=color), None)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from analysis.compare.result import Comparison
-from capture import Session, load_robot
-from capture.console import emit_json, say
-from capture.errors import UsageError
-from sim.drive.bus_cli import drive_armed, drive_on_bus
-from sim.drive.driven import find_driven
-from sim.drive.over_bus import bus_address
+from undulog.analysis.compare.result import Comparison
+from undulog.capture import Session, load_robot
+from undulog.capture.console import emit_json, say
+from undulog.capture.errors import UsageError
+from undulog.sim.drive.bus_cli import drive_armed, drive_on_bus
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.drive.over_bus import bus_address
 
 from .run import compared, what_next
 

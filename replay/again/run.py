@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.compare.compare import compare_sessions
-from analysis.compare.result import Comparison
-from analysis.reading import RESPONSE_TOPIC
-from capture import Session
-from capture.errors import DataError, MissingChannelError
-from capture.interruption import StopRequest
-from sim.drive.driven import Driven, find_driven
-from sim.drive.in_process import drive_twin
-from sim.record import Recording
-from sim.scenario import Scenario
-from sim.scenario_file import load_scenario
-from sim.twin import Sample
+from undulog.analysis.compare.compare import compare_sessions
+from undulog.analysis.compare.result import Comparison
+from undulog.analysis.reading import RESPONSE_TOPIC
+from undulog.capture import Session
+from undulog.capture.errors import DataError, MissingChannelError
+from undulog.capture.interruption import StopRequest
+from undulog.sim.drive.driven import Driven, find_driven
+from undulog.sim.drive.in_process import drive_twin
+from undulog.sim.recording import Recording
+from undulog.sim.scenario import Scenario
+from undulog.sim.scenario_file import load_scenario
+from undulog.sim.twin import Sample
 
 from .sameness import Sameness, sameness
 

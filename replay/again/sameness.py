@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from capture.log.raw_log import RawLog, RawMessage
+from undulog.capture.log.raw_log import RawLog, RawMessage
 
 EVENTS = "/rosout"
 """Events are said in words, which may name what was changed: they are not compared."""

@@ -14,8 +14,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
-from capture.errors import UsageError
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.errors import UsageError
 
 from ..samples.sampling import gaps, interpolate
 from ..samples.timeline import (

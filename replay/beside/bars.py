@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-from analysis.compare.result import BODY, Comparison
-from analysis.compare.side import Known, Seen
-from analysis.response import around, t_factor
-from analysis.results.analysis import Estimate
+from undulog.analysis.compare.result import BODY, Comparison
+from undulog.analysis.compare.side import Known, Seen
+from undulog.analysis.response import around, t_factor
+from undulog.analysis.results.analysis import Estimate
 
 from ..plots.joints import GREY
 from .side import COMPARED, Side

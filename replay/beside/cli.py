@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from capture.console import emit_json, progress, say
-from capture.interruption import interruptible
+from undulog.capture.console import emit_json, progress, say
+from undulog.capture.interruption import interruptible
 
 from .. import viewer
 from . import words

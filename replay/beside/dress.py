@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 from rerun.components import FillMode
 
-from capture.robot import Robot
+from undulog.capture.robot import Robot
 
 from ..plots.joints import Color
 from ..samples.sampling import decimate

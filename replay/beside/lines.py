@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from capture.arrays import FloatArray, IntArray
+from undulog.capture.arrays import FloatArray, IntArray
 
 from ..plots.joints import Places, log_look, log_rows
 from ..plots.power import TOTAL

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from ..samples.sampling import interpolate
 from ..samples.tracks import resampled

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import rerun as rr
 
-from analysis.compare.changes import facts_of
-from analysis.compare.side import Seen, see
-from analysis.stretch import Options
-from capture import Session
-from capture.errors import UndulogError, UsageError
-from capture.robot import Robot
+from undulog.analysis.compare.changes import facts_of
+from undulog.analysis.compare.side import Seen, see
+from undulog.analysis.stretch import Options
+from undulog.capture import Session
+from undulog.capture.errors import UndulogError, UsageError
+from undulog.capture.robot import Robot
 
 from ..drawing import palette_of
 from ..plots.gait import rhythm_of

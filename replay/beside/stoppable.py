@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from capture import Session
-from capture.interruption import StopRequest
-from capture.log.signals import JointSignals
-from capture.part_file import check_stop
+from undulog.capture import Session
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.signals import JointSignals
+from undulog.capture.part_file import check_stop
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class StoppableSession(Session):
     """A session that is read for a file that is to be written.
 
-    Once an end is asked for, every read raises what :func:`capture.part_file.check_stop` raises.
+    Once an end is asked for, every read raises what :func:`.capture.part_file.check_stop` raises.
     """
 
     _wanted: tuple[Path, StopRequest | None] | None = None

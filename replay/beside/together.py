@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from capture import Session
-from capture.interruption import StopRequest
-from capture.part_file import check_stop
+from undulog.capture import Session
+from undulog.capture.interruption import StopRequest
+from undulog.capture.part_file import check_stop
 
 from .alignment import Align, align
 from .side import convert, names_of, read_side

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from analysis.compare.changes import changes
-from analysis.compare.result import Change, Comparison
-from analysis.text.formats import short, utc
+from undulog.analysis.compare.changes import changes
+from undulog.analysis.compare.result import Change, Comparison
+from undulog.analysis.text.formats import short, utc
 
 from ..facts import code, escaped
 from .alignment import Align

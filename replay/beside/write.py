@@ -12,11 +12,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import LazyChunkStream
 
-from analysis.compare.compare import Choices, compare_seen
-from analysis.compare.side import Seen
-from capture.errors import UndulogError
-from capture.interruption import StopRequest
-from capture.part_file import check_stop, part_file
+from undulog.analysis.compare.compare import Choices, compare_seen
+from undulog.analysis.compare.side import Seen
+from undulog.capture.errors import UndulogError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.part_file import check_stop, part_file
 
 from ..plots.joints import log_scalars
 from ..rrd import Recording, open_recording, recording_id, require_whole, rerun_writes

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from analysis.reading import RESPONSE_TOPIC
-from capture import Session
-from capture.arrays import FloatArray
-from capture.errors import DataError
-from sim.drive.command_session import COMMANDS
-from sim.gait import Gait
-from sim.physics.engine import Kernels
-from sim.scenario import Scenario
-from sim.sensing import Noise, SensorModels
-from sim.twin import Twin
+from undulog.analysis.reading import RESPONSE_TOPIC
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import DataError
+from undulog.sim.drive.command_session import COMMANDS
+from undulog.sim.gait import Gait
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.scenario import Scenario
+from undulog.sim.sensing import Noise, SensorModels
+from undulog.sim.twin import Twin
 
 from .parameters import DELAY, Unknown, with_values
 

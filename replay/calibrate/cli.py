@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import UsageError
-from capture.interruption import interruptible
-from capture.part_file import check_stop
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import UsageError
+from undulog.capture.interruption import interruptible
+from undulog.capture.part_file import check_stop
 
 
 def fit(
@@ -66,7 +66,7 @@ def fit(
     for path in (output, scenario):
         if path is not None:
             refuse_existing(path, force=force)
-    from sim.physics.engine import Kernels
+    from undulog.sim.physics.engine import Kernels
 
     from .fit import Wanted, calibrate
     from .output import write_calibration

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.analyse import examine_session
-from capture import Session
-from capture.arrays import FloatArray
-from capture.errors import DataError, UndulogError
-from sim.physics.engine import Kernels
-from sim.scenario import Scenario
+from undulog.analysis.analyse import examine_session
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import DataError, UndulogError
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.scenario import Scenario
 
 from ..again.run import find_repetition
 from .alternatives import Alternative, alternatives

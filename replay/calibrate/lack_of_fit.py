@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from .alternatives import Alternative
 from .answers import Measured
@@ -131,7 +131,7 @@ def lack_of_fit(
         residuals: [rad], shapes (n_j,).
         omega: Of the gait [rad/s]; None where there is none.
         unfitted: From :func:`halves`.
-        others: From :func:`replay.calibrate.alternatives.alternatives`.
+        others: From :func:`.replay.calibrate.alternatives.alternatives`.
 
     Returns:
         The tests.

@@ -13,12 +13,12 @@ from typing import Any, cast
 
 import tomlkit
 
-from capture.console import plain
-from capture.errors import DataError
-from capture.part_file import part_file, write_text
-from capture.robot import Robot
-from capture.robot.description import parse_robot
-from sim.modules import Modules
+from undulog.capture.console import plain
+from undulog.capture.errors import DataError
+from undulog.capture.part_file import part_file, write_text
+from undulog.capture.robot import Robot
+from undulog.capture.robot.description import parse_robot
+from undulog.sim.modules import Modules
 
 from .fit import Calibration
 

@@ -12,11 +12,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from capture.arrays import FloatArray
-from capture.errors import UsageError
-from capture.robot import Servo
-from sim.scenario import Scenario
-from sim.world import FrictionLaw, Ground
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Servo
+from undulog.sim.scenario import Scenario
+from undulog.sim.world import FrictionLaw, Ground
 
 SERVO = {
     "stall_torque": "N m",

@@ -7,8 +7,8 @@ minimises::
 
 The twin is deterministic and its laws are smooth, so derivatives are central differences of runs.
 The weights are those of the last residuals (iteratively reweighted). With A = J' W J + P^-1 and B
-of :mod:`replay.calibrate.noise` the covariance of the estimate is A^-1 (B + P^-1) A^-1, where noise
-never counts as less than white.
+of :mod:`.replay.calibrate.noise` the covariance of the estimate is A^-1 (B + P^-1) A^-1, where
+noise never counts as less than white.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import SimulationError
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import SimulationError
 
 from .answers import Answers
 from .noise import deviations, memory, score_covariance

@@ -53,7 +53,7 @@ def find_weak_module(
         answers: The twin under the commands.
         shared: The fit of identical modules.
         spread: Prior standard deviation of a module's ln factor.
-        on_iteration: As :func:`replay.calibrate.solve.solve` has it.
+        on_iteration: As :func:`.replay.calibrate.solve.solve` has it.
 
     Returns:
         The search, and the fit with that module's own factor.

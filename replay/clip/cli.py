@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import MissingExtraError, UsageError
-from capture.interruption import interruptible
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import MissingExtraError, UsageError
+from undulog.capture.interruption import interruptible
 
 if TYPE_CHECKING:
     from ..rrd import Recording
@@ -67,7 +67,7 @@ def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json
         from .film import film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
-    from capture import Session
+    from undulog.capture import Session
 
     from ..rrd import write_recording
     from ..views import body_title

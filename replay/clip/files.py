@@ -15,7 +15,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from av.video.stream import VideoStream
 from PIL import Image
 
-from capture.errors import LogWriteError, UsageError
+from undulog.capture.errors import LogWriteError, UsageError
 
 GIF_FPS = 50
 """More frames a second than this a browser slows down to ten."""

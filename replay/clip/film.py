@@ -16,10 +16,10 @@ import numpy as np
 import rerun.blueprint as rrb
 from PIL import Image, ImageDraw, ImageFont
 
-from capture.arrays import FloatArray
-from capture.errors import DataError, UndulogError, UsageError
-from capture.interruption import StopRequest
-from capture.part_file import check_stop, part_file
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import DataError, UndulogError, UsageError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.part_file import check_stop, part_file
 
 from ..content import Content
 from ..headless import HeadlessViewer

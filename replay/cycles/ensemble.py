@@ -3,7 +3,7 @@
 Samples are never folded. Each keeps its own time, and with it the phase that the controller logged
 (or that of the fitted rhythm, where none was logged). Over that phase a channel is fitted by
 harmonics and cut into whole cycles, which are averaged phase by phase
-(:func:`analysis.compare.waveform.cycles_by_phase`); their scatter is the interval of the mean.
+(:func:`.analysis.compare.waveform.cycles_by_phase`); their scatter is the interval of the mean.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.compare.differences import from_runs
-from analysis.compare.waveform import PHASES, cycles_by_phase, phases_rad
-from analysis.estimators.harmonic import fit_at
-from analysis.estimators.series import Series, clean
-from analysis.gait import allowed_model
-from analysis.response import t_factor
-from analysis.results.analysis import Analysis
-from capture.arrays import BoolArray, FloatArray, IntArray
-from capture.robot import Robot
-from capture.robot.kinematics import link_poses
+from undulog.analysis.compare.differences import from_runs
+from undulog.analysis.compare.waveform import PHASES, cycles_by_phase, phases_rad
+from undulog.analysis.estimators.harmonic import fit_at
+from undulog.analysis.estimators.series import Series, clean
+from undulog.analysis.gait import allowed_model
+from undulog.analysis.response import t_factor
+from undulog.analysis.results.analysis import Analysis
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.robot import Robot
+from undulog.capture.robot.kinematics import link_poses
 
 from ..plots.joints import Places
 from ..samples.sampling import interpolate

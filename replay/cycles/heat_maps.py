@@ -16,10 +16,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from analysis.results.analysis import Analysis
-from analysis.text.formats import decimals_for_values, number
-from capture.arrays import FloatArray
-from capture.palette import joint_colors
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.text.formats import decimals_for_values, number
+from undulog.capture.arrays import FloatArray
+from undulog.capture.palette import joint_colors
 
 from ..plots.joints import Color
 from ..samples.timeline import Clock

@@ -15,11 +15,11 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.components import FillMode
 
-from analysis.results.analysis import Analysis
-from capture import Session
-from capture.arrays import FloatArray
-from capture.palette import joint_colors
-from capture.robot import Robot
+from undulog.analysis.results.analysis import Analysis
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray
+from undulog.capture.palette import joint_colors
+from undulog.capture.robot import Robot
 
 from ..plots.joints import (
     GREY,

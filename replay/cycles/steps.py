@@ -16,10 +16,10 @@ import numpy as np
 import rerun as rr
 from rerun.components import InterpolationMode
 
-from analysis.cycles import LEAST_COVERED, CycleMaps
-from analysis.results.analysis import Analysis
-from analysis.results.over_time import JointOverTime
-from capture.arrays import FloatArray, IntArray
+from undulog.analysis.cycles import LEAST_COVERED, CycleMaps
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.results.over_time import JointOverTime
+from undulog.capture.arrays import FloatArray, IntArray
 
 from ..plots.joints import (
     GREY,

@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 from rerun.components import InterpolationMode
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..cycles.heat_maps import POWER
 from ..cycles.steps import (

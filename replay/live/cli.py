@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from capture.console import complain, emit_json, say
+from undulog.capture.console import complain, emit_json, say
 
 if TYPE_CHECKING:
     from .relay import RelayReport

@@ -1,6 +1,6 @@
 """Gain, lag and power of each joint in each cycle of a gait, while it is recorded.
 
-The estimator is the analysis's own (:mod:`analysis.estimators.demodulation`), on cycles that
+The estimator is the analysis's own (:mod:`.analysis.estimators.demodulation`), on cycles that
 start where its do: half a turn after the logged phase began to run evenly. It looks half a cycle to
 either side, so a cycle is known half a cycle after its end.
 """
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.cycles import LEAST_COVERED
-from analysis.demodulation_session import LoggedGait
-from analysis.estimators.cycle_sums import weigh
-from analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
-from analysis.estimators.series import Series, clean
-from analysis.reading import planes_of
-from capture.arrays import FloatArray, IntArray
-from capture.robot import Robot
+from undulog.analysis.cycles import LEAST_COVERED
+from undulog.analysis.demodulation_session import LoggedGait
+from undulog.analysis.estimators.cycle_sums import weigh
+from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
+from undulog.analysis.estimators.series import Series, clean
+from undulog.analysis.reading import planes_of
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot import Robot
 
 from ..plots.power import products
 from ..samples.survey import GAIT

@@ -12,16 +12,16 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from capture.arrays import FloatArray, IntArray
-from capture.daemon.live_wire import LiveMessage
-from capture.errors import DataError, RobotFileError
-from capture.log.cdr import Layout, layout_of
-from capture.log.joint_reader import OFFSET_TOPICS
-from capture.log.joint_rows import JointRows, merge_rows
-from capture.log.rosmsg import MessageType, parse_message_type
-from capture.log.sink import Description
-from capture.robot import Robot
-from capture.robot.description import parse_robot
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.daemon.live_wire import LiveMessage
+from undulog.capture.errors import DataError, RobotFileError
+from undulog.capture.log.cdr import Layout, layout_of
+from undulog.capture.log.joint_reader import OFFSET_TOPICS
+from undulog.capture.log.joint_rows import JointRows, merge_rows
+from undulog.capture.log.rosmsg import MessageType, parse_message_type
+from undulog.capture.log.sink import Description
+from undulog.capture.robot import Robot
+from undulog.capture.robot.description import parse_robot
 
 from ..plots.gait import MODE
 from ..samples.sampling import ordered
@@ -292,7 +292,7 @@ class LiveLog:
         return self._shifted(group.stamps, group.log_ns)
 
     def _shifted(self, stamp_ns: IntArray, log_ns: IntArray) -> IntArray:
-        """Stamps on the log's clock; see :mod:`capture.log.stamp_clock`."""
+        """Stamps on the log's clock; see :mod:`.capture.log.stamp_clock`."""
         if not stamp_ns.any():
             return log_ns
         if self._shift_ns is None:

@@ -15,8 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from capture.daemon.live_wire import HEAD_SIZE, MAX_DATAGRAM, DatagramHead, Kind, read_head
-from capture.errors import DataError, UsageError
+from undulog.capture.daemon.live_wire import HEAD_SIZE, MAX_DATAGRAM, DatagramHead, Kind, read_head
+from undulog.capture.errors import DataError, UsageError
 
 _LOOK_S = 0.01
 

@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from capture.daemon.live_wire import Kind, LiveMessage, read_records
-from capture.errors import DataError, LogWriteError
-from capture.interruption import StopRequest, interruptible
-from capture.part_file import part_file
+from undulog.capture.daemon.live_wire import Kind, LiveMessage, read_records
+from undulog.capture.errors import DataError, LogWriteError
+from undulog.capture.interruption import StopRequest, interruptible
+from undulog.capture.part_file import part_file
 
 from ..rrd import APPLICATION, recording_id, require_whole
 from ..viewer import Viewer

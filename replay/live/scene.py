@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 import numpy as np
 import rerun as rr
 
-from capture.arrays import FloatArray, IntArray
+from undulog.capture.arrays import FloatArray, IntArray
 
 from ..blueprint import build_blueprint
 from ..content import (
@@ -296,7 +296,7 @@ class LiveScene:
             self._draw_trail(motion)
 
     def _slots(self, t_ns: IntArray, rate_hz: float) -> IntArray:
-        """At most so many of the rows a second; :func:`~replay.samples.sampling.decimate` chooses.
+        """At most so many of the rows a second; :func:`~.replay.samples.sampling.decimate` chooses.
 
         The slots start with the first row of all, so that it doesn't matter where a batch ends.
         """
@@ -360,7 +360,7 @@ class LiveScene:
         self._rec.send_blueprint(build_blueprint(content))
 
     def _facts(self, content: Content, dropped: int, *, ended: bool) -> str:
-        """The session in words, as in :mod:`replay.facts`."""
+        """The session in words, as in :mod:`.replay.facts`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         facts = [

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray
+from undulog.capture.arrays import FloatArray, IntArray
 
 from ..samples.sampling import ordered
 from ..samples.tracks import Columns, Track

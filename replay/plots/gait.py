@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from capture import Session
-from capture.errors import DataError
+from undulog.capture import Session
+from undulog.capture.errors import DataError
 
 from ..samples.timeline import Clock, Rhythm
 from ..samples.tracks import Track

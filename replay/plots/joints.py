@@ -15,9 +15,9 @@ import numpy as np
 import rerun as rr
 from rerun.encodings import Float32Batch
 
-from capture.arrays import FloatArray, IntArray
-from capture.palette import COMMANDED_RGB, joint_colors
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.palette import COMMANDED_RGB, joint_colors
+from undulog.capture.robot import Plane, Robot
 
 from ..samples.rounding import rounded
 from ..samples.sampling import hold, mark_gaps

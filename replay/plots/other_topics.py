@@ -13,9 +13,9 @@ from typing import Any, cast
 import numpy as np
 import rerun as rr
 
-from capture import Session
-from capture.errors import DataError
-from capture.log.topics import Channel
+from undulog.capture import Session
+from undulog.capture.errors import DataError
+from undulog.capture.log.topics import Channel
 
 from ..content import Signal
 from ..samples.quantities import topic_entity

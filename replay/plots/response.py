@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from analysis.results.analysis import Analysis, Estimate
+from undulog.analysis.results.analysis import Analysis, Estimate
 
 from ..cycles.steps import (
     ENERGY,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..samples.quantities import SIGNALS, quantities
 from ..samples.rounding import plot_step

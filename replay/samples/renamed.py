@@ -8,10 +8,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
-from capture import Session
-from capture.errors import MissingChannelError
-from capture.log.signals import JointSignals
-from capture.log.topics import Channel
+from undulog.capture import Session
+from undulog.capture.errors import MissingChannelError
+from undulog.capture.log.signals import JointSignals
+from undulog.capture.log.topics import Channel
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +40,7 @@ class RenamedSession(Session):
             path: The file.
             command_topic: JointState topic of the commands; ``/joint_commands`` may be missing.
             response_topic: JointState topic of the responses; ``/joint_states`` may be missing.
-            column_folder: Where large columns lie in files, as for :class:`capture.Session`.
+            column_folder: Where large columns lie in files, as for :class:`.capture.Session`.
 
         Returns:
             The session.
@@ -79,7 +79,7 @@ class RenamedSession(Session):
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> dict[tuple[str, str], JointSignals]:
-        """Several quantities in one pass, as :meth:`capture.Session.joint_columns`."""
+        """Several quantities in one pass, as :meth:`.capture.Session.joint_columns`."""
         logged = {self._logged(topic): fields for topic, fields in wanted.items()}
         found = super().joint_columns(logged, start_ns=start_ns, stop_ns=stop_ns)
         usual = {self._logged(topic): topic for topic in wanted}
@@ -88,11 +88,11 @@ class RenamedSession(Session):
     def table(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> pd.DataFrame:
-        """All numbers of a topic, as :meth:`capture.Session.table`."""
+        """All numbers of a topic, as :meth:`.capture.Session.table`."""
         return super().table(self._logged(topic), start_ns=start_ns, stop_ns=stop_ns)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """A topic message by message, as :meth:`capture.Session.messages`."""
+        """A topic message by message, as :meth:`.capture.Session.messages`."""
         return super().messages(self._logged(topic))
 
     def _logged(self, topic: str) -> str:

@@ -13,10 +13,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from capture import Session
-from capture.arrays import FloatArray, IntArray
-from capture.errors import DataError, MissingChannelError
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.errors import DataError, MissingChannelError
+from undulog.capture.robot import Robot
 
 from ..plots.joints import MEASURED
 from ..plots.power import MECHANICAL

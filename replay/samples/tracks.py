@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray, IntArray
-from capture.bus.decoded_topics import JOINT_TOPIC
-from capture.errors import DataError, MissingChannelError
-from capture.log.signals import JointSignals
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.bus.decoded_topics import JOINT_TOPIC
+from undulog.capture.errors import DataError, MissingChannelError
+from undulog.capture.log.signals import JointSignals
 
 from .sampling import interpolate, ordered
 
@@ -225,7 +225,7 @@ def resampled(
         tracks: The tracks, in any order.
         names: Joint names, in the order of the result's columns.
         at_ns: The times [ns], shape (n,).
-        method: :func:`replay.samples.sampling.interpolate` or :func:`replay.samples.sampling.hold`.
+        method: :func:`.sampling.interpolate` or :func:`.sampling.hold`.
 
     Returns:
         Shape (n, number of names); NaN columns for joints without a track.

@@ -13,9 +13,9 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.components import FillMode
 
-from capture.arrays import FloatArray, IntArray
-from capture.palette import joint_colors
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.palette import joint_colors
+from undulog.capture.robot import Robot
 
 from ..plots.joints import GREY
 from ..samples.timeline import Clock

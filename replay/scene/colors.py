@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 NAMED = (255, 95, 190, 255)
 """Pink of a module that a test names: on none of the maps."""

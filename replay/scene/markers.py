@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from capture.arrays import FloatArray, IntArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot import Robot
 
 from ..plots.joints import Color, Places
 from ..samples.timeline import Clock

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from capture.arrays import IntArray
+from undulog.capture.arrays import IntArray
 
 from ..samples.timeline import Clock
 from .colors import NAMED

@@ -6,10 +6,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
-from capture.robot.kinematics import quaternion_from_rotation
-from capture.robot.mesh import mesh_type
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
+from undulog.capture.robot.kinematics import quaternion_from_rotation
+from undulog.capture.robot.mesh import mesh_type
 
 MESHES = "/world/snake/meshes"
 

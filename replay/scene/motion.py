@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import BoolArray, FloatArray, IntArray
-from capture.robot import Robot
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture import Session
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.robot import Robot
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from ..samples.sampling import (
     decimate,

@@ -8,9 +8,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from capture import Session
-from capture.arrays import FloatArray, IntArray
-from capture.robot import Robot, Sensor, SensorKind
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot import Robot, Sensor, SensorKind
 
 from ..samples.sampling import hold, ordered
 from ..samples.timeline import Clock

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from capture import Session
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.robot import Robot
 
 from ..plots.joints import Color, Places
 from ..plots.power import mechanical_power

@@ -8,10 +8,10 @@ from typing import Any
 import rerun as rr
 from rerun.components import FillMode
 
-from capture import Session
-from capture.strict_table import Faults, Table, read_toml
-from sim.world import Box, Cylinder, Obstacle, Target, Wall, World
-from sim.world.toml import read_world
+from undulog.capture import Session
+from undulog.capture.strict_table import Faults, Table, read_toml
+from undulog.sim.world import Box, Cylinder, Obstacle, Target, Wall, World
+from undulog.sim.world.toml import read_world
 
 CYLINDERS = "/world/obstacles/cylinders"
 BOXES = "/world/obstacles/boxes"

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from capture.arrays import FloatArray, IntArray
+from undulog.capture.arrays import FloatArray, IntArray
 
 from ..samples.sampling import decimate, gaps
 from ..samples.stretches import Span

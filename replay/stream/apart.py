@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from capture import Session
+from undulog.capture import Session
 
 from ..layer import Layer
 
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str]) -> None:
         arguments: The session's path, the topics of commands and responses.
     """
     os.nice(_NICENESS)
-    from analysis.stretch import Options
+    from undulog.analysis.stretch import Options
 
     from ..results import computed
 

@@ -6,9 +6,9 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from capture import Session
-from capture.console import progress, say
-from capture.interruption import interruptible
+from undulog.capture import Session
+from undulog.capture.console import progress, say
+from undulog.capture.interruption import interruptible
 
 from .. import viewer
 from ..layer import Layer

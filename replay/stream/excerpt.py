@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from capture import Session
-from capture.log.signals import JointSignals
-from capture.log.topics import Channel
+from undulog.capture import Session
+from undulog.capture.log.signals import JointSignals
+from undulog.capture.log.topics import Channel
 
 from ..samples.renamed import RenamedSession
 from ..samples.stretches import STRETCH_NS
@@ -66,13 +66,13 @@ class Excerpt(_Part):
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> dict[tuple[str, str], JointSignals]:
-        """Several quantities in one pass, as :meth:`capture.Session.joint_columns`."""
+        """Several quantities in one pass, as :meth:`.capture.Session.joint_columns`."""
         return super().joint_columns(wanted, start_ns=start_ns, stop_ns=self._until(stop_ns))
 
     def table(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> pd.DataFrame:
-        """All numbers of a topic, as :meth:`capture.Session.table`."""
+        """All numbers of a topic, as :meth:`.capture.Session.table`."""
         return super().table(topic, start_ns=start_ns, stop_ns=self._until(stop_ns))
 
     def columns(
@@ -80,7 +80,7 @@ class Excerpt(_Part):
         joints: Mapping[str, Sequence[str]],
         tables: Mapping[str, Sequence[str] | None],
     ) -> tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]:
-        """Joint signals and tables, as :meth:`capture.Session.columns`."""
+        """Joint signals and tables, as :meth:`.capture.Session.columns`."""
         read = {topic: self.table(topic) for topic in tables}
         found = {
             topic: read[topic] if fields is None else read[topic][list(fields)]
@@ -138,7 +138,7 @@ class Glimpse(_Part):
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> dict[tuple[str, str], JointSignals]:
-        """Several quantities in one pass, as :meth:`capture.Session.joint_columns`.
+        """Several quantities in one pass, as :meth:`.capture.Session.joint_columns`.
 
         A stretch that isn't looked into has none.
         """

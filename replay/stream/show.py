@@ -16,10 +16,10 @@ from dataclasses import dataclass, field, replace
 import rerun as rr
 import rerun.blueprint as rrb
 
-from capture import Session
-from capture.console import Progress
-from capture.errors import DataError, MissingChannelError, UndulogError
-from capture.interruption import StopRequest
+from undulog.capture import Session
+from undulog.capture.console import Progress
+from undulog.capture.errors import DataError, MissingChannelError, UndulogError
+from undulog.capture.interruption import StopRequest
 
 from ..blueprint import build_blueprint
 from ..drawing import Drawing, Sources, clock_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.robot import Plane, Robot
+from undulog.capture.robot import Plane, Robot
 
 from ..gait import WALK, GaitTick, Generator, Modulation
 from ..readings import Readings

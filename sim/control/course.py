@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot, SensorKind
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot, SensorKind
 
 from .filters import LowPass
 from .moment import Moment

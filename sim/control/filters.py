@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 _Value = TypeVar("_Value", float, FloatArray)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
-from capture.robot import Robot, Sensor, SensorKind
+from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.robot import Robot, Sensor, SensorKind
 
 _RANGING = (SensorKind.IR, SensorKind.SONAR)
 _SIDEWAYS = math.radians(22.5)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 from .layout import Layout, bearing
 from .moment import Moment

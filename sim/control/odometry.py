@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Plane, Robot
 
 
 class SlipOdometry:

@@ -26,8 +26,8 @@ class Calibration:
     """What a robot knows of its gait on free ground, by trying it out once.
 
     Attributes:
-        slip_ratio: K of :class:`sim.control.odometry.SlipOdometry`.
-        turn_gain: c of :class:`sim.control.phase_history.PathHeading`.
+        slip_ratio: K of :class:`.sim.control.odometry.SlipOdometry`.
+        turn_gain: c of :class:`.sim.control.phase_history.PathHeading`.
         turn_radius_m: Of the turn with the course's largest offset [m].
     """
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from capture.robot import Plane, Robot, SensorKind
-from capture.strict_table import Table
+from undulog.capture.robot import Plane, Robot, SensorKind
+from undulog.capture.strict_table import Table
 
 from .layout import Layout, layout
 from .parameters import (

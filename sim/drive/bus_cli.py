@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from capture.console import complain, emit_json, progress, say
-from capture.daemon.control_socket import find_sockets
-from capture.errors import UsageError
-from capture.interruption import interruptible
-from capture.robot import Robot
+from undulog.capture.console import complain, emit_json, progress, say
+from undulog.capture.daemon.control_socket import find_sockets
+from undulog.capture.errors import UsageError
+from undulog.capture.interruption import interruptible
+from undulog.capture.robot import Robot
 
 from ..gate.dry_run_cli import run_dry
 from ..gate.outcome import How

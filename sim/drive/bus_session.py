@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.daemon.bus_recorder import BusRecorder
-from capture.daemon.source_clock import SourceClock
-from capture.log.channels import StringChannel
-from capture.log.durable_sink import DurableSink
-from capture.log.frames import FrameArray
-from capture.log.wal_segment import require_space
-from capture.log.writer import SessionWriter
-from capture.robot import ClockDomain, Robot
-from capture.sources.contract import DEVICE_TIMES_END_NS
+from undulog.capture.daemon.bus_recorder import BusRecorder
+from undulog.capture.daemon.source_clock import SourceClock
+from undulog.capture.log.channels import StringChannel
+from undulog.capture.log.durable_sink import DurableSink
+from undulog.capture.log.frames import FrameArray
+from undulog.capture.log.wal_segment import require_space
+from undulog.capture.log.writer import SessionWriter
+from undulog.capture.robot import ClockDomain, Robot
+from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
 from ..gait import GaitTick
 from ..gate.outcome import How, Outcome

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import emit_json, progress, refuse_existing, say
-from capture.errors import UsageError
-from capture.interruption import interruptible
+from undulog.capture.console import emit_json, progress, refuse_existing, say
+from undulog.capture.errors import UsageError
+from undulog.capture.interruption import interruptible
 
 if TYPE_CHECKING:
-    from ..record import Recording
+    from ..recording import Recording
     from ..scenario import Scenario
     from .driven import Driven
 
@@ -70,7 +70,7 @@ def drive(
     if scheme == _TWIN and colon and not rest:
         raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
     if scheme != _TWIN:
-        from capture import load_robot
+        from undulog.capture import load_robot
 
         from .bus_cli import drive_on_bus
         from .over_bus import bus_address

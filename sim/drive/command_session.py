@@ -15,11 +15,11 @@ from typing import Self
 
 import numpy as np
 
-from capture import Session
-from capture.arrays import FloatArray, IntArray
-from capture.errors import DataError, JointSetError
-from capture.log.signals import JointSignals
-from capture.robot import Robot
+from undulog.capture import Session
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.errors import DataError, JointSetError
+from undulog.capture.log.signals import JointSignals
+from undulog.capture.robot import Robot
 
 from ..gait import GaitTick
 from ..readings import Readings

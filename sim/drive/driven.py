@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from capture import Session
-from capture.errors import DataError, JointSetError, PlanError, UsageError
-from capture.robot import Plane, Robot
-from capture.shipped import Shelf
+from undulog.capture import Session
+from undulog.capture.errors import DataError, JointSetError, PlanError, UsageError
+from undulog.capture.robot import Plane, Robot
+from undulog.capture.shipped import Shelf
 
 from ..control.build import build_gait
 from ..gait import Gait
@@ -159,7 +159,7 @@ def find_driven(
             commands (MCAP).
         world: Where it will be run, if that is known: its robot takes recorded commands.
         changes: Of recorded commands: what to change of the world that they were recorded in, see
-            :func:`sim.scenario_file.parse_scenario`.
+            :func:`.sim.scenario_file.parse_scenario`.
         robot: Who takes recorded commands, whatever the session or the world say.
 
     Returns:
@@ -176,7 +176,7 @@ def find_driven(
     is_folder = path.is_dir() and word not in scenario_names()  # of the parts of a session
     if path.suffix == ".mcap" or is_folder:
         return _commands(path, world, changes, robot)
-    found = Shelf("gait or plan", "sim", "scenarios", PlanError).read(word)
+    found = Shelf("gait or plan", "undulog.sim", "scenarios", PlanError).read(word)
     if is_plan(found.text):
         return _plan(found.text, found.source)
     return _gait(load_scenario(word))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Plane, Robot
 
 from ..gait import Gait, GaitTick
 from ..gait.limits import smoothstep

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from capture.daemon.control_client import ControlClient
-from capture.errors import ControlError
+from undulog.capture.daemon.control_client import ControlClient
+from undulog.capture.errors import ControlError
 
 from ..gait import GaitTick
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from capture.interruption import StopRequest
+from undulog.capture.interruption import StopRequest
 
-from ..record import Driver, Recording, record
+from ..recording import Driver, Recording, record
 from ..scenario import Scenario
 from ..twin import Sample
 from .driven import Driven
@@ -25,11 +25,11 @@ def drive_twin(
 ) -> Recording:
     """Drive the twin and record it.
 
-    A stop request lets the gait come to rest first (:mod:`sim.drive.fading`) and then ends the run.
+    A stop request lets the gait come to rest first (:mod:`.sim.drive.fading`), then ends the run.
 
     Args:
         driven: What to drive.
-        scenario: Where; from :meth:`sim.drive.driven.Driven.scenario`.
+        scenario: Where; from :meth:`.sim.drive.driven.Driven.scenario`.
         path: The file to create.
         force: Replace an existing file.
         stop: Looked at between samples.

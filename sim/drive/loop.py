@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.bus.encoding import BusEncoder, BusValue
-from capture.bus.polling import poll_frames
-from capture.errors import SourceError, UndulogError
-from capture.interruption import StopRequest
-from capture.log.frames import FrameArray, empty_frames
-from capture.robot import Direction, Quantity, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.bus.encoding import BusEncoder, BusValue
+from undulog.capture.bus.polling import poll_frames
+from undulog.capture.errors import SourceError, UndulogError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import FrameArray, empty_frames
+from undulog.capture.robot import Direction, Quantity, Robot
 
 from ..gate.confirmation import Confirmation
 from ..gate.faults import FaultKind, GateFault
@@ -98,7 +98,7 @@ class CommandEncoder:
             command: Joint angles [rad], shape (m,).
 
         Returns:
-            Records of :data:`capture.log.frames.FRAME_DTYPE`, without times.
+            Records of :data:`.capture.log.frames.FRAME_DTYPE`, without times.
         """
         return self._encoder.encode(dict(zip(self._keys, command.tolist(), strict=True)))
 

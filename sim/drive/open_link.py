@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from capture.errors import UsageError
-from capture.sources.contract import SourceAddress
-from capture.sources.events import Tally
-from capture.sources.options import flag
+from undulog.capture.errors import UsageError
+from undulog.capture.sources.contract import SourceAddress
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.options import flag
 
 from .link import VirtualRobotLink, find_virtual_robot
 from .python_can_bus import PythonCanBus

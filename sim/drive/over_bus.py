@@ -8,14 +8,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.daemon.clock import SessionClock
-from capture.errors import LogWriteError, UsageError
-from capture.interruption import StopRequest
-from capture.log.frames import FrameArray, identifier_text
-from capture.robot import Bus, Direction, Quantity, Robot
-from capture.sources.address import parse_address
-from capture.sources.contract import SourceAddress, SourceCounts
-from capture.sources.events import Tally
+from undulog.capture.daemon.clock import SessionClock
+from undulog.capture.errors import LogWriteError, UsageError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import FrameArray, identifier_text
+from undulog.capture.robot import Bus, Direction, Quantity, Robot
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import SourceAddress, SourceCounts
+from undulog.capture.sources.events import Tally
 
 from ..garbage import quick_collections
 from ..gate.confirmation import Confirmation

@@ -19,7 +19,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from capture.robot import Plane, Robot
+from undulog.capture.robot import Plane, Robot
 
 from ..gait import WALK, GaitTick, PlaneGait
 from ..gait.limits import started

@@ -37,10 +37,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from capture.errors import Fault, PlanError
-from capture.input_file import is_file
-from capture.robot import Plane
-from capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
+from undulog.capture.errors import Fault, PlanError
+from undulog.capture.input_file import is_file
+from undulog.capture.robot import Plane
+from undulog.capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 
 from ..gait import WALK, PlaneGait, Serpentine, Wave
 from ..gait.toml import read_gait

@@ -9,16 +9,16 @@ import can
 import numpy as np
 from can.util import cast_from_string
 
-from capture.arrays import IntArray
-from capture.errors import SourceError, UsageError
-from capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
-from capture.robot import ClockDomain
-from capture.sources.can_interfaces import DEVICE_TIME, check_interface, known_options
-from capture.sources.contract import SourceAddress
-from capture.sources.events import Tally
-from capture.sources.options import only
-from capture.sources.python_can import PythonCanLink, bus_class, failure, open_bus
-from capture.sources.socketcand import server_of
+from undulog.capture.arrays import IntArray
+from undulog.capture.errors import SourceError, UsageError
+from undulog.capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.can_interfaces import DEVICE_TIME, check_interface, known_options
+from undulog.capture.sources.contract import SourceAddress
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.options import only
+from undulog.capture.sources.python_can import PythonCanLink, bus_class, failure, open_bus
+from undulog.capture.sources.socketcand import server_of
 
 from .link import wait_until
 
@@ -125,7 +125,7 @@ class PythonCanBus:
         """Put frames on the bus, one after the other.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
             earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
                 None: at once.
 

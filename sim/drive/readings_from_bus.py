@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray, frozen
-from capture.bus.decoding import BusDecoder, DecodedSignals, FrameTally
-from capture.log.frames import FrameArray
-from capture.robot import Quantity, Robot
+from undulog.capture.arrays import FloatArray, IntArray, frozen
+from undulog.capture.bus.decoding import BusDecoder, DecodedSignals, FrameTally
+from undulog.capture.log.frames import FrameArray
+from undulog.capture.robot import Quantity, Robot
 
 from ..gate.status import JointStatus
 from ..readings import Readings
@@ -73,7 +73,7 @@ class BusReadings:
         """Take frames, in the order in which they came.
 
         Args:
-            frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
             time_s: When they came, on the loop's clock [s].
         """
         samples, tally = self._decoder.decode(frames)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 
-from capture.interruption import StopRequest
+from undulog.capture.interruption import StopRequest
 
 _WORDS = {
     signal.SIGINT: "asked to stop (Ctrl-C)",

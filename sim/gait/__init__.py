@@ -1,4 +1,4 @@
-"""Gaits: what the joints are commanded to do. :mod:`sim.gait.contract` says what each offers."""
+"""Gaits: what the joints are commanded to do. :mod:`.sim.gait.contract` says what each offers."""
 
 from .build import GaitParameters, generator
 from .contract import WALK, Gait, GaitTick, Generator, Modulation

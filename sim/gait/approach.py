@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 
 class Approach:

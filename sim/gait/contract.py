@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from capture.arrays import FloatArray, frozen
+from undulog.capture.arrays import FloatArray, frozen
 
 from ..readings import Readings
 

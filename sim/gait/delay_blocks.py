@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Plane, Robot
 
 from ..readings import Readings
 from .limits import started

@@ -1,7 +1,7 @@
 """The oscillator generator: each plane a chain of coupled oscillators, perhaps felt back.
 
 Eq. 1 of Meister, Stepanenko & Kernbach 2011 for the joints of each plane. Joint i is commanded
-A_i r_i sin(phi_i) + Y_i; A and Y follow what is asked for by :class:`~sim.gait.approach.Approach`,
+A_i r_i sin(phi_i) + Y_i; A and Y follow what is asked for by :class:`~.sim.gait.approach.Approach`,
 so that nothing jumps, and begin at zero.
 
 With feedback each oscillator turns by what its own servo reports,
@@ -26,8 +26,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot import Plane, Robot
 
 from ..readings import Readings
 from .approach import Approach

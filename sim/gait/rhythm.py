@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..readings import Readings
 
 
 class Change(NamedTuple):
-    """The part of a :class:`~sim.gait.contract.Modulation` that concerns one plane.
+    """The part of a :class:`~.sim.gait.contract.Modulation` that concerns one plane.
 
     Attributes:
         amplitude_factor: Multiplies each joint's amplitude, shape (n,).

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from capture.robot import Plane, Robot
+from undulog.capture.robot import Plane, Robot
 
 from ..readings import Readings
 from .limits import started

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Any, TypeVar, cast
 
-from capture.robot import Plane, Robot
-from capture.strict_table import Table
+from undulog.capture.robot import Plane, Robot
+from undulog.capture.strict_table import Table
 
 from .build import GaitParameters
 from .delay_blocks import DelayBlocks, DelayLine

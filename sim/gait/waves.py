@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
-from capture.errors import UsageError
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Plane, Robot
 
 from ..readings import Readings
 from .contract import WALK, GaitTick, Modulation

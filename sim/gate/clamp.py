@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 from .limits import GateLimits
 
@@ -38,7 +38,7 @@ class Clamp:
     It knows the command before, which the servos hold: a step is measured from there, and is at
     most what the greatest rate allows in one control period, also where ticks were left out. What
     was late is caught up step by step and never by a jump; that the steps are a period apart in
-    true time, too, is for :mod:`sim.gate.spacing`.
+    true time, too, is for :mod:`.sim.gate.spacing`.
     """
 
     def __init__(self, limits: GateLimits, pose: FloatArray, period_s: float) -> None:

@@ -1,6 +1,6 @@
 """A dry run: what is to be driven, in the twin of its robot, through the gate that a bus has.
 
-It is the same gate (:mod:`sim.gate.gate`), state by state: it reads the pose of the twin's servos,
+It is the same gate (:mod:`.sim.gate.gate`), state by state: it reads the pose of the twin's servos,
 ramps to the first pose, clamps, watches and ends. What the twin does not have (temperatures, supply
 voltages, lost replies, a late process) is not tried.
 """
@@ -17,15 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import SimulationError
-from capture.interruption import StopRequest
-from capture.log.writer import SessionWriter
-from capture.robot import Robot, Safety
-from capture.robot.safety import missing_limits
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import SimulationError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.writer import SessionWriter
+from undulog.capture.robot import Robot, Safety
+from undulog.capture.robot.safety import missing_limits
 
 from ..drive.driven import Driven
-from ..record import Driver, open_session
+from ..recording import Driver, open_session
 from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
 from ..scenario_file import parse_scenario
 from ..session_log import SessionLog

@@ -7,9 +7,9 @@ import sys
 import time
 from pathlib import Path
 
-from capture.console import emit_json, progress, say
-from capture.interruption import interruptible
-from capture.robot import Robot
+from undulog.capture.console import emit_json, progress, say
+from undulog.capture.interruption import interruptible
+from undulog.capture.robot import Robot
 
 from ..drive.driven import Driven
 from ..scenario import Scenario

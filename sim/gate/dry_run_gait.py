@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 from ..gait import Gait, GaitTick
 from ..readings import Readings

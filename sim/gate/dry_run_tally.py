@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.robot import Robot
 
 from ..physics.energy_flows import JOINT_TERMS
 from ..scenario import CONTROL_RATE_HZ
@@ -185,7 +185,7 @@ class DemandTally:
         """Take where the ledger stands; the first time is what is counted from.
 
         Args:
-            flows: Of each joint [J], as :attr:`sim.twin.Sample.joint_energy`, shape (9, m).
+            flows: Of each joint [J], as :attr:`.sim.twin.Sample.joint_energy`, shape (9, m).
         """
         if not self._begun:
             self._begun, self._energy_before = True, flows

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from capture.robot.safety import safety_example
+from undulog.capture.robot.safety import safety_example
 
 from .dry_run import DryRun, Verdict
 from .dry_run_table import joint_table

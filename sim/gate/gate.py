@@ -9,8 +9,8 @@
 
 It is asked once a control tick what to send. Until the pose of every joint is known it sends
 nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
-(:mod:`sim.gate.clamp`). A fault or a request to stop leads to the ending that the robot's file
-names. While the bus is silent (:mod:`sim.gate.silence`) nothing is sent, and the servos hold; the
+(:mod:`.sim.gate.clamp`). A fault or a request to stop leads to the ending that the robot's file
+names. While the bus is silent (:mod:`.sim.gate.silence`) nothing is sent, and the servos hold; the
 ending begins when a joint is received again. It opens nothing and waits for nothing.
 """
 
@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import SourceError, UsageError
-from capture.robot import OnFault
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import SourceError, UsageError
+from undulog.capture.robot import OnFault
 
 from ..gait import Gait, GaitTick
 from .clamp import Clamp, Clamped

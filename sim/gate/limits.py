@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from capture.arrays import FloatArray, frozen
-from capture.errors import UsageError
-from capture.robot import OnFault, Robot, Safety
-from capture.robot.safety import missing_limits, safety_example
+from undulog.capture.arrays import FloatArray, frozen
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import OnFault, Robot, Safety
+from undulog.capture.robot.safety import missing_limits, safety_example
 
 
 @dataclass(frozen=True)

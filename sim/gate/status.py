@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..gait import GaitTick
 from ..readings import Readings

@@ -1,6 +1,6 @@
 """The articulated body: PyBullet steps it, and nothing else.
 
-Contact (:mod:`sim.physics.contact`) and servos (:mod:`sim.physics.servo`) are ours, because the
+Contact (:mod:`.sim.physics.contact`) and servos (:mod:`.sim.physics.servo`) are ours, because the
 engine's anisotropic friction depends on the heading and its position motors have no electrical or
 elastic side. So the body has no collision shapes here and its motors are off; forces and torques
 come in from outside, once a step. It has no mechanical end stops: commands are kept within the
@@ -23,9 +23,9 @@ from operator import itemgetter
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import UsageError
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Plane, Robot
 
 from .engine import BodyState
 

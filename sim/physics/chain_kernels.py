@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from capture.arrays import BoolArray, FloatArray
+from undulog.capture.arrays import BoolArray, FloatArray
 
 
 @njit(cache=True)

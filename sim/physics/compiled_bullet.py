@@ -1,8 +1,8 @@
 """The articulated body in PyBullet with kinematics of our own, compiled.
 
-Half of what :mod:`sim.physics.bullet` costs goes into reading poses and velocities link by link and
-into pushing link by link. Here the engine is asked for its coordinates alone, and forces on the
-links reach it as the generalised force that does the same (:mod:`sim.physics.chain_kernels`).
+Half of what :mod:`.sim.physics.bullet` costs goes into reading poses and velocities link by link
+and into pushing link by link. Here the engine is asked for its coordinates alone, and forces on the
+links reach it as the generalised force that does the same (:mod:`.sim.physics.chain_kernels`).
 Importing it needs the extra ``numba``.
 """
 
@@ -14,8 +14,8 @@ from operator import itemgetter
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Plane, Robot
 
 from . import chain_kernels
 from .bullet import BulletEngine, pybullet
@@ -40,7 +40,7 @@ class CompiledBulletEngine(BulletEngine):
         """Build the body, straight, its head above the origin.
 
         Args:
-            robot: The robot, at most :data:`sim.physics.bullet.MAX_JOINTS` joints.
+            robot: The robot, at most :data:`.sim.physics.bullet.MAX_JOINTS` joints.
             gravity: Acceleration of gravity in the world [m/s^2], length 3.
             height: Height of the links' centres [m].
             heading: Direction of the head's x axis, about z [rad].

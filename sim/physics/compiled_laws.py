@@ -1,4 +1,4 @@
-"""The force laws compiled: as :class:`sim.physics.laws.NumpyLaws`, within rounding.
+"""The force laws compiled: as :class:`.sim.physics.laws.NumpyLaws`, within rounding.
 
 Importing it needs the extra ``numba``. The first import on a machine compiles, which takes some
 seconds; later ones load what was compiled.
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 from ..world import Ground
 from . import kernels
@@ -18,7 +18,7 @@ from .steps import Steps
 
 
 class CompiledLaws:
-    """The laws by :mod:`sim.physics.kernels`."""
+    """The laws by :mod:`.sim.physics.kernels`."""
 
     def __init__(
         self, steps: Steps, robot: Robot, ground: Ground | None, servos: Servos, dt: float

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..world.ground import FrictionLaw, Ground
 from .engine import BodyState

@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 
 class EngineKind(StrEnum):
@@ -144,8 +144,8 @@ class EngineType(Protocol):
 
 
 _TYPES = {
-    EngineKind.BULLET: ("sim.physics.bullet", "BulletEngine"),
-    EngineKind.MUJOCO: ("sim.physics.mujoco", "MujocoEngine"),
+    EngineKind.BULLET: ("undulog.sim.physics.bullet", "BulletEngine"),
+    EngineKind.MUJOCO: ("undulog.sim.physics.mujoco", "MujocoEngine"),
 }
 
 
@@ -164,5 +164,5 @@ def engine_type(kind: EngineKind, kernels: Kernels = Kernels.NUMPY) -> EngineTyp
     """
     module, name = _TYPES[kind]
     if kind is EngineKind.BULLET and kernels is Kernels.NUMBA:
-        module, name = "sim.physics.compiled_bullet", "CompiledBulletEngine"
+        module, name = "undulog.sim.physics.compiled_bullet", "CompiledBulletEngine"
     return cast(EngineType, getattr(import_module(module), name))

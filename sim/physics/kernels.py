@@ -1,7 +1,7 @@
 """The twin's force laws, compiled.
 
-The same equations as :mod:`sim.physics.contact` and :mod:`sim.physics.servo`, in the same order of
-operations, written out over links and joints. They serve speed alone and are held against those
+The same equations as :mod:`.sim.physics.contact` and :mod:`.sim.physics.servo`, in the same order
+of operations, written out over links and joints. They serve speed alone and are held against those
 modules, which say what the equations mean. Hyperbolic tangents may round otherwise than NumPy's, so
 results agree within rounding and not bit by bit.
 """
@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..world.ground import FrictionLaw
 from .servo import COULOMB_SPEED
@@ -57,7 +57,7 @@ def touch_ground(
     """Fill in the ground's action.
 
     Args:
-        row: A step, as :class:`sim.physics.steps.Steps` has it; its body is there.
+        row: A step, as :class:`.sim.physics.steps.Steps` has it; its body is there.
         n: Number of links.
         m: Number of joints.
         radius: Of the links [m], shape (n,).
@@ -104,7 +104,7 @@ def drive_joints(
         n: Number of links.
         m: Number of joints.
         reference: Commanded joint angles q_ref [rad], shape (m,).
-        servos: :attr:`sim.physics.servo.Servos.table`.
+        servos: :attr:`.sim.physics.servo.Servos.table`.
     """
     angle, rate = row[13 * n : 13 * n + m], row[13 * n + m : 13 * n + 2 * m]
     start = 22 * n + 2 * m
@@ -127,14 +127,14 @@ def rotor_friction(
     """Friction of one rotor [N m], and whether it is at rest after the step.
 
     Args:
-        servos: :attr:`sim.physics.servo.Servos.table`.
+        servos: :attr:`.sim.physics.servo.Servos.table`.
         j: The joint.
         speed: Rotor speed om at the step's start [rad/s].
         torque: Kt i - b om - t_g, all else that acts on the rotor [N m].
         dt: Step [s].
 
     Returns:
-        As :meth:`sim.physics.servo.Servos.friction`.
+        As :meth:`.sim.physics.servo.Servos.friction`.
     """
     static, kinetic = servos[10, j], servos[6, j]
     if static == 0.0:
@@ -155,7 +155,7 @@ def advance_rotors(
         here: The step after it.
         n: Number of links.
         m: Number of joints.
-        servos: :attr:`sim.physics.servo.Servos.table`.
+        servos: :attr:`.sim.physics.servo.Servos.table`.
         dt: Step [s].
     """
     start = 22 * n + 2 * m
@@ -194,7 +194,7 @@ def act(
         ground: k, d, mu_t, mu_n, eps, c_t, c_n, shape (7,).
         law: Number of the friction law in :data:`LAWS`.
         reference: Commanded joint angles q_ref [rad], shape (m,).
-        servos: :attr:`sim.physics.servo.Servos.table`.
+        servos: :attr:`.sim.physics.servo.Servos.table`.
         dt: Step [s].
     """
     advance_rotors(before, here, n, m, servos, dt)

@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 from ..world import Ground
 from .contact import GroundContact
@@ -46,7 +46,7 @@ class Laws(Protocol):
 
 
 class NumpyLaws:
-    """The laws by :mod:`sim.physics.contact` and :mod:`sim.physics.servo`."""
+    """The laws by :mod:`.sim.physics.contact` and :mod:`.sim.physics.servo`."""
 
     def __init__(
         self, steps: Steps, robot: Robot, ground: Ground | None, servos: Servos, dt: float

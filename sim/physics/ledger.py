@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
 
 from .energy_flows import (
     GROUND_TERMS,

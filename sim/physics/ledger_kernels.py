@@ -1,4 +1,4 @@
-"""The ledger's sums, compiled: the same as :mod:`sim.physics.energy_flows`'s within rounding."""
+"""The ledger's sums, compiled: the same as :mod:`.sim.physics.energy_flows`'s within rounding."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from numba import njit
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from .kernels import rotor_friction
 from .servo import COULOMB_SPEED
@@ -19,12 +19,12 @@ def add_joint_flows(
     """Add the energies that pass the joints during consecutive steps.
 
     Args:
-        table: k + 1 steps, as :class:`sim.physics.steps.Steps` has them.
+        table: k + 1 steps, as :class:`.sim.physics.steps.Steps` has them.
         n: Number of links.
         m: Number of joints.
-        servos: :attr:`sim.physics.servo.Servos.table`.
+        servos: :attr:`.sim.physics.servo.Servos.table`.
         dt: Step [s].
-        flows: Added to: rows as :data:`sim.physics.energy_flows.JOINT_TERMS` [J], shape (9, m).
+        flows: Added to: rows as :data:`.sim.physics.energy_flows.JOINT_TERMS` [J], shape (9, m).
     """
     for k in range(len(table) - 1):
         rates, rates_after = table[k, 13 * n + m :], table[k + 1, 13 * n + m :]
@@ -60,12 +60,12 @@ def add_ground_flows(
     """Add the energies that the ground takes during consecutive steps.
 
     Args:
-        table: k + 1 steps, as :class:`sim.physics.steps.Steps` has them.
+        table: k + 1 steps, as :class:`.sim.physics.steps.Steps` has them.
         n: Number of links.
         m: Number of joints.
         stiffness: Of the ground [N/m].
         dt: Step [s].
-        flows: Added to: as :data:`sim.physics.energy_flows.GROUND_TERMS` [J], shape (3,).
+        flows: Added to: as :data:`.sim.physics.energy_flows.GROUND_TERMS` [J], shape (3,).
     """
     start = 13 * n + 2 * m
     for k in range(len(table) - 1):

@@ -1,6 +1,6 @@
 """The articulated body, stepped by MuJoCo: the twin's second opinion.
 
-It stands under the same contract and the same force laws as :mod:`sim.physics.bullet`, so for one
+It stands under the same contract and the same force laws as :mod:`.sim.physics.bullet`, so for one
 scenario the two must agree up to rounding. Both have the head's pose and the joint angles as their
 coordinates and follow the semi-implicit Euler rule. One keeps the head's angular velocity in the
 world, the other in the head's frame; as the head turns by exp(dt w) about the new w itself, both
@@ -20,9 +20,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.errors import UsageError
-from capture.robot import Plane, Robot
+from undulog.capture.arrays import FloatArray
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Plane, Robot
 
 from .engine import BodyState
 from .vectors import cross

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..scenario import CONTROL_RATE_HZ, Scenario
 from ..world.obstacle_contact import obstacle_law

@@ -13,7 +13,7 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..world.obstacle_contact import NO_CONTACT, ObstacleContact
 from .contact import Contact
@@ -82,7 +82,7 @@ class Steps(Sequence[Step]):
 
     @property
     def links(self) -> FloatArray:
-        """The links' fields of :class:`sim.physics.engine.BodyState`, a view, shape (k, 13, n)."""
+        """The links' fields of :class:`.sim.physics.engine.BodyState`, a view, shape (k, 13, n)."""
         return self.table[:, : 13 * self.link_count].reshape(-1, 13, self.link_count)
 
     @property
@@ -93,7 +93,7 @@ class Steps(Sequence[Step]):
 
     @property
     def touch(self) -> FloatArray:
-        """All of :class:`sim.physics.contact.Contact` of all steps, a view, shape (k, 9, n)."""
+        """All of :class:`.sim.physics.contact.Contact` of all steps, a view, shape (k, 9, n)."""
         start, n = 13 * self.link_count + 2 * self.joint_count, self.link_count
         return self.table[:, start : start + 9 * n].reshape(-1, 9, n)
 

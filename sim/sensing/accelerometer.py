@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot, Sensor
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..physics.vectors import cross, into_frames, out_of_frames

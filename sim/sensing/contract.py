@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol, TypeAlias
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from ..physics.steps import Steps
 from ..readings import Readings

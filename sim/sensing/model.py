@@ -41,7 +41,7 @@ class ServoPolling:
 
 @dataclass(frozen=True)
 class InfraredModel:
-    """Infrared distance sensors, :mod:`sim.sensing.ir`.
+    """Infrared distance sensors, :mod:`.sim.sensing.ir`.
 
     Attributes:
         hold_s: From one measurement of a sensor to its next [s].
@@ -60,7 +60,7 @@ class InfraredModel:
 
 @dataclass(frozen=True)
 class SonarModel:
-    """Ultrasonic range finders, :mod:`sim.sensing.sonar`.
+    """Ultrasonic range finders, :mod:`.sim.sensing.sonar`.
 
     Attributes:
         rate_hz: Measurements a second.
@@ -77,7 +77,7 @@ class SonarModel:
 
 @dataclass(frozen=True)
 class AccelerometerModel:
-    """Accelerometers, :mod:`sim.sensing.accelerometer`.
+    """Accelerometers, :mod:`.sim.sensing.accelerometer`.
 
     Attributes:
         rate_hz: Measurements a second, each a mean over its period.
@@ -92,7 +92,7 @@ class AccelerometerModel:
 
 @dataclass(frozen=True)
 class CompassModel:
-    """Magnetometers, :mod:`sim.sensing.compass`.
+    """Magnetometers, :mod:`.sim.sensing.compass`.
 
     Attributes:
         rate_hz: Measurements a second.

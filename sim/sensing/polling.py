@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray, frozen
+from undulog.capture.arrays import FloatArray, IntArray, frozen
 
 from ..physics.steps import Steps
 from .contract import JointSample

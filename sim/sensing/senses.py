@@ -1,10 +1,10 @@
-"""All sensors of the robot in its world, as :class:`sim.sensing.contract.Sensing` has them."""
+"""All sensors of the robot in its world, as :class:`.sim.sensing.contract.Sensing` has them."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
-from capture.robot import Sensor, SensorKind
+from undulog.capture.robot import Sensor, SensorKind
 
 from ..physics.steps import Steps
 from ..readings import Readings

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import FloatArray, IntArray
-from capture.robot import Robot, Sensor
+from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.robot import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..world.rays import RayCaster

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from capture.robot import Robot
-from capture.strict_table import Table
+from undulog.capture.robot import Robot
+from undulog.capture.strict_table import Table
 
 from .model import (
     AccelerometerModel,

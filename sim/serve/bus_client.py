@@ -15,7 +15,7 @@ class Sent(NamedTuple):
 
     Attributes:
         client: Number of the client.
-        record: As :data:`capture.sources.records.pack_record` packs it, without times.
+        record: As :data:`.capture.sources.records.pack_record` packs it, without times.
     """
 
     client: int

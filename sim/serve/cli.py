@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from capture.console import complain, say
-from capture.errors import UsageError
+from undulog.capture.console import complain, say
+from undulog.capture.errors import UsageError
 
 if TYPE_CHECKING:
-    from capture.sources.contract import SourceEvent
-    from capture.sources.sender import FrameSender
+    from undulog.capture.sources.contract import SourceEvent
+    from undulog.capture.sources.sender import FrameSender
 
     from ..scenario import Scenario
     from .bus import VirtualBus
@@ -119,9 +119,9 @@ class _Plan:
 
 
 def _run(plan: _Plan, report: _Report) -> int:
-    from capture.interruption import interruptible
-    from capture.sources.events import EventLog
-    from capture.sources.sender import FrameSender
+    from undulog.capture.interruption import interruptible
+    from undulog.capture.sources.events import EventLog
+    from undulog.capture.sources.sender import FrameSender
 
     from .bus import VirtualBus
     from .pacing import Pacer

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, frozen
-from capture.bus.decoding import BusDecoder
-from capture.log.frames import FrameArray
-from capture.robot import Direction, Quantity, Robot
+from undulog.capture.arrays import BoolArray, FloatArray, frozen
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.log.frames import FrameArray
+from undulog.capture.robot import Direction, Quantity, Robot
 
 WATCHDOG_S = 0.5
 """After so long without a command a servo's silence is told; it holds its angle all the while."""

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray
-from capture.log.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
-from capture.robot import Robot
-from capture.sources.bus_watch import BUS_OFF, RESTARTED
+from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.log.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
+from undulog.capture.robot import Robot
+from undulog.capture.sources.bus_watch import BUS_OFF, RESTARTED
 
 from ..sensing.contract import JointSample, SensorSample
 from .encode import ReplyEncoder

@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from capture.errors import UsageError
-from capture.robot import Robot
-from capture.strict_table import Table, listed
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Robot
+from undulog.capture.strict_table import Table, listed
 
 
 class FaultKind(StrEnum):

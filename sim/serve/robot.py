@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import BoolArray
-from capture.interruption import StopRequest
-from capture.log.frames import FrameArray
-from capture.robot import Robot
-from capture.sources.records import records
+from undulog.capture.arrays import BoolArray
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import FrameArray
+from undulog.capture.robot import Robot
+from undulog.capture.sources.records import records
 
 from ..gait import GaitTick
 from ..garbage import quick_collections
@@ -70,7 +70,7 @@ class Served:
 
 
 class VirtualRobot:
-    """A robot on a bus; as a :class:`sim.gait.Gait` it hands the bus's commands to the twin."""
+    """A robot on a bus; as a :class:`.sim.gait.Gait` it hands the bus's commands to the twin."""
 
     def __init__(
         self,

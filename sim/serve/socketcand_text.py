@@ -1,14 +1,14 @@
 """What a socketcand server writes and reads: messages in angle brackets, frames in hexadecimal.
 
 Protocol: https://github.com/linux-can/socketcand, ``doc/protocol.md``. The reading side of a client
-is :mod:`capture.sources.socketcand_text`.
+is :mod:`.capture.sources.socketcand_text`.
 """
 
 from __future__ import annotations
 
 import re
 
-from capture.log.frames import (
+from undulog.capture.log.frames import (
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
@@ -17,7 +17,7 @@ from capture.log.frames import (
     FrameArray,
     data_lengths,
 )
-from capture.sources.records import pack_record
+from undulog.capture.sources.records import pack_record
 
 _MESSAGE = re.compile(rb"<([^<>]*)>")
 _SENT = re.compile(r"([0-9a-f]{1,8}) ([0-8])((?: [0-9a-f]{1,2})*)", re.ASCII | re.IGNORECASE)
@@ -30,7 +30,7 @@ def frame_text(frames: FrameArray) -> bytes:
     """Frames as the raw mode has them, each with its device time to the microsecond.
 
     Args:
-        frames: Records of :data:`capture.log.frames.FRAME_DTYPE`, shape (n,).
+        frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
 
     Returns:
         ``< frame 201 12.345678 1122 >``, ``< rtr 201 12.345678 2 >`` or ``< error 040 12.345678 >``
@@ -59,8 +59,8 @@ def sent_frame(kind: str, rest: str) -> bytes | None:
         rest: E.g. ``123 2 11 F1``; eight digits are a 29-bit identifier.
 
     Returns:
-        The frame as :data:`capture.sources.records.pack_record` packs it, without times; None if it
-        is malformed.
+        The frame as :data:`.capture.sources.records.pack_record` packs it, without times; None if
+        it is malformed.
     """
     found = _SENT.fullmatch(rest)
     if found is None:

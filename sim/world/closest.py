@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 _TINY = 1e-300
 """Makes 0/0 a zero."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from .closest import to_circles, to_rectangles
 from .obstacles import Cylinder, Obstacle, Target, columns, into_axes

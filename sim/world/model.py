@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 
-from capture.errors import UsageError
+from undulog.capture.errors import UsageError
 
 from .field import RandomField
 from .ground import Ground

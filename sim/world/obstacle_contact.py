@@ -4,7 +4,7 @@ A link is a capsule: it touches an obstacle where its axis, from joint to joint,
 obstacle in plan view, if it is nearer than its radius and not wholly above the obstacle's top. The
 normal is horizontal, out of the obstacle. So obstacles push sideways only: a link that gets above
 an edge is not carried by the top. The friction is regularised as on the ground
-(:mod:`sim.physics.contact`): what is held by it creeps.
+(:mod:`.sim.physics.contact`): what is held by it creeps.
 
 A robot presses against an obstacle much harder than a link lies on the ground, so that friction
 smoothed over a slip speed alone would be a damper that turns the slip of a light link over at every
@@ -25,7 +25,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.arrays import BoolArray, FloatArray, IntArray
 
 from ..physics.contact import normal_force
 from ..physics.vectors import cross

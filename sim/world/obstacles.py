@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from capture.arrays import FloatArray, frozen
+from undulog.capture.arrays import FloatArray, frozen
 
 
 @dataclass(frozen=True)

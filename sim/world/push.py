@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import FloatArray
-from capture.robot import Robot
-from capture.strict_table import Table, listed
+from undulog.capture.arrays import FloatArray
+from undulog.capture.robot import Robot
+from undulog.capture.strict_table import Table, listed
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import FloatArray
+from undulog.capture.arrays import FloatArray
 
 from .obstacles import Boxes, Cylinders, Obstacle, columns, into_axes
 

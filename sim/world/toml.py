@@ -7,9 +7,9 @@ import math
 from enum import StrEnum
 from typing import Any
 
-from capture.errors import UsageError
-from capture.robot import Robot
-from capture.strict_table import Table
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Robot
+from undulog.capture.strict_table import Table
 
 from .field import RandomField
 from .ground import FrictionLaw, Ground

@@ -1,7 +1,7 @@
 """What the analysis finds in the files of sessions: of one, or of several as one experiment."""
 
-from analysis import analyse_experiment, analyse_session
-from capture import Session
+from undulog.analysis import analyse_experiment, analyse_session
+from undulog.capture import Session
 
 
 def analysed(path, options=None):

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from analysis.results.analysis import (
+from undulog.analysis.results.analysis import (
     Analysis,
     BodyPoint,
     BodyResult,
@@ -16,9 +16,9 @@ from analysis.results.analysis import (
     SessionFacts,
     Window,
 )
-from analysis.results.answer import Shape
-from analysis.segments.examine import Findings
-from analysis.text.answer import Facts, compose
+from undulog.analysis.results.answer import Shape
+from undulog.analysis.segments.examine import Findings
+from undulog.analysis.text.answer import Facts, compose
 
 
 def answered(analysis, shape=()):

@@ -9,7 +9,7 @@ import pytest
 from mcap_ros2.writer import Writer
 from zoo.bags import JOINT_STATE
 
-from capture import SessionWriter
+from undulog.capture import SessionWriter
 
 built = runpy.run_path(str(Path(__file__).with_name("built_results.py")))
 chain = runpy.run_path(str(Path(__file__).with_name("linear_chain.py")))

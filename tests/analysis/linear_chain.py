@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from capture import SessionWriter
+from undulog.capture import SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("j1", "j2", "j3", "j4", "j5")

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis import analyse_session
-from analysis.stretch import Options
-from capture import Session
-from capture.following.session import faults_in_session
-from capture.log.unbroken import BREAK_S, longest_unbroken
+from undulog.analysis import analyse_session
+from undulog.analysis.stretch import Options
+from undulog.capture import Session
+from undulog.capture.following.session import faults_in_session
+from undulog.capture.log.unbroken import BREAK_S, longest_unbroken
 
 NS = 1_000_000_000
 HOUR = 3600 * NS

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from analysis.analyse import measure_session
-from analysis.cycles import amplitudes, cycle_maps
-from analysis.estimators.cycle_sums import starts_of
-from analysis.estimators.series import Series
-from capture import Session, SessionWriter
+from undulog.analysis.analyse import measure_session
+from undulog.analysis.cycles import amplitudes, cycle_maps
+from undulog.analysis.estimators.cycle_sums import starts_of
+from undulog.analysis.estimators.series import Series
+from undulog.capture import Session, SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("a", "b", "c")

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from analysis.estimators.harmonic import fit_at, fit_shared
-from analysis.estimators.series import Series
-from analysis.estimators.settling import worst_drift
-from analysis.fitting import fit_gait
-from analysis.gait import driven, find_rhythm, phase_step, wave_name
-from analysis.windows import Stretch, covered, settled, steady_runs, whole_cycles
+from undulog.analysis.estimators.harmonic import fit_at, fit_shared
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.estimators.settling import worst_drift
+from undulog.analysis.fitting import fit_gait
+from undulog.analysis.gait import driven, find_rhythm, phase_step, wave_name
+from undulog.analysis.windows import Stretch, covered, settled, steady_runs, whole_cycles
 
 
 def channels(make, count=4, duration=10.0, rate=100.0):

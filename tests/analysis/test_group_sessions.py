@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.notebook.files import load
-from capture import SessionWriter
+from undulog.analysis.notebook.files import load
+from undulog.capture import SessionWriter
 
 HERE = Path(__file__)
 helpers = runpy.run_path(str(HERE.with_name("analysed.py")))

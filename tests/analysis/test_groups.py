@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.estimators.harmonic import fit_at
-from analysis.estimators.harmonic_moments import HarmonicModel
-from analysis.estimators.series import Series
-from analysis.estimators.spectrum import residual_noise
-from analysis.fitting import fit_gait
-from analysis.groups import find_groups
-from analysis.mixing import further_lines, group_model, mixed_tones, with_mixed_lines
-from analysis.response import t_factor
+from undulog.analysis.estimators.harmonic import fit_at
+from undulog.analysis.estimators.harmonic_moments import HarmonicModel
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.estimators.spectrum import residual_noise
+from undulog.analysis.fitting import fit_gait
+from undulog.analysis.groups import find_groups
+from undulog.analysis.mixing import further_lines, group_model, mixed_tones, with_mixed_lines
+from undulog.analysis.response import t_factor
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "group_tables.py")))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.coupling import one_gait_coupling
-from analysis.heterogeneity import energy_indices, gini, response_indices, spread
-from analysis.response import Response, welch_satterthwaite
+from undulog.analysis.coupling import one_gait_coupling
+from undulog.analysis.heterogeneity import energy_indices, gini, response_indices, spread
+from undulog.analysis.response import Response, welch_satterthwaite
 
 BINS = 10
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis import analyse_session
-from analysis.remarks import Lacking, Note, Remarks
-from capture import Session, SessionWriter
+from undulog.analysis import analyse_session
+from undulog.analysis.remarks import Lacking, Note, Remarks
+from undulog.capture import Session, SessionWriter
 
 NAMES = tuple(f"j{k}" for k in range(8))
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.analyse import analyse_session
-from capture import Session
-from sim import load_scenario, scenario_names
-from sim.physics.engine import EngineKind, Kernels
-from sim.record import record
+from undulog.analysis.analyse import analyse_session
+from undulog.capture import Session
+from undulog.sim import load_scenario, scenario_names
+from undulog.sim.physics.engine import EngineKind, Kernels
+from undulog.sim.recording import record
 
 STEADY = [
     *("caterpillar", "caterpillar-pi2", "combined", "delay-blocks", "flat", "horizontal"),

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.estimators.series import Series
-from analysis.soft_start import steady_part
-from analysis.stretch import Options
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.soft_start import steady_part
+from undulog.analysis.stretch import Options
 
 analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.body.null import (
+from undulog.analysis.body.null import (
     SAMPLES,
     one_cycle,
     places,
     viscous_chain,
 )
-from analysis.stretch import Options
-from capture import Session, SessionWriter, load_robot
-from capture.robot import Plane
+from undulog.analysis.stretch import Options
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.robot import Plane
 
 analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 

@@ -115,8 +115,8 @@ def _mutated(data: bytes, suffix: str, rng: random.Random, scratch: Path) -> byt
 
 def read_session(path: Path) -> None:
     """Everything that a session offers; errors of the error tree are answers too."""
-    from capture import Session
-    from capture.errors import UndulogError
+    from undulog.capture import Session
+    from undulog.capture.errors import UndulogError
 
     def tried(part: Callable[[], object]) -> None:
         try:

@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from capture import load_robot
+from undulog.capture import load_robot
 
 from .base import DBC, ROBOT, SCENARIO
 from .case import Result, run_command

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 
-from capture import SessionWriter, load_robot
-from capture.log.cdr import encode
-from capture.log.schemas import message_type, schema_text
-from capture.log.session_check import SessionHealth
-from capture.log.tallies import Timing
+from undulog.capture import SessionWriter, load_robot
+from undulog.capture.log.cdr import encode
+from undulog.capture.log.schemas import message_type, schema_text
+from undulog.capture.log.session_check import SessionHealth
+from undulog.capture.log.tallies import Timing
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import SessionWriter
-from capture.log.frames import (
+from undulog.capture import SessionWriter
+from undulog.capture.log.frames import (
     EXTENDED_FLAG,
     FD_BRS,
     REMOTE_FLAG,
@@ -17,7 +17,7 @@ from capture.log.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from capture.sources.contract import Source, SourceContext, SourceEvent
+from undulog.capture.sources.contract import Source, SourceContext, SourceEvent
 
 PATIENCE_S = 90.0
 

@@ -20,14 +20,14 @@ from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from capture import Session, SessionWriter, load_robot
-from capture.errors import UndulogError
-from capture.log.durable_sink import DurableSink
-from capture.log.frames import empty_frames
-from capture.log.schemas import schema_text
-from capture.log.session_check import check_session
-from capture.log.wal_recover import recover
-from capture.robot.description import parse_robot
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import UndulogError
+from undulog.capture.log.durable_sink import DurableSink
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.log.schemas import schema_text
+from undulog.capture.log.session_check import check_session
+from undulog.capture.log.wal_recover import recover
+from undulog.capture.robot.description import parse_robot
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from campaign.mutate import mutate_bytes

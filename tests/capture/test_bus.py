@@ -11,11 +11,11 @@ from cantools.database.errors import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture import load_robot
-from capture.bus.bit_field import BitField
-from capture.bus.decoding import BusDecoder
-from capture.errors import DataError
-from capture.log.frames import (
+from undulog.capture import load_robot
+from undulog.capture.bus.bit_field import BitField
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.errors import DataError
+from undulog.capture.log.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -23,8 +23,8 @@ from capture.log.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
-from capture.robot.description import parse_robot
-from capture.units import UNITS
+from undulog.capture.robot.description import parse_robot
+from undulog.capture.units import UNITS
 
 
 @pytest.fixture

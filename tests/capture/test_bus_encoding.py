@@ -11,14 +11,14 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture import load_robot
-from capture.bus.bit_field import BitField
-from capture.bus.decoding import BusDecoder
-from capture.bus.encoding import BusEncoder
-from capture.errors import DataError
-from capture.log.frames import DIR_RX, DIR_TX
-from capture.robot import Direction, Quantity
-from capture.robot.description import parse_robot
+from undulog.capture import load_robot
+from undulog.capture.bus.bit_field import BitField
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.bus.encoding import BusEncoder
+from undulog.capture.errors import DataError
+from undulog.capture.log.frames import DIR_RX, DIR_TX
+from undulog.capture.robot import Direction, Quantity
+from undulog.capture.robot.description import parse_robot
 
 
 @settings(max_examples=400, deadline=None)

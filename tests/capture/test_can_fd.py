@@ -16,15 +16,15 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import undulog
-from capture import Session, SessionWriter, load_robot
-from capture.daemon.clock import SessionClock
-from capture.daemon.recorder import Ending, Recorder
-from capture.errors import DataError
-from capture.exchange.can_import import import_can
-from capture.exchange.can_logs import RELATIVE_EPOCH_NS
-from capture.exchange.log_export import export_log
-from capture.interruption import StopRequest
-from capture.log.frames import (
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.daemon.clock import SessionClock
+from undulog.capture.daemon.recorder import Ending, Recorder
+from undulog.capture.errors import DataError
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.can_logs import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.log_export import export_log
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import (
     DIR_RX,
     DIR_TX,
     EXTENDED_FLAG,
@@ -35,11 +35,11 @@ from capture.log.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from capture.log.session_check import check_session
-from capture.robot.description import parse_robot
-from capture.sources.address import parse_address
-from capture.sources.contract import SourceContext
-from capture.sources.registry import open_source
+from undulog.capture.log.session_check import check_session
+from undulog.capture.robot.description import parse_robot
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import SourceContext
+from undulog.capture.sources.registry import open_source
 
 S = 1_000_000_000
 T0 = 1_700_000_003_250_000_000

@@ -9,19 +9,19 @@ import pandas as pd
 import pytest
 
 import undulog
-from capture import Session, SessionWriter, load_robot
-from capture.errors import (
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import (
     DataError,
     LogWriteError,
     MissingChannelError,
     MissingExtraError,
     UsageError,
 )
-from capture.exchange.can_import import import_can
-from capture.exchange.column_export import TABLE_FORMATS, export_columns
-from capture.exchange.column_map import column_map_from_options
-from capture.exchange.csv_import import import_csv
-from capture.interruption import StopRequest
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.column_export import TABLE_FORMATS, export_columns
+from undulog.capture.exchange.column_map import column_map_from_options
+from undulog.capture.exchange.csv_import import import_csv
+from undulog.capture.interruption import StopRequest
 
 RECORDING = (
     Path(__file__).parents[2].parent / "shared/data/arcsnake" / "linear_trajectory.candump.log"
@@ -71,7 +71,7 @@ def assert_same_samples(table, session, topic, field, column):
 def test_each_sample_has_a_row_at_its_own_time(
     suffix, rows_per_block, polled, tmp_path: Path, monkeypatch
 ):
-    monkeypatch.setattr("capture.exchange.column_export._ROWS_PER_BLOCK", rows_per_block)
+    monkeypatch.setattr("undulog.capture.exchange.column_export._ROWS_PER_BLOCK", rows_per_block)
     output = tmp_path / f"x{suffix}"
     report = export_columns(polled, output)
     assert report.rows == {"/joint_states": 600, "/joint_current": 600}
@@ -120,8 +120,8 @@ def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
     # One message a servo, some without velocity: the fields don't share times.
     from mcap.writer import Writer
 
-    from capture.log.cdr import encode
-    from capture.log.schemas import message_type, schema_text
+    from undulog.capture.log.cdr import encode
+    from undulog.capture.log.schemas import message_type, schema_text
 
     kind = message_type("sensor_msgs/msg/JointState")
     with (tmp_path / "run.mcap").open("wb") as stream:
@@ -221,7 +221,7 @@ def test_what_fails_leaves_nothing_behind(polled, tmp_path: Path, monkeypatch):
         with pytest.raises(LogWriteError, match="stopped on request"):
             export_columns(polled, output, force=True, stop=stop)
         with monkeypatch.context() as patch:
-            patch.setattr("capture.exchange.column_export._sorted_blocks", full_disk)
+            patch.setattr("undulog.capture.exchange.column_export._sorted_blocks", full_disk)
             with pytest.raises(LogWriteError, match="can't be written: No space left"):
                 export_columns(polled, output, force=True)
         assert output.read_text() == "precious"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
+from undulog.capture import Session, SessionWriter
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 26)]

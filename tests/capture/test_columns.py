@@ -6,11 +6,11 @@ import zstandard
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from capture import Session, SessionWriter
-from capture.errors import DataError
-from capture.log.frames import empty_frames
-from capture.log.own_times import Series, own_times
-from capture.log.stores import ColumnStore, EchoColumn, Times, TimeStore
+from undulog.capture import Session, SessionWriter
+from undulog.capture.errors import DataError
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.log.own_times import Series, own_times
+from undulog.capture.log.stores import ColumnStore, EchoColumn, Times, TimeStore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 6)]

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from capture import SessionWriter
+from undulog.capture import SessionWriter
 
 READS = """
 import gc, sys, weakref
-from capture.log.mcap_payloads import McapPayloads
+from undulog.capture.log.mcap_payloads import McapPayloads
 from pathlib import Path
 
 class Ring:

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from capture import Session, SessionWriter, load_robot
-from capture.exchange.can_import import import_can
-from capture.exchange.log_export import export_log
-from capture.exchange.undated import RELATIVE_EPOCH_NS
-from capture.log.frames import (
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.log_export import export_log
+from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
+from undulog.capture.log.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,

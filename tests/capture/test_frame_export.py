@@ -15,14 +15,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import undulog
-from capture import Session, SessionWriter, load_robot
-from capture.errors import LogWriteError, UsageError
-from capture.exchange.can_import import import_can
-from capture.exchange.can_logs import RELATIVE_EPOCH_NS
-from capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
-from capture.exchange.log_export import export_log
-from capture.interruption import StopRequest
-from capture.log.frames import (
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import LogWriteError, UsageError
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.can_logs import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
+from undulog.capture.exchange.log_export import export_log
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -322,7 +322,7 @@ def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
         buses[bus] = frames
     source = write_session(tmp_path / "run.mcap", buses, batch=3)
     whole = export_log(source, tmp_path / f"whole{suffix}")
-    monkeypatch.setattr("capture.exchange.frame_blocks._MESSAGES_PER_BLOCK", 7)
+    monkeypatch.setattr("undulog.capture.exchange.frame_blocks._MESSAGES_PER_BLOCK", 7)
     parts = export_log(source, tmp_path / f"parts{suffix}")
     assert (whole.buses, whole.warnings) == (parts.buses, parts.warnings)
     assert whole.buses == dict.fromkeys(buses, len(every_kind()))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import undulog
-from capture import Session
+from undulog.capture import Session
 
 LOG = "".join(f"(100.{i:06d}) can0 {0x101 + i % 2:03X}#{i:02X}00 T\n" for i in range(10))
 

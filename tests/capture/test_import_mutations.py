@@ -10,11 +10,11 @@ from pathlib import Path
 import can
 import pytest
 
-from capture import Session, load_robot
-from capture.errors import UndulogError
-from capture.exchange.can_import import import_can
-from capture.exchange.column_map import column_map_from_options
-from capture.exchange.csv_import import import_csv
+from undulog.capture import Session, load_robot
+from undulog.capture.errors import UndulogError
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.column_map import column_map_from_options
+from undulog.capture.exchange.csv_import import import_csv
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db")
 NUMBERS = (

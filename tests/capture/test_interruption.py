@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from capture import Session
+from undulog.capture import Session
 
 RECORDER = """
 import sys, time
-from capture import SessionWriter
-from capture.interruption import interruptible
+from undulog.capture import SessionWriter
+from undulog.capture.interruption import interruptible
 
 with interruptible() as stop, SessionWriter(sys.argv[1], session_id="s", epoch_ns=10**18) as writer:
     channel = writer.joint_state("/joint_states", ["a"], unit="rad")
@@ -49,7 +49,7 @@ def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
 
 def test_the_second_signal_acts_as_usual() -> None:
     code = (
-        "import time; from capture.interruption import interruptible\n"
+        "import time; from undulog.capture.interruption import interruptible\n"
         "with interruptible() as stop:\n"
         "    print('in', flush=True)\n"
         "    while not stop.requested: time.sleep(1e-3)\n"

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture import load_robot
-from capture.errors import DataError
-from capture.robot import Plane
-from capture.robot.kinematics import link_poses, quaternion_from_rotation, rotation_from_quaternion
+from undulog.capture import load_robot
+from undulog.capture.errors import DataError
+from undulog.capture.robot import Plane
+from undulog.capture.robot.kinematics import (
+    link_poses,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 
 ROBOT = load_robot("snake13")
 RNG = np.random.default_rng(5)

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from capture.daemon import live_feed
-from capture.daemon.live_feed import LiveFeed
-from capture.daemon.live_wire import (
+from undulog.capture.daemon import live_feed
+from undulog.capture.daemon.live_feed import LiveFeed
+from undulog.capture.daemon.live_wire import (
     MAX_DATAGRAM,
     MAX_MESSAGE,
     DatagramHead,
@@ -27,7 +27,7 @@ from capture.daemon.live_wire import (
     read_head,
     read_records,
 )
-from capture.errors import DataError
+from undulog.capture.errors import DataError
 
 EPOCH_NS = 1_735_689_600_000_000_000
 STEP_NS = 10_000_000

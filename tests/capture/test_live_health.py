@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Metadata
 
-from capture import SessionWriter, load_robot
-from capture.daemon import live_health
-from capture.daemon.live_health import LiveHealth
-from capture.daemon.tapped_sink import TappedSink
-from capture.log.diagnostics import OK, DiagnosticStatus
-from capture.log.frames import ERROR_FLAG, empty_frames
-from capture.log.freeze import FreezeTally, RangeTally
-from capture.log.mcap_sink import McapSink
-from capture.log.session_check import SessionHealth, check_session
-from capture.log.session_scan import SessionMeasures
-from capture.log.sink import Description, MessageSink
+from undulog.capture import SessionWriter, load_robot
+from undulog.capture.daemon import live_health
+from undulog.capture.daemon.live_health import LiveHealth
+from undulog.capture.daemon.tapped_sink import TappedSink
+from undulog.capture.log.diagnostics import OK, DiagnosticStatus
+from undulog.capture.log.frames import ERROR_FLAG, empty_frames
+from undulog.capture.log.freeze import FreezeTally, RangeTally
+from undulog.capture.log.mcap_sink import McapSink
+from undulog.capture.log.session_check import SessionHealth, check_session
+from undulog.capture.log.session_scan import SessionMeasures
+from undulog.capture.log.sink import Description, MessageSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000

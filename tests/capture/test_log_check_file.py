@@ -14,10 +14,10 @@ from mcap.writer import CompressionType, IndexType
 from mcap_ros2.writer import Writer as RosWriter
 
 import undulog
-from capture import SessionWriter
-from capture.log.chunk import walk_records
-from capture.log.schemas import schema_text
-from capture.log.session_check import check_session
+from undulog.capture import SessionWriter
+from undulog.capture.log.chunk import walk_records
+from undulog.capture.log.schemas import schema_text
+from undulog.capture.log.session_check import check_session
 
 shared = runpy.run_path(str(Path(__file__).with_name("checked_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

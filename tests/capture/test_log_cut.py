@@ -14,9 +14,9 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 import undulog
-from capture import Session, SessionWriter, load_robot
-from capture.log.cut import cut_log
-from capture.log.schemas import schema_text
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.log.cut import cut_log
+from undulog.capture.log.schemas import schema_text
 
 shared = runpy.run_path(str(Path(__file__).with_name("edited_logs.py")))
 EPOCH_NS = shared["EPOCH_NS"]

@@ -15,11 +15,11 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 import undulog
-from capture import Session, SessionWriter, load_robot
-from capture.errors import DataError, UsageError
-from capture.log.cut import cut_log
-from capture.log.merge import merge_logs
-from capture.log.schemas import schema_text
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import DataError, UsageError
+from undulog.capture.log.cut import cut_log
+from undulog.capture.log.merge import merge_logs
+from undulog.capture.log.schemas import schema_text
 
 shared = runpy.run_path(str(Path(__file__).with_name("edited_logs.py")))
 EPOCH_NS = shared["EPOCH_NS"]

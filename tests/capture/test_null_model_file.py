@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from capture.errors import InputFileError, NullModelError
-from capture.null_model import NullModel, SharedParameter, read_null_model, write_null_model
+from undulog.capture.errors import InputFileError, NullModelError
+from undulog.capture.null_model import NullModel, SharedParameter, read_null_model, write_null_model
 
 
 def some_model():

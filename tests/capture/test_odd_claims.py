@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import undulog
-from capture import Session
-from capture.errors import DataError
-from capture.log.merge import merge_logs
-from capture.log.rosmsg import parse_message_type
-from capture.log.session_check import check_session
-from replay.samples.tracks import drawn_topics
+from undulog.capture import Session
+from undulog.capture.errors import DataError
+from undulog.capture.log.merge import merge_logs
+from undulog.capture.log.rosmsg import parse_message_type
+from undulog.capture.log.session_check import check_session
+from undulog.replay.samples.tracks import drawn_topics
 
 hostile = runpy.run_path(str(Path(__file__).parents[2] / "bench" / "hostile_logs.py"))
 HostileLog, EPOCH_NS, NS = hostile["HostileLog"], hostile["EPOCH_NS"], hostile["NS"]

@@ -11,13 +11,13 @@ import pytest
 from mcap.reader import make_reader
 
 import undulog
-from capture import Session, SessionWriter
-from capture.errors import LogError, LogWriteError, NotALogError, OutputExistsError
-from capture.log.cut import cut_log
-from capture.log.durable_sink import DurableSink
-from capture.log.merge import merge_logs
-from capture.log.part_names import later_parts, part_path, split_part_path
-from capture.log.session_check import check_session
+from undulog.capture import Session, SessionWriter
+from undulog.capture.errors import LogError, LogWriteError, NotALogError, OutputExistsError
+from undulog.capture.log.cut import cut_log
+from undulog.capture.log.durable_sink import DurableSink
+from undulog.capture.log.merge import merge_logs
+from undulog.capture.log.part_names import later_parts, part_path, split_part_path
+from undulog.capture.log.session_check import check_session
 
 recorder = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("durable_child.py"))))
 read = runpy.run_path(str(Path(__file__).with_name("read_back.py")))["read"]

@@ -11,12 +11,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
-from capture import Session, SessionWriter
-from capture.errors import UsageError
-from capture.log import arenas
-from capture.log.durable_sink import DurableSink
-from capture.log.read_ahead import Piece, ahead, helpers
-from capture.log.storage import LogFile
+from undulog.capture import Session, SessionWriter
+from undulog.capture.errors import UsageError
+from undulog.capture.log import arenas
+from undulog.capture.log.durable_sink import DurableSink
+from undulog.capture.log.read_ahead import Piece, ahead, helpers
+from undulog.capture.log.storage import LogFile
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -239,7 +239,7 @@ def test_what_has_not_begun_is_left_undone_at_the_end():
 MEASURE = """
 import json, sys
 from pathlib import Path
-from capture import Session
+from undulog.capture import Session
 
 def status(key):
     for line in Path("/proc/self/status").read_text().splitlines():

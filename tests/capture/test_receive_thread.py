@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter, load_robot
-from capture.daemon.bus_recorder import BusRecorder
-from capture.daemon.source_clock import SourceClock
-from capture.log.frames import empty_frames
-from capture.priority import raised_priority
-from capture.sources.receive_thread import ReceiveThread
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.daemon.bus_recorder import BusRecorder
+from undulog.capture.daemon.source_clock import SourceClock
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.priority import raised_priority
+from undulog.capture.sources.receive_thread import ReceiveThread
 
 ROOT = Path(__file__).parents[2]
 wait_for = runpy.run_path(str(Path(__file__).with_name("patience.py")))["wait_for"]

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session, load_robot
-from capture.daemon.live_health import LiveHealth
-from capture.daemon.record import Recording
-from capture.daemon.settings import resolve
-from capture.interruption import StopRequest
-from capture.log.frames import DIR_TX, empty_frames
-from capture.log.session_check import check_session
+from undulog.capture import Session, load_robot
+from undulog.capture.daemon.live_health import LiveHealth
+from undulog.capture.daemon.record import Recording
+from undulog.capture.daemon.settings import resolve
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import DIR_TX, empty_frames
+from undulog.capture.log.session_check import check_session
 
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]

@@ -23,12 +23,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from capture import Session, SessionWriter, load_robot
-from capture.bus.decoding import BusDecoder
-from capture.daemon.bus_recorder import BusRecorder
-from capture.daemon.source_clock import SourceClock
-from capture.log.channels import JointStateChannel
-from capture.log.frames import DIR_TX, FrameArray, empty_frames
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.daemon.bus_recorder import BusRecorder
+from undulog.capture.daemon.source_clock import SourceClock
+from undulog.capture.log.channels import JointStateChannel
+from undulog.capture.log.frames import DIR_TX, FrameArray, empty_frames
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
@@ -264,9 +264,9 @@ def test_a_duration_ends_sources_of_simulated_time(tmp_path: Path) -> None:
 
 
 PLUG_IN = """
-from capture.log.frames import empty_frames
-from capture.robot import ClockDomain
-from capture.sources.contract import Polled, SourceCounts
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.contract import Polled, SourceCounts
 
 class Source:
     clock, robot, directions, facts = ClockDomain.HOST, None, False, {}

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from capture.log.frames import empty_frames
-from capture.log.session_check import check_session
-from capture.sources.packets import HEAD
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.log.session_check import check_session
+from undulog.capture.sources.packets import HEAD
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000

@@ -19,7 +19,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from capture import Session
+from undulog.capture import Session
 
 ROOT = Path(__file__).parents[2]
 SENDER = ROOT / "bench" / "bus_sender.py"

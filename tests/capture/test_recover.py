@@ -18,12 +18,18 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 import undulog
-from capture import Session, SessionWriter
-from capture.errors import LogError, NotALogError, OutputExistsError, UndulogError, UsageError
-from capture.log.cut import cut_log
-from capture.log.merge import merge_logs
-from capture.log.recover import recover_log, recovered_path
-from capture.log.session_check import check_session
+from undulog.capture import Session, SessionWriter
+from undulog.capture.errors import (
+    LogError,
+    NotALogError,
+    OutputExistsError,
+    UndulogError,
+    UsageError,
+)
+from undulog.capture.log.cut import cut_log
+from undulog.capture.log.merge import merge_logs
+from undulog.capture.log.recover import recover_log, recovered_path
+from undulog.capture.log.session_check import check_session
 
 CHILD = Path(__file__).with_name("durable_child.py")
 recorder = SimpleNamespace(**runpy.run_path(str(CHILD)))

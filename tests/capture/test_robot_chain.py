@@ -3,10 +3,10 @@
 import pytest
 from mcap.reader import make_reader
 
-from capture import Session, SessionWriter, load_robot
-from capture.errors import RobotFileError
-from capture.robot import Plane
-from capture.robot.description import parse_robot
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import RobotFileError
+from undulog.capture.robot import Plane
+from undulog.capture.robot.description import parse_robot
 
 LINK = """
 [defaults.link]

@@ -6,9 +6,9 @@ from pathlib import Path
 import cantools
 import pytest
 
-from capture import load_robot, robot_names
-from capture.errors import RobotFileError, UsageError
-from capture.robot import (
+from undulog.capture import load_robot, robot_names
+from undulog.capture.errors import RobotFileError, UsageError
+from undulog.capture.robot import (
     BusPoll,
     ClockDomain,
     Direction,
@@ -20,8 +20,8 @@ from capture.robot import (
     SensorKind,
     Servo,
 )
-from capture.robot.description import parse_robot
-from capture.robot.safety import missing_limits, safety_example
+from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.safety import missing_limits, safety_example
 
 MINIMAL = """
 name = "worm"

@@ -11,13 +11,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from capture import Session, SessionWriter, load_robot
-from capture.errors import (
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import (
     DataError,
     LogWriteError,
     OutputExistsError,
 )
-from capture.log.frames import DIR_TX, EXTENDED_FLAG, empty_frames
+from undulog.capture.log.frames import DIR_TX, EXTENDED_FLAG, empty_frames
 
 shared = runpy.run_path(str(Path(__file__).with_name("written_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from capture import Session, load_robot
-from capture.errors import (
+from undulog.capture import Session, load_robot
+from undulog.capture.errors import (
     DataError,
     LogError,
     MissingChannelError,

@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.arrays import IntArray
-from capture.daemon.envelope import Envelope
-from capture.daemon.source_clock import JUMP_NS, ClockEstimate, SourceClock
-from capture.sources.contract import DEVICE_TIMES_END_NS
+from undulog.capture.arrays import IntArray
+from undulog.capture.daemon.envelope import Envelope
+from undulog.capture.daemon.source_clock import JUMP_NS, ClockEstimate, SourceClock
+from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000

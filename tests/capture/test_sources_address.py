@@ -5,10 +5,10 @@ import sys
 
 import pytest
 
-from capture.errors import UsageError
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.registry import open_source, open_sources, schemes
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.registry import open_source, open_sources, schemes
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_two_sources_need_two_names(tmp_path) -> None:
 def test_a_source_without_its_extra_says_which() -> None:
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
-        "from capture.errors import MissingExtraError\n"
-        "from capture.sources.registry import open_sources\n"
+        "from undulog.capture.errors import MissingExtraError\n"
+        "from undulog.capture.sources.registry import open_sources\n"
         "try:\n"
         "    open_sources(['twin:flat'])\n"
         "except MissingExtraError as error:\n"

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from capture.log.frames import ERROR_FLAG, empty_frames
-from capture.sources.backoff import Backoff
-from capture.sources.bus_watch import BUS_OFF, RESTARTED, BusWatch
-from capture.sources.events import EventLog, Tally
+from undulog.capture.log.frames import ERROR_FLAG, empty_frames
+from undulog.capture.sources.backoff import Backoff
+from undulog.capture.sources.bus_watch import BUS_OFF, RESTARTED, BusWatch
+from undulog.capture.sources.events import EventLog, Tally
 
 S = 1_000_000_000
 

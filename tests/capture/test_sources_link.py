@@ -6,14 +6,14 @@ import time
 
 import pytest
 
-from capture.errors import SourceError
-from capture.log.frames import FRAME_DTYPE
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.drained_link import DrainedLink
-from capture.sources.link import LinkedSource
-from capture.sources.receive_many import SO_RXQ_OVFL, SO_TIMESTAMPNS
-from capture.sources.socketcan import SocketcanLink
+from undulog.capture.errors import SourceError
+from undulog.capture.log.frames import FRAME_DTYPE
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.drained_link import DrainedLink
+from undulog.capture.sources.link import LinkedSource
+from undulog.capture.sources.receive_many import SO_RXQ_OVFL, SO_TIMESTAMPNS
+from undulog.capture.sources.socketcan import SocketcanLink
 
 FRAME = bytes.fromhex("23010000020000001122000000000000")
 

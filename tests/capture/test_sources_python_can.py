@@ -4,8 +4,8 @@ import can
 import numpy as np
 import pytest
 
-from capture.errors import SourceError, UsageError
-from capture.log.frames import (
+from undulog.capture.errors import SourceError, UsageError
+from undulog.capture.log.frames import (
     DIR_RX,
     ERROR_FLAG,
     EXTENDED_FLAG,
@@ -14,12 +14,17 @@ from capture.log.frames import (
     ID_MASK,
     REMOTE_FLAG,
 )
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.can_interfaces import DEVICE_TIME, LISTEN_ONLY, NO_CONTROLLER, known_options
-from capture.sources.can_source import open_can
-from capture.sources.python_can import bus_class, failure, fd_frames_of, frames_of
-from capture.sources.registry import open_source
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.can_interfaces import (
+    DEVICE_TIME,
+    LISTEN_ONLY,
+    NO_CONTROLLER,
+    known_options,
+)
+from undulog.capture.sources.can_source import open_can
+from undulog.capture.sources.python_can import bus_class, failure, fd_frames_of, frames_of
+from undulog.capture.sources.registry import open_source
 
 
 def message_of(frame) -> can.Message:

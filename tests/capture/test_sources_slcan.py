@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from can.util import len2dlc
 
-from capture.errors import SourceError, UsageError
-from capture.log.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG, empty_frames
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from capture.sources.registry import open_source
-from capture.sources.slcan_text import STAMP_PERIOD_MS, SlcanText
+from undulog.capture.errors import SourceError, UsageError
+from undulog.capture.log.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG, empty_frames
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.registry import open_source
+from undulog.capture.sources.slcan_text import STAMP_PERIOD_MS, SlcanText
 
 
 def lines(frames, stamps_ms=None) -> bytes:

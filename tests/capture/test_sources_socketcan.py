@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
-from capture.errors import SourceError
-from capture.log.frames import (
+from undulog.capture.errors import SourceError
+from undulog.capture.log.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -24,18 +24,18 @@ from capture.log.frames import (
     ID_MASK,
     REMOTE_FLAG,
 )
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from capture.sources.receive_many import (
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.receive_many import (
     SO_RXQ_OVFL,
     SO_TIMESTAMPNS,
     ArrivalClock,
     Batch,
     ReceiveMany,
 )
-from capture.sources.registry import open_source
-from capture.sources.socketcan import SocketcanLink, frames_of
+from undulog.capture.sources.registry import open_source
+from undulog.capture.sources.socketcan import SocketcanLink, frames_of
 
 
 def packed(frame) -> bytes:

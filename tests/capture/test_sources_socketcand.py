@@ -11,13 +11,13 @@ import can
 import numpy as np
 import pytest
 
-from capture.errors import UsageError
-from capture.log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, empty_frames
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from capture.sources.registry import open_source
-from capture.sources.socketcand_text import SocketcandText
+from undulog.capture.errors import UsageError
+from undulog.capture.log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, empty_frames
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.registry import open_source
+from undulog.capture.sources.socketcand_text import SocketcandText
 
 
 def messages(frames, blank: str = "") -> bytes:

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.errors import DataError, SourceError, UsageError
-from capture.log.frames import ERROR_FLAG, empty_frames
-from capture.robot import ClockDomain
-from capture.sources.address import parse_address
-from capture.sources.registry import open_source
-from capture.sources.sender import FrameSender
-from capture.sources.unix_socket import MOST_SENDERS
+from undulog.capture.errors import DataError, SourceError, UsageError
+from undulog.capture.log.frames import ERROR_FLAG, empty_frames
+from undulog.capture.robot import ClockDomain
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.registry import open_source
+from undulog.capture.sources.sender import FrameSender
+from undulog.capture.sources.unix_socket import MOST_SENDERS
 
 # Knows nothing of us but the packets: 32 bytes a frame, packed by struct.
 FOREIGN = """
@@ -41,7 +41,7 @@ peer.close()
 OURS = """
 import json, sys, time
 import numpy as np
-from capture.sources.sender import FrameSender
+from undulog.capture.sources.sender import FrameSender
 frames = np.load(sys.argv[1])
 with FrameSender(sys.argv[2]) as sender:
     at = 0

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from capture.daemon.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
-from capture.errors import UsageError
+from undulog.capture.daemon.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
+from undulog.capture.errors import UsageError
 
 PATIENCE_S = 60.0
 EXPOSURE = 2.0  # of 10, as `systemd-analyze security` counts; 2.5 would still be "OK"

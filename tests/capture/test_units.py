@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from capture.errors import UsageError
-from capture.robot import Quantity
-from capture.units import SESSION_UNIT, UNITS, unit_for, valid_units
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Quantity
+from undulog.capture.units import SESSION_UNIT, UNITS, unit_for, valid_units
 
 
 @pytest.mark.parametrize(

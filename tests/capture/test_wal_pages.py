@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from capture import Session
-from capture.log.frames import empty_frames
-from capture.log.wal import WriteAheadLog
-from capture.sources.sender import FrameSender
+from undulog.capture import Session
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.log.wal import WriteAheadLog
+from undulog.capture.sources.sender import FrameSender
 
 ROOT = Path(__file__).parents[2]
 PAGE = resource.getpagesize()

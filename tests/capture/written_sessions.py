@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
 
-from capture import SessionWriter
-from capture.log.schemas import schema_text
+from undulog.capture import SessionWriter
+from undulog.capture.log.schemas import schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import undulog
-from sim import load_scenario
-from sim.record import record
+from undulog.sim import load_scenario
+from undulog.sim.recording import record
 
 # What isn't there is {no} with a suffix, what is there {run}; outputs go to {out}.
 LINES = [

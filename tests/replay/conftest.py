@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from analysis.results.analysis import (
+from undulog.analysis.results.analysis import (
     Analysis,
     Coupling,
     Estimate,
@@ -19,8 +19,8 @@ from analysis.results.analysis import (
     SessionFacts,
     Window,
 )
-from capture import Session, SessionWriter, load_robot
-from capture.robot import Plane
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.robot import Plane
 
 EPOCH_NS = 1_735_689_600_000_000_000
 
@@ -280,7 +280,7 @@ def read_back():
 @pytest.fixture(scope="session")
 def recording(session_file, analysis, tmp_path_factory):
     """The whole session as a recording: (what was said, what is in the file)."""
-    from replay.rrd import write_recording
+    from undulog.replay.rrd import write_recording
 
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     with Session.open(session_file) as session:
@@ -291,7 +291,7 @@ def recording(session_file, analysis, tmp_path_factory):
 @pytest.fixture(scope="session")
 def rerun_command():
     """Runs Rerun's own command line; returns its standard output."""
-    from replay.viewer import viewer_binary
+    from undulog.replay.viewer import viewer_binary
 
     def run(*arguments):
         done = subprocess.run(
@@ -310,7 +310,7 @@ def rerun_command():
 @pytest.fixture(scope="module")
 def show(vulkan):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
-    from replay.headless import HeadlessViewer
+    from undulog.replay.headless import HeadlessViewer
 
     with ExitStack() as stack:
 

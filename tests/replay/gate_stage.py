@@ -18,7 +18,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from capture import SessionWriter, load_robot
+from undulog.capture import SessionWriter, load_robot
 
 UNDULOG = (sys.executable, "-m", "undulog")
 LISTENER = Path(__file__).with_name("bus_listener.py")

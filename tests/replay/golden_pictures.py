@@ -24,11 +24,11 @@ import rerun.blueprint as rrb
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from analysis.analyse import analyse_session
-from capture import Session
-from replay.headless import HeadlessViewer
-from replay.rrd import APPLICATION, write_recording
-from replay.views import build_views
+from undulog.analysis.analyse import analyse_session
+from undulog.capture import Session
+from undulog.replay.headless import HeadlessViewer
+from undulog.replay.rrd import APPLICATION, write_recording
+from undulog.replay.views import build_views
 
 FOLDER = Path(__file__).with_name("golden")
 SESSION = FOLDER / "session.mcap"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session, SessionWriter
-from replay.again.sameness import sameness
+from undulog.capture import Session, SessionWriter
+from undulog.replay.again.sameness import sameness
 
 ROBOT = """name = "chain5"
 description = "Five yaw joints."

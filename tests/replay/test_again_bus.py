@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session
+from undulog.capture import Session
 
 STEP = np.radians(0.01)  # of a command on the bus of snake25
 

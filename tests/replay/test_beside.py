@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.compare.compare import Choices, compare_sessions
-from capture import Session, SessionWriter, load_robot
-from capture.errors import LogWriteError
-from capture.interruption import StopRequest
-from capture.palette import joint_colors
-from replay.beside.alignment import Align, align, times_of
-from replay.beside.layout import all_views
-from replay.beside.side import convert, read_side
-from replay.beside.stoppable import StoppableSession
-from replay.beside.together import bring_together
-from replay.beside.write import Converted, write_beside
-from replay.samples.timeline import Rhythm
+from undulog.analysis.compare.compare import Choices, compare_sessions
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import LogWriteError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.palette import joint_colors
+from undulog.replay.beside.alignment import Align, align, times_of
+from undulog.replay.beside.layout import all_views
+from undulog.replay.beside.side import convert, read_side
+from undulog.replay.beside.stoppable import StoppableSession
+from undulog.replay.beside.together import bring_together
+from undulog.replay.beside.write import Converted, write_beside
+from undulog.replay.samples.timeline import Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")

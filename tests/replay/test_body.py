@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.robot.kinematics import link_poses
-from replay.samples.tracks import Track
-from replay.scene.body import (
+from undulog.capture.robot.kinematics import link_poses
+from undulog.replay.samples.tracks import Track
+from undulog.replay.scene.body import (
     ROUNDING,
     TURN_ROUNDING,
     capsule_columns,
@@ -14,8 +14,8 @@ from replay.scene.body import (
     capsule_shape,
     segment_power,
 )
-from replay.scene.markers import above_joints
-from replay.scene.motion import HeadPath, assemble, frames_of
+from undulog.replay.scene.markers import above_joints
+from undulog.replay.scene.motion import HeadPath, assemble, frames_of
 
 
 @pytest.fixture(scope="module")

@@ -12,15 +12,15 @@ import pytest
 from scipy.signal import lfilter
 
 import undulog as front
-from capture import Session, SessionWriter, load_robot
-from capture.interruption import StopRequest
-from replay.calibrate import cli
-from replay.calibrate.determined import ridges
-from replay.calibrate.misfit import misfit
-from replay.calibrate.noise import memory, score_covariance
-from replay.calibrate.parameters import Unknown
-from replay.calibrate.solve import solve
-from sim.scenario_file import load_scenario
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.interruption import StopRequest
+from undulog.replay.calibrate import cli
+from undulog.replay.calibrate.determined import ridges
+from undulog.replay.calibrate.misfit import misfit
+from undulog.replay.calibrate.noise import memory, score_covariance
+from undulog.replay.calibrate.parameters import Unknown
+from undulog.replay.calibrate.solve import solve
+from undulog.sim.scenario_file import load_scenario
 
 TRACE = Path(__file__).parents[2].parent / "shared/data/arcsnake/linear_trajectory.candump.log"
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from replay.scene.colors import power_colors, power_limit
+from undulog.replay.scene.colors import power_colors, power_limit
 
 
 def test_sign_and_size_of_power_can_be_read_from_the_colour():

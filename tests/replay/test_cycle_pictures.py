@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import undulog
-from capture import Session
-from capture.palette import joint_colors
-from replay.blueprint import build_blueprint
-from replay.results import computed
-from replay.rrd import write_recording
+from undulog.capture import Session
+from undulog.capture.palette import joint_colors
+from undulog.replay.blueprint import build_blueprint
+from undulog.replay.results import computed
+from undulog.replay.rrd import write_recording
 
 pytestmark = pytest.mark.slow
 

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from analysis.cycles import CycleMaps
-from analysis.results.analysis import Estimate
-from analysis.results.energy import EnergyResult, JointCycles, Transport
-from analysis.results.over_time import JointOverTime, ResponseOverTime
-from capture import Session
-from capture.palette import joint_colors
-from replay.cycles.heat_maps import cell_colors, heat_maps
-from replay.cycles.steps import (
+from undulog.analysis.cycles import CycleMaps
+from undulog.analysis.results.analysis import Estimate
+from undulog.analysis.results.energy import EnergyResult, JointCycles, Transport
+from undulog.analysis.results.over_time import JointOverTime, ResponseOverTime
+from undulog.capture import Session
+from undulog.capture.palette import joint_colors
+from undulog.replay.cycles.heat_maps import cell_colors, heat_maps
+from undulog.replay.cycles.steps import (
     ENERGY,
     GAIN,
     LAG,
@@ -20,9 +20,9 @@ from replay.cycles.steps import (
     cycle_tables,
     together,
 )
-from replay.plots.response import charts
-from replay.rrd import write_recording
-from replay.scene.colors import power_colors
+from undulog.replay.plots.response import charts
+from undulog.replay.rrd import write_recording
+from undulog.replay.scene.colors import power_colors
 
 STARTS = (0.0, 1.0, 2.0)
 STOPS = (1.0, 2.0, 3.0)

@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.robot.kinematics import link_poses
-from replay.cycles.ensemble import (
+from undulog.capture.robot.kinematics import link_poses
+from undulog.replay.cycles.ensemble import (
     DEGREES,
     body_frame,
     mean_cycles,
     pace_of,
 )
-from replay.plots.joints import Places
-from replay.samples.timeline import Rhythm
-from replay.samples.tracks import Track
+from undulog.replay.plots.joints import Places
+from undulog.replay.samples.timeline import Rhythm
+from undulog.replay.samples.tracks import Track
 
 EPOCH_NS = 1_735_689_600_000_000_000
 PHASE = np.radians(DEGREES)

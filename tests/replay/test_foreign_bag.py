@@ -9,10 +9,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import undulog
-from capture import Session
-from capture.errors import MissingChannelError
-from replay.plots.other_topics import is_foreign, log_others
-from replay.samples.renamed import RenamedSession
+from undulog.capture import Session
+from undulog.capture.errors import MissingChannelError
+from undulog.replay.plots.other_topics import is_foreign, log_others
+from undulog.replay.samples.renamed import RenamedSession
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]

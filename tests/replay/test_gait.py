@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from replay.plots.gait import changes, rhythm_of
-from replay.samples.tracks import Track
-from replay.scene.trail import trail_segments
+from undulog.replay.plots.gait import changes, rhythm_of
+from undulog.replay.samples.tracks import Track
+from undulog.replay.scene.trail import trail_segments
 
 T = np.arange(500, dtype=np.int64) * 10_000_000
 

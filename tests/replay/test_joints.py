@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from capture.palette import joint_colors
-from capture.robot import Plane
-from replay.plots.joints import head_middle_tail, joint_palette, tracking_errors
-from replay.plots.power import electrical_power, mechanical_power, total
-from replay.samples.tracks import Track
+from undulog.capture.palette import joint_colors
+from undulog.capture.robot import Plane
+from undulog.replay.plots.joints import head_middle_tail, joint_palette, tracking_errors
+from undulog.replay.plots.power import electrical_power, mechanical_power, total
+from undulog.replay.samples.tracks import Track
 
 T = np.arange(200, dtype=np.int64) * 10_000_000
 

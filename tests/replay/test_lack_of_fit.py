@@ -11,10 +11,10 @@ import pytest
 from scipy.signal import lfilter
 
 import undulog as front
-from capture import Session, SessionWriter
-from replay.calibrate.alternatives import play_direction
-from replay.calibrate.answers import Measured
-from replay.calibrate.lack_of_fit import (
+from undulog.capture import Session, SessionWriter
+from undulog.replay.calibrate.alternatives import play_direction
+from undulog.replay.calibrate.answers import Measured
+from undulog.replay.calibrate.lack_of_fit import (
     JointFit,
     LackOfFit,
     Unfitted,

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from analysis.analyse import analyse_session
-from capture import Session, SessionWriter
-from capture.daemon.live_wire import LiveMessage
-from capture.robot import Plane
-from replay.live.cycles import CycleMeter
-from replay.live.decode import LiveLog
+from undulog.analysis.analyse import analyse_session
+from undulog.capture import Session, SessionWriter
+from undulog.capture.daemon.live_wire import LiveMessage
+from undulog.capture.robot import Plane
+from undulog.replay.live.cycles import CycleMeter
+from undulog.replay.live.decode import LiveLog
 
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
 Recorder, Relay, EPOCH_NS = shared["Recorder"], shared["Relay"], shared["EPOCH_NS"]

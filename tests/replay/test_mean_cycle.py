@@ -7,15 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import undulog
-from analysis.analyse import measure_session
-from analysis.cycles import cycle_maps
-from analysis.results.analysis import Estimate
-from analysis.results.artefact import Artefact
-from capture import Session
-from replay.cycles.steps import cycle_tables
-from replay.results import computed
-from replay.rrd import write_recording
-from replay.samples.timeline import ENSEMBLE_CYCLE
+from undulog.analysis.analyse import measure_session
+from undulog.analysis.cycles import cycle_maps
+from undulog.analysis.results.analysis import Estimate
+from undulog.analysis.results.artefact import Artefact
+from undulog.capture import Session
+from undulog.replay.cycles.steps import cycle_tables
+from undulog.replay.results import computed
+from undulog.replay.rrd import write_recording
+from undulog.replay.samples.timeline import ENSEMBLE_CYCLE
 
 CHAIN = """name = "chain5"
 description = "Five yaw joints."

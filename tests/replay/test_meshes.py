@@ -7,8 +7,8 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter, load_robot
-from capture.robot.kinematics import link_poses
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.robot.kinematics import link_poses
 
 EPOCH_NS = 1_735_689_600_000_000_000
 SHAPES = "/world/snake/meshes"
@@ -29,7 +29,7 @@ def box(x, y, z):
 def robot(tmp_path_factory):
     """The shipped robot; all links but the head are boxes in millimetres."""
     folder = tmp_path_factory.mktemp("robot")
-    shipped = files("capture.robot") / "shipped"
+    shipped = files("undulog.capture.robot") / "shipped"
     text = (shipped / "snake25.toml").read_text()
     links = [f'{{ name = "link{i:02d}", mesh = "box.stl" }}' for i in range(2, 27)]
     entries = ",\n".join(['{ name = "link01" }', *links])
@@ -52,7 +52,7 @@ def angles():
 @pytest.fixture(scope="module")
 def file(robot, angles, tmp_path_factory):
     """That robot, recorded and converted."""
-    from replay.rrd import write_recording
+    from undulog.replay.rrd import write_recording
 
     folder = tmp_path_factory.mktemp("meshes")
     path = folder / "boxes.mcap"

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 
-from capture import Session
-from capture.palette import joint_colors
-from replay.rrd import write_recording
-from replay.views import build_views
+from undulog.capture import Session
+from undulog.capture.palette import joint_colors
+from undulog.replay.rrd import write_recording
+from undulog.replay.views import build_views
 
 pytestmark = pytest.mark.slow
 

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from analysis.results.analysis import Estimate
-from replay.plots.response import charts
+from undulog.analysis.results.analysis import Estimate
+from undulog.replay.plots.response import charts
 
 
 def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.compare.result import Comparison, NamedJoint
-from analysis.null_model.result import ModelledAnalysis, ModuleDeviation, NullModelResult
-from analysis.results.analysis import Coupling, Estimate, Provenance
-from analysis.results.experiment import (
+from undulog.analysis.compare.result import Comparison, NamedJoint
+from undulog.analysis.null_model.result import ModelledAnalysis, ModuleDeviation, NullModelResult
+from undulog.analysis.results.analysis import Coupling, Estimate, Provenance
+from undulog.analysis.results.experiment import (
     Experiment,
     FloorTilt,
     Headings,
@@ -17,10 +17,10 @@ from analysis.results.experiment import (
     Reversal,
     Run,
 )
-from capture import Session
-from capture.errors import DataError
-from capture.robot.kinematics import link_poses
-from replay.results import saved
+from undulog.capture import Session
+from undulog.capture.errors import DataError
+from undulog.capture.robot.kinematics import link_poses
+from undulog.replay.results import saved
 
 PINK = 0xFF5FBEFF
 NO_COUPLING = Coupling(identifiable=False, why="one gait")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
-from capture.errors import DataError, LogWriteError
-from capture.palette import joint_colors
-from replay.rrd import recording_id, write_recording
-from replay.scene.body import ROUNDING
+from undulog.capture import Session, SessionWriter
+from undulog.capture.errors import DataError, LogWriteError
+from undulog.capture.palette import joint_colors
+from undulog.replay.rrd import recording_id, write_recording
+from undulog.replay.scene.body import ROUNDING
 
 START = 1_735_689_600_000_000_000
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from replay.samples.sampling import (
+from undulog.replay.samples.sampling import (
     decimate,
     gaps,
     hold,

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session
-from capture.errors import UndulogError
-from capture.interruption import StopRequest
-from replay.drawing import clock_of
-from replay.layer import Layer
-from replay.results import computed
-from replay.rrd import recording_id, write_recording
-from replay.stream.apart import Analysing
-from replay.stream.excerpt import Excerpt
-from replay.stream.foresight import foreseen, same_arrangement
-from replay.stream.show import NoLongerWantedError, Task, show_session
-from replay.viewer import Viewer
+from undulog.capture import Session
+from undulog.capture.errors import UndulogError
+from undulog.capture.interruption import StopRequest
+from undulog.replay.drawing import clock_of
+from undulog.replay.layer import Layer
+from undulog.replay.results import computed
+from undulog.replay.rrd import recording_id, write_recording
+from undulog.replay.stream.apart import Analysing
+from undulog.replay.stream.excerpt import Excerpt
+from undulog.replay.stream.foresight import foreseen, same_arrangement
+from undulog.replay.stream.show import NoLongerWantedError, Task, show_session
+from undulog.replay.viewer import Viewer
 
 TOPICS = ("/joint_commands", "/joint_states")
 NS = 1_000_000_000

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
-from capture.robot import Plane
-from replay.rrd import write_recording
-from replay.samples import stretches
-from replay.samples.stretches import Span
-from replay.samples.survey import survey
+from undulog.capture import Session, SessionWriter
+from undulog.capture.robot import Plane
+from undulog.replay.rrd import write_recording
+from undulog.replay.samples import stretches
+from undulog.replay.samples.stretches import Span
+from undulog.replay.samples.survey import survey
 
 START = 1_735_689_600_000_000_000
 DRAWN = {

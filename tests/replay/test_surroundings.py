@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
-from replay.rrd import write_recording
-from sim import load_scenario
-from sim.world import Cylinder, Wall
+from undulog.capture import Session, SessionWriter
+from undulog.replay.rrd import write_recording
+from undulog.sim import load_scenario
+from undulog.sim.world import Cylinder, Wall
 
 EPOCH_NS = 1_735_689_600_000_000_000
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from replay.samples.timeline import (
+from undulog.replay.samples.timeline import (
     GAIT_CYCLE,
     ROWS_PER_CHUNK,
     SESSION_TIME,

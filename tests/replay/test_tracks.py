@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from replay.samples.sampling import hold, interpolate
-from replay.samples.tracks import (
+from undulog.replay.samples.sampling import hold, interpolate
+from undulog.replay.samples.tracks import (
     Track,
     brought_together,
     in_turn,

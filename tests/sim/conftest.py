@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from capture.robot import ClockDomain, Joint, Link, Plane, Robot, Servo
-from sim import PlaneGait, Scenario, Serpentine, World
+from undulog.capture.robot import ClockDomain, Joint, Link, Plane, Robot, Servo
+from undulog.sim import PlaneGait, Scenario, Serpentine, World
 
 
 @pytest.fixture(scope="session")

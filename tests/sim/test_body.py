@@ -8,14 +8,14 @@ import numpy as np
 import pybullet
 import pytest
 
-from capture.errors import UsageError
-from capture.robot import Link
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
-from sim.physics.bullet import BulletEngine
-from sim.physics.engine import EngineKind, Kernels, engine_type
-from sim.physics.steps import Steps
-from sim.twin import Twin
-from sim.urdf import frame_origins, urdf
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Link
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.sim.physics.bullet import BulletEngine
+from undulog.sim.physics.engine import EngineKind, Kernels, engine_type
+from undulog.sim.physics.steps import Steps
+from undulog.sim.twin import Twin
+from undulog.sim.urdf import frame_origins, urdf
 
 
 @pytest.fixture

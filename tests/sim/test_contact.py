@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.robot.kinematics import rotation_from_quaternion
-from sim import FrictionLaw, Ground
-from sim.physics.contact import GroundContact, friction_force, normal_force, tangents
-from sim.physics.steps import Steps
+from undulog.capture.robot.kinematics import rotation_from_quaternion
+from undulog.sim import FrictionLaw, Ground
+from undulog.sim.physics.contact import GroundContact, friction_force, normal_force, tangents
+from undulog.sim.physics.steps import Steps
 
 COULOMB = tuple(law for law in FrictionLaw if law is not FrictionLaw.VISCOUS)
 MU = np.array([[0.05], [0.5]])

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.control.filters import LowPass, NearMemory, SideLatch
-from sim.control.laws import amplitude, bend, frequency
-from sim.control.phase_history import TURN, BodyWave, PathHeading, PhaseHistory
+from undulog.sim.control.filters import LowPass, NearMemory, SideLatch
+from undulog.sim.control.laws import amplitude, bend, frequency
+from undulog.sim.control.phase_history import TURN, BodyWave, PathHeading, PhaseHistory
 
 DISTANCES = np.linspace(0.0, 3.0, 31)
 

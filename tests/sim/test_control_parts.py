@@ -6,17 +6,17 @@ import math
 import numpy as np
 import pytest
 
-from capture.robot import Plane, Robot, Sensor, SensorKind
-from capture.robot.description import load_robot
-from sim import PlaneGait, Readings, Serpentine
-from sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
-from sim.control.course import RandomCourse, StraightOn, TargetCourse
-from sim.control.distances import Distances
-from sim.control.layout import layout
-from sim.control.lookout import Lookout
-from sim.control.moment import Moment
-from sim.control.odometry import SlipOdometry
-from sim.control.parameters import (
+from undulog.capture.robot import Plane, Robot, Sensor, SensorKind
+from undulog.capture.robot.description import load_robot
+from undulog.sim import PlaneGait, Readings, Serpentine
+from undulog.sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
+from undulog.sim.control.course import RandomCourse, StraightOn, TargetCourse
+from undulog.sim.control.distances import Distances
+from undulog.sim.control.layout import layout
+from undulog.sim.control.lookout import Lookout
+from undulog.sim.control.moment import Moment
+from undulog.sim.control.odometry import SlipOdometry
+from undulog.sim.control.parameters import (
     Controller,
     ControllerKind,
     HeadSteering,
@@ -25,9 +25,9 @@ from sim.control.parameters import (
     TailHaste,
     TargetHeading,
 )
-from sim.control.parameters import Lookout as LookoutParameters
-from sim.control.reckoning import Pose
-from sim.gait import WALK, generator
+from undulog.sim.control.parameters import Lookout as LookoutParameters
+from undulog.sim.control.reckoning import Pose
+from undulog.sim.gait import WALK, generator
 
 SNAKE = load_robot("snake25")
 WAVE = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 0.5, math.pi / 6)}, ramp_s=0.0)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session
-from sim import load_scenario
-from sim.record import record
-from sim.twin import Twin
-from sim.world import Target
+from undulog.capture import Session
+from undulog.sim import load_scenario
+from undulog.sim.recording import record
+from undulog.sim.twin import Twin
+from undulog.sim.world import Target
 
 PERIOD = 200
 """Ticks of a gait period at 0.5 Hz."""

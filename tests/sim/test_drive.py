@@ -13,15 +13,15 @@ import pytest
 from mcap.reader import make_reader
 
 import undulog as front
-from capture import Session
-from capture.errors import DataError
-from capture.log.writer import SessionWriter
-from capture.robot import Plane
-from sim import PlaneGait, Readings, Serpentine, SerpentineGait
-from sim.drive.command_session import CommandReplay, RecordedCommands
-from sim.drive.fading import FadingGait
-from sim.gait import GaitTick
-from sim.scenario_file import load_scenario, parse_scenario, scenario_names
+from undulog.capture import Session
+from undulog.capture.errors import DataError
+from undulog.capture.log.writer import SessionWriter
+from undulog.capture.robot import Plane
+from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait
+from undulog.sim.drive.command_session import CommandReplay, RecordedCommands
+from undulog.sim.drive.fading import FadingGait
+from undulog.sim.gait import GaitTick
+from undulog.sim.scenario_file import load_scenario, parse_scenario, scenario_names
 
 T0_NS = 10**18
 COLUMNS = (

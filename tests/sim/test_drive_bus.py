@@ -13,29 +13,29 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session, SessionWriter, load_robot
-from capture.bus.encoding import BusEncoder
-from capture.errors import LogWriteError, SourceError, UsageError
-from capture.interruption import StopRequest
-from capture.log.frames import DIR_TX
-from capture.robot import Direction, OnFault, Quantity
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from sim import load_scenario
-from sim.control.build import build_gait
-from sim.drive.driven import find_driven
-from sim.drive.link import find_virtual_robot, sent_text
-from sim.drive.loop import CommandEncoder
-from sim.drive.open_link import open_link
-from sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
-from sim.drive.pace import WallPace
-from sim.gate.outcome import How
-from sim.sensing.contract import JointSample
-from sim.serve.bus import VirtualBus
-from sim.serve.pacing import Pacer
-from sim.serve.robot import PERIOD_NS, VirtualRobot
-from sim.serve.socketcand_server import SocketcandServer
-from sim.twin import Twin
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.bus.encoding import BusEncoder
+from undulog.capture.errors import LogWriteError, SourceError, UsageError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import DIR_TX
+from undulog.capture.robot import Direction, OnFault, Quantity
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.sim import load_scenario
+from undulog.sim.control.build import build_gait
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.drive.link import find_virtual_robot, sent_text
+from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.drive.open_link import open_link
+from undulog.sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
+from undulog.sim.drive.pace import WallPace
+from undulog.sim.gate.outcome import How
+from undulog.sim.sensing.contract import JointSample
+from undulog.sim.serve.bus import VirtualBus
+from undulog.sim.serve.pacing import Pacer
+from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
+from undulog.sim.serve.socketcand_server import SocketcandServer
+from undulog.sim.twin import Twin
 
 STEP = np.radians(0.01)  # of a command on the bus of snake25
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.errors import PlanError
-from capture.robot import Plane
-from sim import PlaneGait, Readings, Serpentine, SerpentineGait, load_scenario
-from sim.drive.plan import Plan, PlanGait, Segment
-from sim.drive.plan_file import is_plan, parse_plan
+from undulog.capture.errors import PlanError
+from undulog.capture.robot import Plane
+from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, load_scenario
+from undulog.sim.drive.plan import Plan, PlanGait, Segment
+from undulog.sim.drive.plan_file import is_plan, parse_plan
 
 H, V = Plane.HORIZONTAL, Plane.VERTICAL
 SLOW = PlaneGait(0.2, 0.5, 0.6)

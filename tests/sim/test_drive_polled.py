@@ -9,14 +9,14 @@ import can
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
-from capture.bus.polling import poll_frames
-from capture.interruption import StopRequest
-from capture.log.frames import DIR_RX, DIR_TX
-from capture.robot.description import load_robot
-from sim.drive.driven import find_driven
-from sim.drive.over_bus import bus_plan, drive_bus
-from sim.gate.outcome import How
+from undulog.capture import Session, SessionWriter
+from undulog.capture.bus.polling import poll_frames
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import DIR_RX, DIR_TX
+from undulog.capture.robot.description import load_robot
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.drive.over_bus import bus_plan, drive_bus
+from undulog.sim.gate.outcome import How
 
 SHIPPED = load_robot("arcsnake-joint")
 SAFETY = """

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from capture import Session
-from capture.log.frames import DIR_TX
+from undulog.capture import Session
+from undulog.capture.log.frames import DIR_TX
 
 pytestmark = pytest.mark.slow
 

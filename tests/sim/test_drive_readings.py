@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from capture import load_robot
-from capture.bus.encoding import BusEncoder
-from capture.log.frames import DIR_TX, empty_frames
-from capture.robot import Direction, Quantity
-from sim.drive.readings_from_bus import BusReadings
+from undulog.capture import load_robot
+from undulog.capture.bus.encoding import BusEncoder
+from undulog.capture.log.frames import DIR_TX, empty_frames
+from undulog.capture.robot import Direction, Quantity
+from undulog.sim.drive.readings_from_bus import BusReadings
 
 
 @pytest.fixture

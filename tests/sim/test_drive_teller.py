@@ -7,10 +7,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from capture.daemon.control import ControlServer
-from capture.errors import ControlError
-from sim.drive.gait_teller import GaitTeller
-from sim.gait import GaitTick
+from undulog.capture.daemon.control import ControlServer
+from undulog.capture.errors import ControlError
+from undulog.sim.drive.gait_teller import GaitTeller
+from undulog.sim.gait import GaitTick
 
 NAMES = tuple(f"horizontal.{key}" for key in ("A", "omega", "lag", "offset", "phase"))
 

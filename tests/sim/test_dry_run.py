@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session, SessionWriter, load_robot
-from capture.errors import SimulationError
-from capture.robot import Safety
-from capture.robot.description import parse_robot
-from sim.drive.driven import find_driven
-from sim.gate.dry_run import Verdict, dry_run, nominal_world
-from sim.gate.dry_run_text import reported, told
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.errors import SimulationError
+from undulog.capture.robot import Safety
+from undulog.capture.robot.description import parse_robot
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.gate.dry_run import Verdict, dry_run, nominal_world
+from undulog.sim.gate.dry_run_text import reported, told
 
 EPOCH_NS = 1_735_689_600_000_000_000
 RATE_HZ = 100

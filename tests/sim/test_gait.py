@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from capture.robot import Plane
-from sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from sim.gait.limits import smoothstep, within_limits
+from undulog.capture.robot import Plane
+from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
+from undulog.sim.gait.limits import smoothstep, within_limits
 
 NOTHING = Readings(np.empty(0), np.empty(0))
 

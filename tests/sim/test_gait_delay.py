@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from capture.robot import Plane
-from sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from sim.gait import DelayBlockGait, DelayBlocks, DelayLine, Modulation
-from sim.gait.delay_blocks import DelayedPhase
+from undulog.capture.robot import Plane
+from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
+from undulog.sim.gait import DelayBlockGait, DelayBlocks, DelayLine, Modulation
+from undulog.sim.gait.delay_blocks import DelayedPhase
 
 NOTHING = Readings(np.empty(0), np.empty(0))
 YAW = slice(0, 25, 2)

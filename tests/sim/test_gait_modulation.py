@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.errors import UsageError
-from capture.robot import ClockDomain, Joint, Link, Plane, Robot
-from sim import PlaneGait, Readings, Serpentine, Wave
-from sim.gait import (
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import ClockDomain, Joint, Link, Plane, Robot
+from undulog.sim import PlaneGait, Readings, Serpentine, Wave
+from undulog.sim.gait import (
     DelayBlocks,
     DelayLine,
     Modulation,

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from capture import Session
-from capture.robot import Plane
-from sim import Readings, load_scenario
-from sim.gait import generator
-from sim.record import record
-from sim.twin import Twin
+from undulog.capture import Session
+from undulog.capture.robot import Plane
+from undulog.sim import Readings, load_scenario
+from undulog.sim.gait import generator
+from undulog.sim.recording import record
+from undulog.sim.twin import Twin
 
 CYCLE = 200  # ticks
 

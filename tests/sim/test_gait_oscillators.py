@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from capture.robot import Plane
-from sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from sim.gait import Modulation, OscillatorChain, OscillatorChains, OscillatorGait, OscillatorKind
-from sim.gait.approach import Approach
+from undulog.capture.robot import Plane
+from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
+from undulog.sim.gait import (
+    Modulation,
+    OscillatorChain,
+    OscillatorChains,
+    OscillatorGait,
+    OscillatorKind,
+)
+from undulog.sim.gait.approach import Approach
 
 OMEGA = math.pi
 PSI = math.pi / 6

@@ -8,12 +8,12 @@ import tomlkit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture import load_robot
-from capture.errors import ScenarioError
-from capture.robot import Plane
-from capture.strict_table import Faults, Table
-from sim import PlaneGait, Readings, Serpentine, Wave, parse_scenario
-from sim.gait import (
+from undulog.capture import load_robot
+from undulog.capture.errors import ScenarioError
+from undulog.capture.robot import Plane
+from undulog.capture.strict_table import Faults, Table
+from undulog.sim import PlaneGait, Readings, Serpentine, Wave, parse_scenario
+from undulog.sim.gait import (
     DelayBlocks,
     DelayLine,
     OscillatorChain,
@@ -21,7 +21,7 @@ from sim.gait import (
     OscillatorKind,
     generator,
 )
-from sim.gait.toml import gait_table, read_gait
+from undulog.sim.gait.toml import gait_table, read_gait
 
 ROBOT = load_robot("snake13")  # 6 joints in each plane
 

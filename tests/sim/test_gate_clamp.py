@@ -10,17 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from capture import load_robot
-from capture.errors import UsageError
-from capture.robot import OnFault
-from sim.drive.loop import CommandEncoder
-from sim.gate.clamp import Clamp
-from sim.gate.ending import Ending
-from sim.gate.limits import gate_limits
-from sim.gate.ramp import Ramp
-from sim.gate.spacing import Spacing
-from sim.gate.status import JointStatus
-from sim.gate.yielding import Yielding
+from undulog.capture import load_robot
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import OnFault
+from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.gate.clamp import Clamp
+from undulog.sim.gate.ending import Ending
+from undulog.sim.gate.limits import gate_limits
+from undulog.sim.gate.ramp import Ramp
+from undulog.sim.gate.spacing import Spacing
+from undulog.sim.gate.status import JointStatus
+from undulog.sim.gate.yielding import Yielding
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

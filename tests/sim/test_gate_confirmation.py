@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import load_robot
-from sim.gate.clamp import Clamp
-from sim.gate.confirmation import Confirmation
-from sim.gate.limits import gate_limits
-from sim.gate.silence import Silence
+from undulog.capture import load_robot
+from undulog.sim.gate.clamp import Clamp
+from undulog.sim.gate.confirmation import Confirmation
+from undulog.sim.gate.limits import gate_limits
+from undulog.sim.gate.silence import Silence
 
 sys.path.insert(0, str(Path(__file__).parent))
 from far_end import beyond_rate, largest_burst

@@ -5,21 +5,21 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture import load_robot
-from capture.errors import SourceError, UsageError
-from capture.log.frames import DIR_TX, ERROR_FLAG, empty_frames
-from capture.robot import OnFault
-from capture.sources.bus_watch import BUS_OFF
-from sim.gait import GaitTick
-from sim.gate.faults import FaultKind, GateFault
-from sim.gate.gate import HOLD_S, POSE_S, Gate
-from sim.gate.lateness import jitter
-from sim.gate.limits import gate_limits
-from sim.gate.outcome import How
-from sim.gate.presence import Presence
-from sim.gate.status import JointStatus
-from sim.gate.tick import Heard, Phase
-from sim.readings import Readings
+from undulog.capture import load_robot
+from undulog.capture.errors import SourceError, UsageError
+from undulog.capture.log.frames import DIR_TX, ERROR_FLAG, empty_frames
+from undulog.capture.robot import OnFault
+from undulog.capture.sources.bus_watch import BUS_OFF
+from undulog.sim.gait import GaitTick
+from undulog.sim.gate.faults import FaultKind, GateFault
+from undulog.sim.gate.gate import HOLD_S, POSE_S, Gate
+from undulog.sim.gate.lateness import jitter
+from undulog.sim.gate.limits import gate_limits
+from undulog.sim.gate.outcome import How
+from undulog.sim.gate.presence import Presence
+from undulog.sim.gate.status import JointStatus
+from undulog.sim.gate.tick import Heard, Phase
+from undulog.sim.readings import Readings
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

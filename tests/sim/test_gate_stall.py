@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import Session, SessionWriter
-from capture.robot.description import load_robot
+from undulog.capture import Session, SessionWriter
+from undulog.capture.robot.description import load_robot
 
 sys.path.insert(0, str(Path(__file__).parent))
 from far_end import beyond_rate, largest_burst

@@ -13,17 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from capture import load_robot
-from capture.errors import SourceError, UsageError
-from capture.robot import OnFault
-from sim.drive.loop import CommandEncoder
-from sim.gait import GaitTick
-from sim.gate.faults import FaultKind, GateFault
-from sim.gate.gate import Gate
-from sim.gate.limits import gate_limits
-from sim.gate.status import JointStatus
-from sim.gate.tick import Heard, Phase
-from sim.readings import Readings
+from undulog.capture import load_robot
+from undulog.capture.errors import SourceError, UsageError
+from undulog.capture.robot import OnFault
+from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.gait import GaitTick
+from undulog.sim.gate.faults import FaultKind, GateFault
+from undulog.sim.gate.gate import Gate
+from undulog.sim.gate.limits import gate_limits
+from undulog.sim.gate.status import JointStatus
+from undulog.sim.gate.tick import Heard, Phase
+from undulog.sim.readings import Readings
 
 ROBOT = load_robot("snake25")
 COUNT, RATE_HZ = len(ROBOT.joints), 100

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.robot import Sensor, SensorKind
-from sim.physics.steps import Steps
-from sim.sensing.accelerometer import Accelerometer
-from sim.sensing.compass import Compass
-from sim.sensing.model import AccelerometerModel, CompassModel
-from sim.sensing.mount import rotation_from_rpy
+from undulog.capture.robot import Sensor, SensorKind
+from undulog.sim.physics.steps import Steps
+from undulog.sim.sensing.accelerometer import Accelerometer
+from undulog.sim.sensing.compass import Compass
+from undulog.sim.sensing.model import AccelerometerModel, CompassModel
+from undulog.sim.sensing.mount import rotation_from_rpy
 
 DT, PERIOD, G = 1e-3, 10, 9.81
 GRAVITY = (0.0, 0.0, -G)

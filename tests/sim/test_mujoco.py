@@ -9,13 +9,13 @@ import sys
 import numpy as np
 import pytest
 
-from capture.errors import SimulationError, UsageError
-from capture.robot import Link, Plane
-from sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
-from sim.physics.engine import EngineKind, engine_type
-from sim.physics.ledger import TERMS
-from sim.twin import Twin
-from sim.world.obstacles import Box, Cylinder
+from undulog.capture.errors import SimulationError, UsageError
+from undulog.capture.robot import Link, Plane
+from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
+from undulog.sim.physics.engine import EngineKind, engine_type
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.twin import Twin
+from undulog.sim.world.obstacles import Box, Cylinder
 
 pytest.importorskip("mujoco")
 
@@ -127,9 +127,9 @@ def test_engines_agree_on_an_uneven_body_that_tumbles(uneven):
 def test_two_processes_find_the_same_bits(tmp_path):
     code = """
 import dataclasses, hashlib
-from sim import load_scenario
-from sim.physics.engine import EngineKind
-from sim.twin import Twin
+from undulog.sim import load_scenario
+from undulog.sim.physics.engine import EngineKind
+from undulog.sim.twin import Twin
 scenario = load_scenario("flat").changed(duration_s=0.5)
 with Twin(dataclasses.replace(scenario, engine=EngineKind.MUJOCO)) as twin:
     rows = [b"".join(part.tobytes() for part in s.step.body) for s in twin.samples()]

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from sim import FrictionLaw, Ground, World
-from sim.physics.engine import EngineKind
-from sim.physics.ledger import TERMS
-from sim.twin import Twin
-from sim.world.model import tilted_gravity
+from undulog.sim import FrictionLaw, Ground, World
+from undulog.sim.physics.engine import EngineKind
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.twin import Twin
+from undulog.sim.world.model import tilted_gravity
 
 G, MASS, RADIUS = 9.81, 0.1, 0.025
 STIFFNESS, SLIP_SPEED = Ground.stiffness, Ground.slip_speed

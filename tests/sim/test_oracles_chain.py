@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from capture.robot import Link, Plane
-from sim import PlaneGait, Serpentine, World
-from sim.physics.engine import EngineKind, engine_type
-from sim.twin import Twin
+from undulog.capture.robot import Link, Plane
+from undulog.sim import PlaneGait, Serpentine, World
+from undulog.sim.physics.engine import EngineKind, engine_type
+from undulog.sim.twin import Twin
 
 IN_SPACE = {"gravity": (0, 0, 0), "height": 0.0, "heading": 0.4, "velocity": (0.1, 0.0, 0.0)}
 

@@ -10,9 +10,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.robot import Plane
-from sim import load_scenario
-from sim.twin import Twin
+from undulog.capture.robot import Plane
+from undulog.sim import load_scenario
+from undulog.sim.twin import Twin
 
 pytestmark = pytest.mark.slow
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from sim.physics.steps import Steps
-from sim.sensing.model import Noise, ServoPolling
-from sim.sensing.polling import JointPolling
+from undulog.sim.physics.steps import Steps
+from undulog.sim.sensing.model import Noise, ServoPolling
+from undulog.sim.sensing.polling import JointPolling
 
 DT, N, JOINTS = 1e-3, 10, 4
 

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim import World, parse_scenario
-from sim.physics.engine import EngineKind
-from sim.physics.ledger import TERMS
-from sim.twin import Twin
-from sim.world import Push
+from undulog.sim import World, parse_scenario
+from undulog.sim.physics.engine import EngineKind
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.twin import Twin
+from undulog.sim.world import Push
 
 FREE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 TEXT = """

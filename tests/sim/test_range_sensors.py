@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from capture.robot import Sensor, SensorKind
-from sim.physics.steps import Steps
-from sim.sensing.ir import Infrared, decoded, voltage
-from sim.sensing.model import InfraredModel, SonarModel
-from sim.sensing.sonar import Sonar, cone
-from sim.world import Cylinder, Wall
-from sim.world.rays import RayCaster
+from undulog.capture.robot import Sensor, SensorKind
+from undulog.sim.physics.steps import Steps
+from undulog.sim.sensing.ir import Infrared, decoded, voltage
+from undulog.sim.sensing.model import InfraredModel, SonarModel
+from undulog.sim.sensing.sonar import Sonar, cone
+from undulog.sim.world import Cylinder, Wall
+from undulog.sim.world.rays import RayCaster
 
 DT, PERIOD = 1e-3, 10
 EXACT = InfraredModel(noise_v=0.0, adc_bits=24)

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from capture.errors import RobotFileError, ScenarioError, UsageError
-from capture.robot import Plane
-from sim import FrictionLaw, Wave, load_scenario, parse_scenario, scenario_names
+from undulog.capture.errors import RobotFileError, ScenarioError, UsageError
+from undulog.capture.robot import Plane
+from undulog.sim import FrictionLaw, Wave, load_scenario, parse_scenario, scenario_names
 
 MINIMAL = """
 description = "a test"

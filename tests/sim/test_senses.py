@@ -9,10 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from capture import Session
-from capture.errors import ScenarioError
-from capture.robot import Plane
-from sim import (
+from undulog.capture import Session
+from undulog.capture.errors import ScenarioError
+from undulog.capture.robot import Plane
+from undulog.sim import (
     Cylinder,
     Readings,
     SensorModels,
@@ -21,9 +21,9 @@ from sim import (
     load_scenario,
     parse_scenario,
 )
-from sim.record import record
-from sim.sensing.contract import JointSample, RangeSample, VectorSample
-from sim.twin import Twin
+from undulog.sim.recording import record
+from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
+from undulog.sim.twin import Twin
 
 SCENARIO = """
 description = "a test"

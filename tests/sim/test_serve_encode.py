@@ -6,16 +6,16 @@ import cantools
 import numpy as np
 import pytest
 
-from capture import load_robot
-from capture.bus.decoding import BusDecoder
-from capture.bus.encoding import BusEncoder
-from capture.errors import DataError
-from capture.log.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, empty_frames
-from capture.robot import Direction, Quantity
-from capture.robot.description import parse_robot
-from sim.sensing.contract import JointSample, RangeSample, VectorSample
-from sim.serve.commands import CommandLatch
-from sim.serve.encode import ReplyEncoder
+from undulog.capture import load_robot
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.bus.encoding import BusEncoder
+from undulog.capture.errors import DataError
+from undulog.capture.log.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, empty_frames
+from undulog.capture.robot import Direction, Quantity
+from undulog.capture.robot.description import parse_robot
+from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
+from undulog.sim.serve.commands import CommandLatch
+from undulog.sim.serve.encode import ReplyEncoder
 
 STEP = {"position": 0.01, "velocity": 0.1, "torque": 1, "current": 1}
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from capture import Session, load_robot
-from capture.errors import ScenarioError, UsageError
-from sim import load_scenario, parse_scenario
-from sim.record import record
-from sim.serve.faults import BusFault, FaultKind, parse_faults
+from undulog.capture import Session, load_robot
+from undulog.capture.errors import ScenarioError, UsageError
+from undulog.sim import load_scenario, parse_scenario
+from undulog.sim.recording import record
+from undulog.sim.serve.faults import BusFault, FaultKind, parse_faults
 
 ROBOT = load_robot("snake25")
 BASE = """

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.log.frames import empty_frames
-from sim.serve.socketcand_server import SocketcandServer
-from sim.serve.socketcand_text import ClientText
+from undulog.capture.log.frames import empty_frames
+from undulog.sim.serve.socketcand_server import SocketcandServer
+from undulog.sim.serve.socketcand_text import ClientText
 
 WORDS = (
     b"< open can0 >",

@@ -6,11 +6,11 @@ import time
 import numpy as np
 import pytest
 
-from capture.log.frames import empty_frames
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from sim.drive.link import find_virtual_robot
-from sim.serve.socketcand_server import HOLD_S, SocketcandServer
+from undulog.capture.log.frames import empty_frames
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.sim.drive.link import find_virtual_robot
+from undulog.sim.serve.socketcand_server import HOLD_S, SocketcandServer
 
 COUNT = 40
 

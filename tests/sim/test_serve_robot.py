@@ -9,25 +9,25 @@ import can
 import numpy as np
 import pytest
 
-from capture import load_robot
-from capture.bus.decoding import BusDecoder
-from capture.bus.encoding import BusEncoder
-from capture.interruption import StopRequest
-from capture.log.frames import ERROR_FLAG, empty_frames
-from capture.robot import Direction, Quantity
-from capture.robot.description import parse_robot
-from sim.gait import GaitTick
-from sim.scenario import CONTROL_RATE_HZ
-from sim.sensing import Noise, SensorModels, ServoPolling
-from sim.sensing.contract import JointSample
-from sim.serve.bus import VirtualBus
-from sim.serve.encode import ReplyEncoder
-from sim.serve.fault_line import FaultLine
-from sim.serve.faults import parse_faults
-from sim.serve.pacing import PATIENCE_NS, Pacer
-from sim.serve.robot import PERIOD_NS, VirtualRobot
-from sim.serve.socketcand_server import SocketcandServer
-from sim.twin import Twin
+from undulog.capture import load_robot
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.bus.encoding import BusEncoder
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.frames import ERROR_FLAG, empty_frames
+from undulog.capture.robot import Direction, Quantity
+from undulog.capture.robot.description import parse_robot
+from undulog.sim.gait import GaitTick
+from undulog.sim.scenario import CONTROL_RATE_HZ
+from undulog.sim.sensing import Noise, SensorModels, ServoPolling
+from undulog.sim.sensing.contract import JointSample
+from undulog.sim.serve.bus import VirtualBus
+from undulog.sim.serve.encode import ReplyEncoder
+from undulog.sim.serve.fault_line import FaultLine
+from undulog.sim.serve.faults import parse_faults
+from undulog.sim.serve.pacing import PATIENCE_NS, Pacer
+from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
+from undulog.sim.serve.socketcand_server import SocketcandServer
+from undulog.sim.twin import Twin
 
 JOINTS = 4
 STEP = math.radians(0.01)

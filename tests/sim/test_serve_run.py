@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 
 import undulog as front
-from capture import Session, load_robot
-from capture.log.session_check import check_session
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from sim.drive.driven import find_driven
-from sim.drive.link import find_virtual_robot
-from sim.drive.loop import CommandEncoder
-from sim.readings import Readings
+from undulog.capture import Session, load_robot
+from undulog.capture.log.session_check import check_session
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.drive.link import find_virtual_robot
+from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.readings import Readings
 
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]

@@ -15,18 +15,18 @@ from can.interfaces.socketcand.socketcand import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from capture import SessionWriter
-from capture.errors import UsageError
-from capture.log.frames import DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, empty_frames
-from capture.sources.address import parse_address
-from capture.sources.contract import SourceContext
-from capture.sources.events import Tally
-from capture.sources.records import records
-from capture.sources.registry import open_source
-from capture.sources.socketcand_text import SocketcandText
-from sim.serve.bus import VirtualBus
-from sim.serve.socketcand_server import MOST_CLIENTS, MOST_SENT, SocketcandServer
-from sim.serve.socketcand_text import ClientText, frame_text, sent_frame
+from undulog.capture import SessionWriter
+from undulog.capture.errors import UsageError
+from undulog.capture.log.frames import DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, empty_frames
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import SourceContext
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.records import records
+from undulog.capture.sources.registry import open_source
+from undulog.capture.sources.socketcand_text import SocketcandText
+from undulog.sim.serve.bus import VirtualBus
+from undulog.sim.serve.socketcand_server import MOST_CLIENTS, MOST_SENT, SocketcandServer
+from undulog.sim.serve.socketcand_text import ClientText, frame_text, sent_frame
 
 PATIENCE_S = 60.0
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.robot import Servo
-from sim.physics.servo import Rotors, Servos
+from undulog.capture.robot import Servo
+from undulog.sim.physics.servo import Rotors, Servos
 
 
 def rotors(*speeds):

@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from capture.errors import ScenarioError
-from capture.robot import Plane, Servo
-from sim import PlaneGait, Serpentine, World
-from sim.physics.engine import EngineKind, Kernels
-from sim.physics.ledger import TERMS
-from sim.physics.servo import Rotors, Servos
-from sim.scenario_file import load_scenario, parse_scenario
-from sim.stability import stability
-from sim.twin import Twin
+from undulog.capture.errors import ScenarioError
+from undulog.capture.robot import Plane, Servo
+from undulog.sim import PlaneGait, Serpentine, World
+from undulog.sim.physics.engine import EngineKind, Kernels
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.physics.servo import Rotors, Servos
+from undulog.sim.scenario_file import load_scenario, parse_scenario
+from undulog.sim.stability import stability
+from undulog.sim.twin import Twin
 
 DT = 1e-3
 

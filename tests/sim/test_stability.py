@@ -5,12 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.errors import SimulationError
-from capture.robot import Plane
-from sim import FrictionLaw, Ground, PlaneGait, Serpentine, World, load_scenario, scenario_names
-from sim.stability import likely_cause, stability, warnings
-from sim.twin import Twin
-from sim.world import Cylinder, ObstacleMaterial
+from undulog.capture.errors import SimulationError
+from undulog.capture.robot import Plane
+from undulog.sim import (
+    FrictionLaw,
+    Ground,
+    PlaneGait,
+    Serpentine,
+    World,
+    load_scenario,
+    scenario_names,
+)
+from undulog.sim.stability import likely_cause, stability, warnings
+from undulog.sim.twin import Twin
+from undulog.sim.world import Cylinder, ObstacleMaterial
 
 IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 

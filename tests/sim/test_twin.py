@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from capture.errors import SimulationError
-from capture.robot import Plane
-from sim import FrictionLaw, Ground, PlaneGait, Serpentine, Wave, World
-from sim.physics.ledger import TERMS
-from sim.sensing.contract import JointSample
-from sim.twin import Twin
+from undulog.capture.errors import SimulationError
+from undulog.capture.robot import Plane
+from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, Wave, World
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.sensing.contract import JointSample
+from undulog.sim.twin import Twin
 
 G = 9.81
 

@@ -5,8 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from capture.errors import ScenarioError, UsageError
-from sim import Box, Cylinder, Ground, ObstacleMaterial, RandomField, Target, Wall, parse_scenario
+from undulog.capture.errors import ScenarioError, UsageError
+from undulog.sim import (
+    Box,
+    Cylinder,
+    Ground,
+    ObstacleMaterial,
+    RandomField,
+    Target,
+    Wall,
+    parse_scenario,
+)
 
 HEAD = """
 description = "a test"

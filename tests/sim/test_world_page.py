@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim import (
+from undulog.sim import (
     AccelerometerModel,
     CompassModel,
     InfraredModel,

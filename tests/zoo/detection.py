@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.following import JointMotion, joints_not_following
-from capture.following.motion import Samples
+from undulog.capture.following import JointMotion, joints_not_following
+from undulog.capture.following.motion import Samples
 
 from .outputs import Named, Statement
 from .robot import Log

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
-from analysis.analyse import analyse_session
-from analysis.compare.compare import Choices, compare_sessions
-from analysis.report import render
-from analysis.results.answer import Answer
-from analysis.stretch import Options
-from capture import Session
-from capture.errors import UndulogError
-from capture.log.session_check import check_session
-from replay.content import Content
-from replay.facts import markdown
+from undulog.analysis.analyse import analyse_session
+from undulog.analysis.compare.compare import Choices, compare_sessions
+from undulog.analysis.report import render
+from undulog.analysis.results.answer import Answer
+from undulog.analysis.stretch import Options
+from undulog.capture import Session
+from undulog.capture.errors import UndulogError
+from undulog.capture.log.session_check import check_session
+from undulog.replay.content import Content
+from undulog.replay.facts import markdown
 
 from .robot import SECOND_TOPIC
 

@@ -14,13 +14,13 @@ from zoo.planting import RESPONSE
 from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
 
 import undulog
-from capture import Session, load_robot
-from capture.sources.address import parse_address
-from capture.sources.events import Tally
-from sim.drive.driven import find_driven
-from sim.drive.link import find_virtual_robot
-from sim.drive.loop import CommandEncoder
-from sim.readings import Readings
+from undulog.capture import Session, load_robot
+from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.events import Tally
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.drive.link import find_virtual_robot
+from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.readings import Readings
 
 UNDULOG = [sys.executable, "-m", "undulog"]
 PATIENCE_S = 300

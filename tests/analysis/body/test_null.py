@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from analysis.body.null import (
+from undulog.analysis.body.null import (
     SAMPLES,
     Chain,
     free_chain,
@@ -12,16 +12,16 @@ from analysis.body.null import (
     places,
     viscous_chain,
 )
-from analysis.body.places import (
+from undulog.analysis.body.places import (
     observed,
     perfect_tracking,
     place_links,
     track,
 )
-from analysis.estimators.series import Series
-from capture import load_robot
-from capture.robot import ClockDomain, Joint, Link, Plane, Robot
-from capture.robot.kinematics import quaternion_from_rotation
+from undulog.analysis.estimators.series import Series
+from undulog.capture import load_robot
+from undulog.capture.robot import ClockDomain, Joint, Link, Plane, Robot
+from undulog.capture.robot.kinematics import quaternion_from_rotation
 
 
 def planar_robot(links=13, plane=Plane.HORIZONTAL):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis import Choices, Options, compare_sessions
-from capture import Session
-from capture.errors import DataError
+from undulog.analysis import Choices, Options, compare_sessions
+from undulog.capture import Session
+from undulog.capture.errors import DataError
 
 SIGMA = 0.003
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis import compare_sessions
-from capture import Session
-from sim import load_scenario
-from sim.record import record
+from undulog.analysis import compare_sessions
+from undulog.capture import Session
+from undulog.sim import load_scenario
+from undulog.sim.recording import record
 
 pytestmark = pytest.mark.slow
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.compare.decisions import Margins, decide, differ
-from analysis.compare.differences import Quantities, from_runs, holm, independent, paired
-from capture.errors import UsageError
+from undulog.analysis.compare.decisions import Margins, decide, differ
+from undulog.analysis.compare.differences import Quantities, from_runs, holm, independent, paired
+from undulog.capture.errors import UsageError
 
 SEEDS = 600
 JOINTS = 13

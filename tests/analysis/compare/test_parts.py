@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from analysis.compare.changes import changes
-from analysis.compare.differences import Quantities
-from analysis.compare.motion import GRAVITY, Steps, centre_of_mass, cost_of_transport, speed
-from analysis.compare.result import Change
-from analysis.compare.side import turned
-from analysis.compare.waveform import cycles_by_phase, phases_rad
-from analysis.estimators.harmonic import HarmonicModel, fit_at
-from analysis.estimators.series import Series
-from capture import load_robot
-from capture.robot.kinematics import quaternion_from_rotation
+from undulog.analysis.compare.changes import changes
+from undulog.analysis.compare.differences import Quantities
+from undulog.analysis.compare.motion import GRAVITY, Steps, centre_of_mass, cost_of_transport, speed
+from undulog.analysis.compare.result import Change
+from undulog.analysis.compare.side import turned
+from undulog.analysis.compare.waveform import cycles_by_phase, phases_rad
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
+from undulog.analysis.estimators.series import Series
+from undulog.capture import load_robot
+from undulog.capture.robot.kinematics import quaternion_from_rotation
 
 
 def test_changes_are_what_only_one_side_has_or_has_otherwise():

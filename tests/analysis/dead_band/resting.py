@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from analysis.dead_band import dead_bands
-from analysis.estimators.series import Series
-from analysis.fitting import fit_gait
-from analysis.reading import Columns
-from capture.log.signals import Signal
+from undulog.analysis.dead_band import dead_bands
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.fitting import fit_gait
+from undulog.analysis.reading import Columns
+from undulog.capture.log.signals import Signal
 
 STEP = 2 * np.pi / 4096
 FINE = 20

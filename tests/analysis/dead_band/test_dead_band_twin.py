@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture import load_robot
-from capture.robot import Plane
-from sim import PlaneGait, Scenario, Serpentine, World
-from sim.twin import Twin
+from undulog.capture import load_robot
+from undulog.capture.robot import Plane
+from undulog.sim import PlaneGait, Scenario, Serpentine, World
+from undulog.sim.twin import Twin
 
 shared = runpy.run_path(str(Path(__file__).with_name("resting.py")))
 found_in, STEP = shared["found_in"], shared["STEP"]

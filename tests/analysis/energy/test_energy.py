@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from analysis.energy.joint import add_up, integrate, power_of
-from analysis.estimators.series import (
+from undulog.analysis.energy.joint import add_up, integrate, power_of
+from undulog.analysis.estimators.series import (
     Series,
     clean,
     coverage,
     sample_weights,
 )
-from capture.log.signals import Signal
+from undulog.capture.log.signals import Signal
 
 SECOND = 10**9
 

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.estimators.contrasts import contrast_variance, response_errors
-from analysis.estimators.harmonic import HarmonicModel, fit_at
-from analysis.estimators.series import Series
-from analysis.estimators.spectrum import residual_noise, residual_spectrum
+from undulog.analysis.estimators.contrasts import contrast_variance, response_errors
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.estimators.spectrum import residual_noise, residual_spectrum
 
 DOCS = Path(__file__).parents[3] / "docs"
 TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "contrast_tables.py")))

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from analysis.estimators.cycle_sums import cycle_sums, starts_of
-from analysis.estimators.rotation import cos_sin
+from undulog.analysis.estimators.cycle_sums import cycle_sums, starts_of
+from undulog.analysis.estimators.rotation import cos_sin
 
 
 def test_sums_of_each_cycle_empty_ones_too():

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from analysis.demodulation_session import response_over_time
-from analysis.estimators.demodulation import Phase, cycles_of, demodulate
-from analysis.estimators.series import Series
-from analysis.reading import read_columns
-from analysis.response import t_factor
-from capture import Session, SessionWriter
+from undulog.analysis.demodulation_session import response_over_time
+from undulog.analysis.estimators.demodulation import Phase, cycles_of, demodulate
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.reading import read_columns
+from undulog.analysis.response import t_factor
+from undulog.capture import Session, SessionWriter
 
 T = np.arange(6000) / 100
 

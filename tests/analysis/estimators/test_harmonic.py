@@ -5,11 +5,11 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.signal import lfilter
 
-from analysis.estimators.harmonic import HarmonicModel, fit_at, fit_shared
-from analysis.estimators.series import Series, clean
-from analysis.estimators.spectrum import Noise, omega_variance, residual_noise
-from analysis.response import gain_estimate, lag_estimate, respond, t_factor
-from capture.errors import DataError
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at, fit_shared
+from undulog.analysis.estimators.series import Series, clean
+from undulog.analysis.estimators.spectrum import Noise, omega_variance, residual_noise
+from undulog.analysis.response import gain_estimate, lag_estimate, respond, t_factor
+from undulog.capture.errors import DataError
 
 
 def coloured(rng, count, correlation):
@@ -204,7 +204,7 @@ def test_chunks_do_not_change_the_answer(monkeypatch):
     series = [Series("q", t, np.cos(3 * t) + rng.normal(0, 0.1, 3000)) for _ in range(2)]
     whole = fit_shared(series, 3.01)
     level = residual_noise(series, whole).level
-    monkeypatch.setattr("analysis.estimators.harmonic_moments.CHUNK", 700)
+    monkeypatch.setattr("undulog.analysis.estimators.harmonic_moments.CHUNK", 700)
     cut = fit_shared(series, 3.01)
     assert cut.omega == pytest.approx(whole.omega, abs=1e-12)
     np.testing.assert_allclose(residual_noise(series, cut).level, level, rtol=1e-9)

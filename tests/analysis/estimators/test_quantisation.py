@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from analysis.estimators.contrasts import contrast_variance, lag_contrast_variance, response_errors
-from analysis.estimators.harmonic import fit_at
-from analysis.estimators.quantisation import lattice_step
-from analysis.estimators.series import Series
-from analysis.estimators.spectrum import ResidualBins, residual_spectrum
+from undulog.analysis.estimators.contrasts import (
+    contrast_variance,
+    lag_contrast_variance,
+    response_errors,
+)
+from undulog.analysis.estimators.harmonic import fit_at
+from undulog.analysis.estimators.quantisation import lattice_step
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.estimators.spectrum import ResidualBins, residual_spectrum
 
 DOCS = Path(__file__).parents[3] / "docs"
 TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "estimator_tables.py")))

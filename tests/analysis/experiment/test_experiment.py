@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.experiment.runs import mirror_fault
-from analysis.experiment.table import render_experiment
-from capture import SessionWriter, load_robot
-from capture.errors import UsageError
-from capture.robot import Plane
+from undulog.analysis.experiment.runs import mirror_fault
+from undulog.analysis.experiment.table import render_experiment
+from undulog.capture import SessionWriter, load_robot
+from undulog.capture.errors import UsageError
+from undulog.capture.robot import Plane
 
 experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import undulog
-from sim import load_scenario
-from sim.record import record
+from undulog.sim import load_scenario
+from undulog.sim.recording import record
 
 pytestmark = pytest.mark.slow
 

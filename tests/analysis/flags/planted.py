@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from analysis.flags import find_artefacts
-from analysis.reading import read_columns
-from capture import Session, SessionWriter, load_robot
+from undulog.analysis.flags import find_artefacts
+from undulog.analysis.reading import read_columns
+from undulog.capture import Session, SessionWriter, load_robot
 
 EPOCH_NS = 1_735_689_600_000_000_000
 RATE_HZ = 100

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.reading import read_columns
-from capture import Session
-from sim import load_scenario
-from sim.record import record
+from undulog.analysis.reading import read_columns
+from undulog.capture import Session
+from undulog.sim import load_scenario
+from undulog.sim.recording import record
 
 here = Path(__file__).parent
 planted = runpy.run_path(str(here / "planted.py"))

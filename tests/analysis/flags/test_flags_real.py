@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.analyse import analyse_session
-from analysis.stretch import Options
-from capture import Session, SessionWriter
+from undulog.analysis.analyse import analyse_session
+from undulog.analysis.stretch import Options
+from undulog.capture import Session, SessionWriter
 
 ARCSNAKE = Path(__file__).parents[3].parent / "shared" / "data" / "arcsnake"
 EPOCH_NS = 1_735_689_600_000_000_000

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.experiment.table import render_experiment
-from analysis.results.coupling import LocalCoupling
-from capture import SessionWriter
+from undulog.analysis.experiment.table import render_experiment
+from undulog.analysis.results.coupling import LocalCoupling
+from undulog.capture import SessionWriter
 
 experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 

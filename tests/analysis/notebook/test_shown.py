@@ -8,18 +8,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis import Choices, Experiment, compare_sessions, load
-from analysis.oscillators.result import ChainCoupling, Link, Rate
-from analysis.results.analysis import Estimate
-from analysis.results.artefact import Artefact
-from analysis.results.sweep import (
+from undulog.analysis import Choices, Experiment, compare_sessions, load
+from undulog.analysis.oscillators.result import ChainCoupling, Link, Rate
+from undulog.analysis.results.analysis import Estimate
+from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.sweep import (
     ComplexMatrix,
     LinearCoupling,
     Route,
     ToneCoupling,
 )
-from capture import Session
-from capture.errors import DataError, InputFileError, OutputExistsError, UsageError
+from undulog.capture import Session
+from undulog.capture.errors import DataError, InputFileError, OutputExistsError, UsageError
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
-from analysis.oscillators.phase_log import read_phases
-from analysis.results.experiment import Experiment
-from capture import Session
-from sim import GaitTick, load_scenario
-from sim.physics.engine import Kernels
-from sim.record import Driver, record
+from undulog.analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
+from undulog.analysis.oscillators.phase_log import read_phases
+from undulog.analysis.results.experiment import Experiment
+from undulog.capture import Session
+from undulog.sim import GaitTick, load_scenario
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.recording import Driver, record
 
 shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 together = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from analysis.oscillators.chain import MOST_CONDITION, chain_coupling
-from analysis.oscillators.pieces import kicked_steps
+from undulog.analysis.oscillators.chain import MOST_CONDITION, chain_coupling
+from undulog.analysis.oscillators.pieces import kicked_steps
 
 PERIOD_S = 0.01
 PARTS = ("K", "psi", "omega")

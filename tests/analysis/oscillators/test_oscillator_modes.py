@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from analysis.oscillators.comparator import explicit_coupling, homogeneous, path_laplacian
-from analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
-from analysis.oscillators.entrainment import entrainment
-from analysis.oscillators.laplacian import growth, intervals, spectrum
-from analysis.oscillators.pseudospectrum import pseudospectrum, smallest_singular
+from undulog.analysis.oscillators.comparator import explicit_coupling, homogeneous, path_laplacian
+from undulog.analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
+from undulog.analysis.oscillators.entrainment import entrainment
+from undulog.analysis.oscillators.laplacian import growth, intervals, spectrum
+from undulog.analysis.oscillators.pseudospectrum import pseudospectrum, smallest_singular
 
 
 @dataclass(frozen=True)

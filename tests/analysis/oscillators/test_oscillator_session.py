@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import undulog
-from capture import SessionWriter, load_robot
-from capture.robot import Plane
-from sim import Readings
-from sim.gait import OscillatorChain, OscillatorChains, OscillatorGait
+from undulog.capture import SessionWriter, load_robot
+from undulog.capture.robot import Plane
+from undulog.sim import Readings
+from undulog.sim.gait import OscillatorChain, OscillatorChains, OscillatorGait
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake13")

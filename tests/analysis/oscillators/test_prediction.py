@@ -12,12 +12,12 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import undulog
-from analysis.kicks.coupling import kick_coupling
-from analysis.oscillators.comparator import path_laplacian
-from analysis.oscillators.laplacian import of_deviations
-from analysis.oscillators.prediction import closed_loop
-from analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of
-from capture.errors import DataError, UsageError
+from undulog.analysis.kicks.coupling import kick_coupling
+from undulog.analysis.oscillators.comparator import path_laplacian
+from undulog.analysis.oscillators.laplacian import of_deviations
+from undulog.analysis.oscillators.prediction import closed_loop
+from undulog.analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of
+from undulog.capture.errors import DataError, UsageError
 
 HERE = Path(__file__).parent
 tables = runpy.run_path(str(HERE.parents[2] / "docs" / "kick_tables.py"))
@@ -216,7 +216,7 @@ def test_sessions_without_kicks_fail_and_say_what_to_record(result, capsys):
 
 
 def test_a_result_of_kicks_reads_back(result):
-    from analysis import load
+    from undulog.analysis import load
 
     coupling = load(result[0]).coupling
     assert isinstance(coupling, LocalCoupling)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import undulog
-from analysis.plan.body_modes import slowest_mode, transverse_mass
-from analysis.plan.sweep_designs import tones
-from capture import Session, SessionWriter, load_robot
-from capture.robot import Plane
+from undulog.analysis.plan.body_modes import slowest_mode, transverse_mass
+from undulog.analysis.plan.sweep_designs import tones
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.robot import Plane
 
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]

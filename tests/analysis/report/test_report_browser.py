@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-from analysis.report import render
+from undulog.analysis.report import render
 
 SCHEMES = [pytest.param(False, id="light"), pytest.param(True, id="dark")]
 

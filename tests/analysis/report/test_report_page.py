@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from analysis.report import render
-from analysis.results.analysis import Coupling, Estimate
+from undulog.analysis.report import render
+from undulog.analysis.results.analysis import Coupling, Estimate
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 NAMES = ["snake", "still", "single", "hostile"]

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from analysis.results.analysis import Window
-from analysis.reversal.posture import posture
-from capture import Session, SessionWriter, load_robot
+from undulog.analysis.results.analysis import Window
+from undulog.analysis.reversal.posture import posture
+from undulog.capture import Session, SessionWriter, load_robot
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")

@@ -2,8 +2,8 @@
 
 import pytest
 
-from analysis.results.artefact import Artefact
-from analysis.segments.session import Following, not_following
+from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.segments.session import Following, not_following
 
 
 @pytest.mark.parametrize(

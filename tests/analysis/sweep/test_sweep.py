@@ -5,18 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from analysis.estimators.series import Series
-from analysis.sweep.chain import (
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.sweep.chain import (
     Phasors,
     impedance,
     impedance_behind_servos,
     servo_side,
     transfer,
 )
-from analysis.sweep.runs import CommandTones, find_sweep
-from analysis.sweep.tone_finder import common_step, find_tones
-from analysis.sweep.tones import fit_tones
-from capture.robot import Servo
+from undulog.analysis.sweep.runs import CommandTones, find_sweep
+from undulog.analysis.sweep.tone_finder import common_step, find_tones
+from undulog.analysis.sweep.tones import fit_tones
+from undulog.capture.robot import Servo
 
 LINEAR = dataclasses.replace(Servo(), coulomb_friction=0.0)
 

@@ -9,12 +9,12 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 import undulog
-from capture import Session
-from capture.robot import Plane
-from sim import load_scenario
-from sim.drive.driven import find_driven
-from sim.physics.engine import Kernels
-from sim.record import Driver, record
+from undulog.capture import Session
+from undulog.capture.robot import Plane
+from undulog.sim import load_scenario
+from undulog.sim.drive.driven import find_driven
+from undulog.sim.physics.engine import Kernels
+from undulog.sim.recording import Driver, record
 
 shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.results.analysis import Estimate
-from analysis.text import formats
-from capture.console import plain
+from undulog.analysis.results.analysis import Estimate
+from undulog.analysis.text import formats
+from undulog.capture.console import plain
 
 
 @pytest.mark.parametrize(

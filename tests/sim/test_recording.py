@@ -13,11 +13,11 @@ import time
 import numpy as np
 import pytest
 
-from capture import Session
-from capture.errors import OutputExistsError
-from capture.interruption import StopRequest
-from capture.robot.kinematics import link_poses, rotation_from_quaternion
-from sim import (
+from undulog.capture import Session
+from undulog.capture.errors import OutputExistsError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.sim import (
     Ground,
     Noise,
     SensorModels,
@@ -26,12 +26,12 @@ from sim import (
     load_scenario,
     parse_scenario,
 )
-from sim.physics.energy_flows import JOINT_TERMS
-from sim.physics.ledger import TERMS
-from sim.record import record
-from sim.sensing.contract import JointSample
-from sim.twin import Twin
-from sim.urdf import urdf
+from undulog.sim.physics.energy_flows import JOINT_TERMS
+from undulog.sim.physics.ledger import TERMS
+from undulog.sim.recording import record
+from undulog.sim.sensing.contract import JointSample
+from undulog.sim.twin import Twin
+from undulog.sim.urdf import urdf
 
 HUNDREDTH_NS = 10_000_000
 UNDULOG = (sys.executable, "-m", "undulog")

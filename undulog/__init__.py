@@ -9,63 +9,94 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from importlib import import_module
-from importlib.metadata import version
+from typing import TYPE_CHECKING
 
-from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
+if TYPE_CHECKING:
+    from cyclopts import App
 
-from capture.console import complain
-from capture.deferred import defer
-from capture.errors import MissingExtraError, UndulogError, UsageError
+    from .capture.errors import MissingExtraError
 
 VERBS: dict[str, tuple[str, str]] = {
-    "record": ("capture.record_cli:record", "Record a robot, or its twin, into a session."),
-    "record status": ("capture.record_control:status", "Say how the running recordings go."),
-    "record mark": ("capture.record_control:mark", "Mark this moment of the running recording."),
-    "record note": ("capture.record_control:note", "Write a remark into the running recording."),
-    "record split": ("capture.record_control:split", "Have it begin a new part."),
-    "record stop": ("capture.record_control:stop", "End the running recording in good order."),
-    "record unit": ("capture.record_control:unit", "Print a systemd unit for recordings."),
-    "import": ("capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
-    "log info": ("capture.log_info:log_info", "Say what a log holds."),
+    "record": ("undulog.capture.record_cli:record", "Record a robot, or its twin, into a session."),
+    "record status": (
+        "undulog.capture.record_control:status",
+        "Say how the running recordings go.",
+    ),
+    "record mark": (
+        "undulog.capture.record_control:mark",
+        "Mark this moment of the running recording.",
+    ),
+    "record note": (
+        "undulog.capture.record_control:note",
+        "Write a remark into the running recording.",
+    ),
+    "record split": ("undulog.capture.record_control:split", "Have it begin a new part."),
+    "record stop": (
+        "undulog.capture.record_control:stop",
+        "End the running recording in good order.",
+    ),
+    "record unit": ("undulog.capture.record_control:unit", "Print a systemd unit for recordings."),
+    "import": ("undulog.capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
+    "log info": ("undulog.capture.log_info:log_info", "Say what a log holds."),
     "log check": (
-        "capture.log_check:log_check",
+        "undulog.capture.log_check:log_check",
         "Say whether a session is good, degraded or bad, and why.",
     ),
     "log recover": (
-        "capture.log_recover:log_recover",
+        "undulog.capture.log_recover:log_recover",
         "Write a whole file from what a crash left.",
     ),
-    "log cut": ("capture.log_tools:log_cut", "Write a part of a log to a new file."),
-    "log merge": ("capture.log_tools:log_merge", "Put several logs into one new file."),
-    "log export": ("capture.cli:export_log", "Write frames or joint columns for other tools."),
-    "sim list": ("sim.cli:list_scenarios", "List the shipped scenarios."),
-    "sim run": ("sim.cli:run", "Simulate a scenario and record it."),
-    "sim fit": ("replay.calibrate.cli:fit", "Fit the twin's servo and friction to a session."),
-    "sim null": ("sim.null_cli:null", "Model identical modules, for analyse --null."),
-    "sim serve": ("sim.serve.cli:serve", "Be a robot on a bus, in real time."),
-    "drive": ("sim.drive.cli:drive", "Drive a gait, a plan or recorded commands."),
-    "analyse": ("analysis.cli:analyse", "Numbers: response, energy, spread over the segments."),
+    "log cut": ("undulog.capture.log_tools:log_cut", "Write a part of a log to a new file."),
+    "log merge": ("undulog.capture.log_tools:log_merge", "Put several logs into one new file."),
+    "log export": (
+        "undulog.capture.cli:export_log",
+        "Write frames or joint columns for other tools.",
+    ),
+    "sim list": ("undulog.sim.cli:list_scenarios", "List the shipped scenarios."),
+    "sim run": ("undulog.sim.cli:run", "Simulate a scenario and record it."),
+    "sim fit": (
+        "undulog.replay.calibrate.cli:fit",
+        "Fit the twin's servo and friction to a session.",
+    ),
+    "sim null": ("undulog.sim.null_cli:null", "Model identical modules, for analyse --null."),
+    "sim serve": ("undulog.sim.serve.cli:serve", "Be a robot on a bus, in real time."),
+    "drive": ("undulog.sim.drive.cli:drive", "Drive a gait, a plan or recorded commands."),
+    "analyse": (
+        "undulog.analysis.cli:analyse",
+        "Numbers: response, energy, spread over the segments.",
+    ),
     "predict": (
-        "analysis.oscillators.cli:predict",
+        "undulog.analysis.oscillators.cli:predict",
         "From kicks: how oscillators that feel their servos synchronise.",
     ),
-    "compare": ("analysis.compare.cli:compare", "What differs between two sessions or groups."),
+    "compare": (
+        "undulog.analysis.compare.cli:compare",
+        "What differs between two sessions or groups.",
+    ),
     "plan lag-sweep": (
-        "analysis.plan.sweep_cli:lag_sweep",
+        "undulog.analysis.plan.sweep_cli:lag_sweep",
         "Commands that tell the coupling without contact.",
     ),
     "plan multisine": (
-        "analysis.plan.sweep_cli:multisine",
+        "undulog.analysis.plan.sweep_cli:multisine",
         "The same at several frequencies at once.",
     ),
-    "plan phase-kicks": ("analysis.plan.cli:phase_kicks", "Commands that tell the coupling."),
-    "plan reversal": ("analysis.plan.cli:reversal", "Commands that tell boundary from module."),
-    "report": ("analysis.report.cli:report", "The offline report, one HTML page."),
-    "replay": ("replay.again.cli:replay", "Run a recorded experiment again in the twin; compare."),
-    "view": ("replay.cli:view", "See a session in Rerun."),
-    "info": ("capture.environment:info", "Versions and extras, for a bug report."),
+    "plan phase-kicks": (
+        "undulog.analysis.plan.cli:phase_kicks",
+        "Commands that tell the coupling.",
+    ),
+    "plan reversal": (
+        "undulog.analysis.plan.cli:reversal",
+        "Commands that tell boundary from module.",
+    ),
+    "report": ("undulog.analysis.report.cli:report", "The offline report, one HTML page."),
+    "replay": (
+        "undulog.replay.again.cli:replay",
+        "Run a recorded experiment again in the twin; compare.",
+    ),
+    "view": ("undulog.replay.cli:view", "See a session in Rerun."),
+    "info": ("undulog.capture.environment:info", "Versions and extras, for a bug report."),
 }
 """Verb to the function behind it and its line in the list of verbs."""
 
@@ -104,6 +135,10 @@ def build(arguments: Sequence[str] = ()) -> App:
     Returns:
         The application.
     """
+    from importlib.metadata import version
+
+    from cyclopts import App, Parameter
+
     app = App(
         name="undulog",
         help="Record, simulate, measure and replay undulating robots. "
@@ -135,6 +170,8 @@ def _group(name: str, arguments: Sequence[str]) -> App:
     ``undulog record can:...`` records, ``undulog record stop`` ends a recording: a word that names
     a verb of the group is that verb, anything else goes to the group's own.
     """
+    from cyclopts import App
+
     if name not in VERBS or list(arguments[:1]) != [name]:
         summary = VERBS[name][1] if name in VERBS else _GROUPS[name]
         return App(name=name, help=summary, help_epilogue="")
@@ -153,6 +190,10 @@ def run(arguments: Sequence[str]) -> int:
     Returns:
         The exit code: 0 done, 1 the work failed, 2 wrong usage.
     """
+    from cyclopts import CycloptsError, UnknownCommandError
+
+    from .capture.errors import UndulogError, UsageError
+
     try:
         if "" in arguments:  # as a path it would be this folder
             raise UsageError("an argument is empty; is it a variable of the shell that isn't set?")
@@ -176,6 +217,8 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
+    from .capture.deferred import defer
+
     defer()
     if not sys.stderr.isatty():
         os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
@@ -219,7 +262,8 @@ def _without_chunk_limit(arguments: Sequence[str]) -> list[str]:
     for word in rest:
         name, equals, value = word.partition("=")
         if name == option:
-            from capture.log.chunk import LARGEST_CHUNK_VARIABLE, largest_chunk
+            from .capture.errors import UsageError
+            from .capture.log.chunk import LARGEST_CHUNK_VARIABLE, largest_chunk
 
             os.environ[LARGEST_CHUNK_VARIABLE] = value if equals else next(rest, "")
             try:
@@ -233,6 +277,8 @@ def _without_chunk_limit(arguments: Sequence[str]) -> list[str]:
 
 
 def _unknown(arguments: Sequence[str]) -> str:
+    from difflib import get_close_matches
+
     words = [word for word in arguments if not word.startswith("-")][:2]
     typed = " ".join(words if words and words[0] in _GROUPS else words[:1])
     options = [word for word in arguments if word.startswith("-")]
@@ -246,6 +292,8 @@ def _unknown(arguments: Sequence[str]) -> str:
 
 def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtraError | None:
     """The extra that would mend the import, if one would."""
+    from .capture.errors import MissingExtraError
+
     cause: BaseException | None = error
     while cause is not None:
         package = (getattr(cause, "name", None) or "").partition(".")[0]
@@ -257,9 +305,7 @@ def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtra
 
 
 def _complain(message: str, code: int) -> int:
+    from .capture.console import complain
+
     complain(f"error: {message}")
     return code
-
-
-if __name__ == "__main__":
-    main()

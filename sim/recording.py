@@ -10,12 +10,12 @@ from functools import partial
 from pathlib import Path
 from types import TracebackType
 
-from capture.console import refuse_existing
-from capture.errors import LogWriteError, SimulationError
-from capture.interruption import StopRequest
-from capture.log.mcap_sink import write_error
-from capture.log.writer import SessionWriter
-from capture.robot import ClockDomain
+from undulog.capture.console import refuse_existing
+from undulog.capture.errors import LogWriteError, SimulationError
+from undulog.capture.interruption import StopRequest
+from undulog.capture.log.mcap_sink import write_error
+from undulog.capture.log.writer import SessionWriter
+from undulog.capture.robot import ClockDomain
 
 from .gait import Gait
 from .physics.engine import Kernels

@@ -1,0 +1,196 @@
+"""One package name: what is built and installed, and that no module exists under two names."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = ("analysis", "capture", "replay", "sim")
+BUILD = [sys.executable, "-m", "hatchling", "build"]
+
+
+def tracked(*patterns: str) -> list[Path]:
+    command = ["git", "ls-files", "--", *patterns]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip("not a git checkout: the list of tracked files is unknown")
+    return [ROOT / name for name in done.stdout.splitlines()]
+
+
+def run(*words: str | Path, cwd: Path = ROOT, fails: bool = False, **environment: str) -> str:
+    keep = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        words, cwd=cwd, env=keep | environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode != 0) == fails, done.stderr
+    return done.stderr if fails else done.stdout
+
+
+def record(wheel: Path) -> dict[str, str]:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/RECORD")]
+        rows = csv.reader(archive.read(name).decode().splitlines())
+        return {row[0]: row[1] for row in rows}
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tree") / "undulog"
+    for path in tracked():
+        copy = folder / path.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy, follow_symlinks=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(tree: Path) -> Path:
+    run(*BUILD, "-t", "wheel", "-d", tree.parent / "wheel", cwd=tree)
+    return next((tree.parent / "wheel").glob("*.whl"))
+
+
+def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(
+    tree: Path, wheel: Path
+) -> None:
+    run(*BUILD, "-t", "sdist", "-d", tree.parent / "sdist", cwd=tree)
+    with tarfile.open(next((tree.parent / "sdist").glob("*.tar.gz"))) as archive:
+        members = archive.getmembers()
+        assert all(member.isfile() for member in members)
+        archive.extractall(tree.parent / "unpacked", filter="data")
+    (unpacked,) = (tree.parent / "unpacked").iterdir()
+    names = [str(Path(member.name).relative_to(unpacked.name)) for member in members]
+    assert len(set(names)) == len(names)
+    assert not [name for name in names if name.startswith(tuple(f"{one}/" for one in FOLDERS))]
+    run(*BUILD, "-t", "wheel", "-d", tree.parent / "again", cwd=unpacked)
+    again = record(next((tree.parent / "again").glob("*.whl")))
+    assert again == record(wheel)
+
+
+def test_the_wheel_holds_every_file_of_the_packages(wheel: Path) -> None:
+    expected = {f"undulog/{path.relative_to(ROOT)}" for path in tracked(*FOLDERS)}
+    expected |= {"undulog/__init__.py", "undulog/__main__.py"}
+    assert {name for name in record(wheel) if not name.startswith("undulog-")} == expected
+
+
+def test_a_tree_without_links_is_refused_when_it_is_built(tree: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "flat"
+    shutil.copytree(tree, folder, symlinks=True)
+    for name in FOLDERS:  # what git writes where links are not allowed
+        (folder / "undulog" / name).unlink()
+        (folder / "undulog" / name).write_text(f"../{name}")
+    said = run(*BUILD, "-t", "wheel", "-d", tmp_path / "wheel", cwd=folder, fails=True)
+    assert "undulog/analysis" in said
+    assert "symbolic link" in said
+
+
+def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(
+    wheel: Path, tmp_path: Path
+) -> None:
+    place, work = tmp_path / "site", tmp_path / "work"
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--quiet"]
+    run(*pip, "--no-compile", "--target", place, wheel)
+    assert sorted(p.name for p in place.iterdir() if ".dist-info" not in p.name) == [
+        "bin",
+        "undulog",
+    ]
+    work.mkdir()
+    for name in FOLDERS:
+        (work / f"{name}.py").write_text("MINE = True\n")
+    script = (
+        "import analysis, capture, replay, sim, undulog.analysis, undulog.replay, undulog.sim\n"
+        "from undulog.capture import Session\n"
+        "assert analysis.MINE and capture.MINE and replay.MINE and sim.MINE\n"
+        "print(Session.__module__, undulog.__file__)\n"
+    )
+    module, file = run(sys.executable, "-c", script, cwd=work, PYTHONPATH=f"{work}:{place}").split()
+    assert module.startswith("undulog.capture.")
+    assert file.startswith(str(place))
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize("how", [("-c",), ("-m", "pytest", "-q", "-p", "no:cacheprovider")])
+def test_a_package_by_another_name_is_an_error(
+    name: str, how: tuple[str, ...], tmp_path: Path
+) -> None:
+    if how == ("-c",):
+        said = run(sys.executable, "-c", f"import {name}", fails=True)
+        assert f"ImportError: import undulog.{name} instead of {name}" in said
+        return
+    test = tmp_path / "test_names.py"
+    test.write_text(
+        "import pytest\ndef test():\n"
+        f"    with pytest.raises(ImportError, match='undulog.{name}'):\n        import {name}\n"
+    )
+    run(sys.executable, *how, test)
+
+
+def test_results_cross_to_a_spawned_process(tmp_path: Path) -> None:
+    script = tmp_path / "spawned.py"
+    script.write_text(
+        "import json, multiprocessing\n"
+        "from undulog.analysis import Estimate\n"
+        "from undulog.capture.errors import UsageError\n"
+        "def work(value):\n"
+        "    return type(value).__module__, value\n"
+        "if __name__ == '__main__':\n"
+        "    values = [Estimate(1.0, (0.9, 1.1)), UsageError('x')]\n"
+        "    with multiprocessing.get_context('spawn').Pool(1) as pool:\n"
+        "        back = pool.map(work, values)\n"
+        "    same = [type(b) is type(a) for a, (_, b) in zip(values, back)]\n"
+        "    print(json.dumps([[module for module, _ in back], same]))\n"
+    )
+    modules, same = json.loads(run(sys.executable, script))
+    assert all(module.startswith("undulog.") for module in modules)
+    assert same == [True, True]
+
+
+def _imports(tree: ast.AST) -> list[str]:
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
+
+
+def test_no_file_names_a_package_without_undulog_or_its_own_package_with_it() -> None:
+    found = []
+    for path in tracked("*.py"):
+        name = path.relative_to(ROOT)
+        for imported in _imports(ast.parse(path.read_text())):
+            first, *rest = imported.split(".")
+            own = first == "undulog" and rest[:1] == [name.parts[0]]
+            if (first in FOLDERS) or (own and name.parts[0] in FOLDERS):
+                found.append(f"{name}: {imported}")
+    assert found == []
+
+
+MODULE = re.compile(
+    r"(?<![\w./-])(?:from |import |[`\"']|:: |-m )"
+    rf"(?P<name>(?:{'|'.join(FOLDERS)})(?:\.[a-z_]\w*)+)"
+)
+
+
+def test_no_text_or_string_names_a_module_without_undulog() -> None:
+    found = []
+    for path in tracked("*.py", "*.md", "*.ipynb", "*.toml", "*.service", ".ci", "Makefile"):
+        if path.name == "CHANGELOG.md":
+            continue
+        for match in MODULE.finditer(path.read_text()):
+            module = ROOT.joinpath(*match["name"].split(".")[:2])
+            if module.is_dir() or module.with_suffix(".py").exists():
+                found.append(f"{path.relative_to(ROOT)}: {match[0]}")
+    assert found == []

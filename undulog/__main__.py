@@ -1,0 +1,5 @@
+"""``python -m undulog``: the command."""
+
+from . import main
+
+main()
