@@ -210,6 +210,10 @@ def run(arguments: Sequence[str]) -> int:
         if missing is None:
             raise
         return _complain(str(missing), missing.exit_code)
+    except OSError as error:  # a file that vanished or a disk that failed, at any moment
+        if error.filename is None or error.errno == errno.ENAMETOOLONG:
+            raise
+        return _complain(f"{error.filename}: {error.strerror}", 1)
     except KeyboardInterrupt:
         return _complain("interrupted", 1)
     return result if isinstance(result, int) else 0

@@ -90,7 +90,8 @@ class McapPayloads:
     def close(self) -> None:
         """Release the mapping."""
         _cache.drop(self._owner)
-        self.buffer.close()
+        with suppress(BufferError):  # the frames of an error still refer to it: it goes with them
+            self.buffer.close()
         self._close_descriptor()
 
     def forget(self) -> None:

@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from undulog.capture import SessionWriter
+from undulog.capture.log.mcap_payloads import McapPayloads
 
 READS = """
 import gc, sys, weakref
@@ -52,3 +54,19 @@ def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path: Path) -> None:
         cwd=Path(__file__).parents[2],
     )
     assert done.stdout == "read\n", done.stderr
+
+
+def test_an_interrupt_stays_one_where_a_frame_still_holds_bytes_of_the_log(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"0123456789" * 100)
+
+    def read(log: McapPayloads) -> None:
+        held = memoryview(log.buffer)[10:20]
+        try:
+            raise KeyboardInterrupt
+        finally:
+            log.close()
+            assert bytes(held) == b"0123456789"
+
+    with pytest.raises(KeyboardInterrupt):
+        read(McapPayloads(path))

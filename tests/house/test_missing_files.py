@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shlex
 from pathlib import Path
@@ -135,3 +136,22 @@ def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(
     assert said.err == f"error: {tmp_path / 'nowhere'}{suffix[1]}: no such file\n"
     assert said.out == ""
     assert not any(tmp_path.iterdir())
+
+
+def test_a_file_that_vanishes_meanwhile_is_named(
+    there: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(there["run"].read_bytes())
+    digest = hashlib.sha256
+
+    def vanish(*data: bytes) -> object:
+        path.unlink(missing_ok=True)
+        return digest(*data)
+
+    monkeypatch.setattr("hashlib.sha256", vanish)
+    assert undulog.run(["analyse", str(path)]) == 1
+    assert capsys.readouterr().err == f"error: {path}: No such file or directory\n"
