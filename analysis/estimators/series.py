@@ -14,6 +14,9 @@ from undulog.capture.log.signals import Signal
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""
 
+LARGEST = 1e100
+"""A value above it counts as missing: no sensor sends it, and its powers have no finite value."""
+
 _HALF_NS = 0.5e-9
 
 
@@ -98,10 +101,11 @@ def clean(name: str, t_ns: IntArray, values: FloatArray, origin_ns: int) -> Seri
         origin_ns: Unix time that becomes 0 s.
 
     Returns:
-        The series, without samples that are not finite and without second samples of one time;
+        The series, without samples that are not finite (or above :data:`LARGEST`) and without second
+        samples of one time;
         where there are none, its values are those that were given, not a copy.
     """
-    finite = np.isfinite(values)
+    finite = np.abs(values) <= LARGEST  # not so where it is NaN
     lost = values.size - int(np.count_nonzero(finite))
     if lost:
         t_ns, values = t_ns[finite], values[finite]
@@ -141,7 +145,7 @@ def clean_together(signals: Mapping[str, Signal], origin_ns: int) -> dict[str, S
     times: dict[int, Series] = {}
     for key, one in signals.items():
         known = times.get(id(one.t_ns))
-        if known is not None and np.isfinite(one.values).all():
+        if known is not None and (np.abs(one.values) <= LARGEST).all():
             found[key] = Series(one.name, known.t_s, frozen(one.values.view()))
             continue
         found[key] = made = clean(one.name, one.t_ns, one.values, origin_ns)

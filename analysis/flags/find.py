@@ -13,7 +13,7 @@ from undulog.capture.arrays import FloatArray
 from undulog.capture.log.signals import Signal
 from undulog.capture.threads import in_threads
 
-from ..estimators.series import Series, clean_together
+from ..estimators.series import LARGEST, Series, clean_together
 from ..gait import DRIVEN_SHARE
 from ..reading import QUANTITIES, Columns
 from ..results.artefact import FALSIFYING, Artefact, Span
@@ -220,7 +220,7 @@ def _at_limits(joint: _Joint) -> _Found:
 def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
     raw, one = joint.raw[quantity], joint.series[quantity]
     if one.dropped_nan:
-        yield quantity, "nan", spans_of(_seconds(raw, origin_ns), ~np.isfinite(raw.values)), ""
+        yield quantity, "nan", spans_of(_seconds(raw, origin_ns), ~(np.abs(raw.values) <= LARGEST)), ""
     if one.dropped_duplicates:
         seconds = _seconds(raw, origin_ns)
         again = np.concatenate((np.diff(raw.t_ns) == 0, [False]))

@@ -26,6 +26,9 @@ LEVEL = 0.05
 _MORE_DIGITS = 6
 """Digits that a sentence may add so that what decides is seen."""
 
+_LONG = 1e9
+"""From here on numbers have an exponent: a damaged sample can be of any size."""
+
 
 def number(value: float | None, decimals: int) -> str:
     """A number with fixed decimals, or an en dash.
@@ -39,7 +42,7 @@ def number(value: float | None, decimals: int) -> str:
     """
     if value is None or not math.isfinite(value):
         return MISSING
-    text = f"{value:.{decimals}f}"
+    text = f"{value:.{decimals}f}" if abs(value) < _LONG else f"{value:.3g}"
     if float(text) == 0.0:
         text = text.lstrip("-")
     return text.replace("-", MINUS)

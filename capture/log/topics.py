@@ -16,6 +16,7 @@ from mcap.records import Schema
 from ..errors import DataError, MissingChannelError
 from .batches import Window
 from .cdr import Layout
+from .chunk import LAST_NS
 from .columns import Messages, Request, message_blocks, message_bytes, read_messages
 from .rosmsg import MessageType, parse_message_type
 from .storage import LogFile
@@ -170,7 +171,8 @@ class Topics:
         ids = self._channel_ids(topic)
         for data, offsets in message_blocks(self._file, ids, (None, None), self._warn):
             for offset in offsets.tolist():
-                yield message_bytes(data, offset)
+                log_ns, message = message_bytes(data, offset)
+                yield min(log_ns, LAST_NS), message
 
     def decoder(self, topic: str) -> Callable[[bytes], Any]:
         """The general decoder of a topic, for messages of any shape.

@@ -21,6 +21,7 @@ from undulog.capture.console import plain
         (None, 3, "–"),
         (float("nan"), 3, "–"),
         (float("inf"), 3, "–"),
+        (-5.98e302, 5, "−5.98e+302"),
     ],
 )
 def test_number(value, decimals, text):
