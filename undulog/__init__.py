@@ -203,13 +203,11 @@ def run(arguments: Sequence[str]) -> int:
         return _complain(_unknown(arguments), 2)
     except CycloptsError as error:
         return _complain(f"{error}\nTry 'undulog --help', or --help after the verb.", 2)
-    except UndulogError as error:
-        return _complain(str(error), error.exit_code)
-    except ImportError as error:
-        missing = _missing_extra(error, arguments)
-        if missing is None:
+    except (UndulogError, ImportError) as error:
+        known = error if isinstance(error, UndulogError) else _missing_extra(error, arguments)
+        if known is None:
             raise
-        return _complain(str(missing), missing.exit_code)
+        return _complain(str(known), known.exit_code)
     except OSError as error:  # a file that vanished or a disk that failed, at any moment
         if error.filename is None or error.errno == errno.ENAMETOOLONG:
             raise

@@ -101,9 +101,9 @@ def clean(name: str, t_ns: IntArray, values: FloatArray, origin_ns: int) -> Seri
         origin_ns: Unix time that becomes 0 s.
 
     Returns:
-        The series, without samples that are not finite (or above :data:`LARGEST`) and without second
-        samples of one time;
-        where there are none, its values are those that were given, not a copy.
+        The series, without samples that are not finite or above :data:`LARGEST`, and without second
+        samples of one time; where there are none, its values are those that were given, not a
+        copy.
     """
     finite = np.abs(values) <= LARGEST  # not so where it is NaN
     lost = values.size - int(np.count_nonzero(finite))

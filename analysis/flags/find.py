@@ -220,7 +220,12 @@ def _at_limits(joint: _Joint) -> _Found:
 def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
     raw, one = joint.raw[quantity], joint.series[quantity]
     if one.dropped_nan:
-        yield quantity, "nan", spans_of(_seconds(raw, origin_ns), ~(np.abs(raw.values) <= LARGEST)), ""
+        yield (
+            quantity,
+            "nan",
+            spans_of(_seconds(raw, origin_ns), ~(np.abs(raw.values) <= LARGEST)),
+            "",
+        )
     if one.dropped_duplicates:
         seconds = _seconds(raw, origin_ns)
         again = np.concatenate((np.diff(raw.t_ns) == 0, [False]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import types
 from enum import Enum
 from pathlib import Path
@@ -119,7 +120,7 @@ def load(path: Path | str) -> Shown:
         if isinstance(data, dict) and _required(kind) <= set(cast("dict[str, Any]", data)):
             try:
                 return cast("Shown", _build(kind, data))
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, OverflowError, TypeError, ValueError) as error:
                 raise DataError(f"{path}: a damaged {kind.__name__}: {error!r}") from error
     known = ", ".join(kind.__name__ for kind in _KINDS)
     raise DataError(f"{path}: holds no result; known are {known}")
@@ -133,11 +134,15 @@ def _required(kind: type[Any]) -> set[str]:
     }
 
 
-def _build(kind: Any, value: Any) -> Any:
+def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a line
     """A value of an annotated type from plain JSON values."""
-    if value is None or kind is Any:
-        return value
     origin, arguments = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if value is None:
+        if types.NoneType not in arguments:
+            raise TypeError(f"null where {kind} is expected")
+        return None
     if origin in (Union, types.UnionType):
         return _build(next(one for one in arguments if one is not type(None)), value)
     if origin is tuple:
@@ -150,7 +155,13 @@ def _build(kind: Any, value: Any) -> Any:
 
 
 def _plain(kind: type[Any], value: Any) -> Any:
-    return kind(value) if issubclass(kind, Enum) else value
+    if issubclass(kind, Enum):
+        return kind(value)
+    wanted = (int, float) if kind is float else kind
+    wrong = isinstance(value, bool) and kind is not bool
+    if wrong or not isinstance(value, wanted) or (kind is float and not math.isfinite(value)):
+        raise TypeError(f"{value!r:.40} where {kind.__name__} is expected")
+    return float(value) if kind is float else value
 
 
 def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
@@ -164,8 +175,9 @@ def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
         if name not in data:
             continue
         if hints[name] is Estimate and not isinstance(data[name], dict):
-            ends = data[interval_key(name)]
-            built[name] = Estimate(data[name], None if ends is None else tuple(ends))
+            hint = get_type_hints(Estimate)
+            value = _build(hint["value"], data[name])
+            built[name] = Estimate(value, _build(hint["ci95"], data[interval_key(name)]))
         else:
             built[name] = _build(hints[name], data[name])
     return chosen(**built)

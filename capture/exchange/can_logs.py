@@ -15,7 +15,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
@@ -144,27 +144,15 @@ def _reader(path: Path) -> MessageReader:
     from can import LogReader
 
     try:
-        if log_suffix(path) == ".blf" and path.suffix != ".gz":
-            return _blf_reader(path)
+        if log_suffix(path) == ".blf":
+            from .blf import CheckedBLFReader
+
+            return CheckedBLFReader(path)
         if log_suffix(path) == ".db":
             _check_database(path)
         return LogReader(path)
     except _read_errors() as error:
         raise ImportFormatError(path, f"can't be read: {error}") from error
-
-
-def _blf_reader(path: Path) -> MessageReader:
-    """The reader of a BLF file, which would leave the file open where its header is damaged."""
-    from can import BLFReader
-
-    with ExitStack() as stack:
-        stream = stack.enter_context(path.open("rb"))
-        if stream.read(4) != b"LOGG":
-            raise ValueError("not a BLF file")
-        stream.seek(0)
-        reader = BLFReader(stream)
-        stack.pop_all()  # the reader closes it
-        return reader
 
 
 def _check_database(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -48,6 +49,14 @@ def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str,
             readable = False
             continue
         for message in found:
+            for signal in message.signals:
+                if not (_is_finite(signal.scale) and _is_finite(signal.offset)):
+                    faults.add(
+                        f"bus.databases: {name}",
+                        f"{message.name}.{signal.name} is scaled by a number that is not finite",
+                        "a factor and an offset that a double can hold",
+                    )
+                    readable = False
             if message.name in messages:
                 faults.add(
                     f"bus.databases: {name}",
@@ -56,6 +65,13 @@ def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str,
                 )
             messages[message.name] = message
     return messages if readable else None
+
+
+def _is_finite(number: float) -> bool:
+    try:
+        return math.isfinite(number)
+    except OverflowError:  # an integer of hundreds of digits
+        return False
 
 
 @lru_cache(maxsize=16)  # every session of a robot carries the same databases

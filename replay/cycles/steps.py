@@ -186,7 +186,11 @@ def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray
     Returns:
         Unix times [ns], each of shape (c,).
     """
-    start, stop = (np.round(t * 1e9).astype(np.int64) for t in (table.start_s, table.stop_s))
+    far_s = 4e9  # keeps the times of a damaged result within int64
+    start, stop = (
+        np.round(np.clip(t_s, -far_s, far_s) * 1e9).astype(np.int64)
+        for t_s in (table.start_s, table.stop_s)
+    )
     return start_ns + start, start_ns + stop
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,8 @@ def log_mode(rec: rr.RecordingStream, clock: Clock, session: Session, warnings: 
     Returns:
         How often a mode began.
     """
-    messages = [(t_ns, str(message.data)) for t_ns, message in _read(session, MODE, warnings)]
+    found = _read(session, MODE, {"data": str}, warnings)
+    messages = [(t_ns, message.data) for t_ns, message in found]
     turns = changes([state for _, state in messages])
     log_states(rec, clock, [messages[i] for i in turns])
     return len(turns)
@@ -110,7 +111,7 @@ def log_events(
     Returns:
         Whether there was any.
     """
-    events = _read(session, "/rosout", warnings)
+    events = _read(session, "/rosout", {"name": str, "msg": str, "level": int}, warnings)
     log_lines(rec, clock, events)
     return bool(events)
 
@@ -125,18 +126,24 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
     """
     t_ns = np.array([time for time, _ in events], dtype=np.int64)
     texts = [f"{event.name}: {event.msg}" if event.name else event.msg for _, event in events]
-    levels = [_LEVELS.get(int(event.level), rr.TextLogLevel.INFO) for _, event in events]
+    levels = [_LEVELS.get(event.level, rr.TextLogLevel.INFO) for _, event in events]
     for rows, times in clock.rows(t_ns):
         columns = rr.TextLog.columns(text=texts[rows], level=levels[rows])
         rec.send_columns(EVENTS, times, columns)
 
 
-def _read(session: Session, topic: str, warnings: list[str]) -> list[tuple[int, Any]]:
-    """Log time [ns] and message, up to the first one that is damaged."""
+def _read(
+    session: Session, topic: str, fields: Mapping[str, type], warnings: list[str]
+) -> list[tuple[int, Any]]:
+    """Log time [ns] and message, up to the first one that is damaged; none without the fields."""
     found: list[tuple[int, Any]] = []
     if topic in session.channels:
         try:
             found.extend(session.messages(topic))
         except DataError as error:
             warnings.append(f"{topic}: shown up to a message that can't be read: {error}")
+    for name, kind in fields.items():
+        if found and not isinstance(getattr(found[0][1], name, None), kind):
+            warnings.append(f"{topic}: not shown: its schema has no field {name} ({kind.__name__})")
+            return []
     return found
