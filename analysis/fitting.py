@@ -133,6 +133,9 @@ def fit_gait(
     channels, amplitudes = _select(commands, responses, found, warn)
     rhythms = [one for one, group in zip(found.rhythms, channels, strict=True) if group.driven]
     channels = [group for group in channels if group.driven]
+    if not channels:
+        warn(Lacking("no gait: no joint has enough commands at the frequency that they share"))
+        return None
     fits = _fit_groups(channels, [one.omega for one in rhythms], duration_s)
     _warn_groups(found, fits, duration_s, warn)
     groups = [
