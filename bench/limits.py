@@ -110,9 +110,9 @@ DIMENSIONS: dict[str, tuple[Callable[[HostileLog, int], None], int]] = {
     "small chunks": (small_chunks, 2_000),
     "messages": (messages, 20_000),
     "channels": (channels, 8_000),
-    "joints": (joints, 5_000),
+    "joints": (joints, 1_000),
     "lists of joints": (joint_lists, 10_000),
-    "chunk listed again": (listed_again, 5_000),
+    "chunk listed again": (listed_again, 20_000),
     "decompressed MiB": (decompressed, 512),
 }
 

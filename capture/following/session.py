@@ -17,7 +17,7 @@ from .motion import JointMotion, Samples
 
 COMMANDS = "/joint_commands"
 STATES = "/joint_states"
-MOST_JOINTS = 5000
+MOST_JOINTS = 2000
 """Of a session whose joints are judged; a file that claims more of them describes no robot."""
 
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
