@@ -12,7 +12,7 @@ from pathlib import Path
 from .base import gait_session
 from .case import Result, judge, run_command
 from .fuzz import check_output
-from .recording import check_kept, recorder, senders
+from .recording import check_kept, numbers_in, recorder, senders
 from .stage import Stage
 
 LINES = [
@@ -134,4 +134,7 @@ def run_recorder(seed: int, stage: Stage) -> Result:
         for one, least in zip(sending, accepted, strict=True):
             result.failures += check_kept(folder / "recovered", one, least)
             result.figures["n_accepted"] = result.figures.get("n_accepted", 0) + least
+            kept = len(numbers_in(sorted((folder / "recovered").glob("*.mcap")), one.bus))
+            tail_ms = one.lost_tail_ms(kept, killed_ns)
+            result.figures["tail_ms"] = max(tail_ms, result.figures.get("tail_ms", 0))
     return result

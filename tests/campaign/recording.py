@@ -77,6 +77,11 @@ class Sending:
         """Frames that were accepted before a moment."""
         return max((count for at_ns, count in self.rows() if at_ns < t_ns), default=0)
 
+    def lost_tail_ms(self, kept: int, killed_ns: int) -> float:
+        """How long before a kill the first frame was accepted that is not kept; 0 if all are."""
+        first = next((at_ns for at_ns, count in self.rows() if count > kept), killed_ns)
+        return max(0, killed_ns - first) / 1e6
+
     def wait_for(self, packets: int) -> None:
         """Wait until so many packets were accepted."""
         until = time.monotonic() + PATIENCE_S
