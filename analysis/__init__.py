@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 
 from undulog.capture.lazy import attach
 
+from .notebook.shown import Presentation, present_with
+
 if TYPE_CHECKING:
     from .analyse import analyse_session
     from .compare.compare import Choices, compare_sessions
@@ -39,6 +41,15 @@ if TYPE_CHECKING:
     from .results.sweep import LinearCoupling
     from .stretch import Options
     from .text.table import render
+
+
+def _presentation() -> Presentation:
+    from .notebook.presentation import Presenter
+
+    return Presenter()
+
+
+present_with(_presentation)
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
