@@ -2,7 +2,7 @@
 
 ::
 
-    from undulog.analysis import analyse_session
+    from .session.analyse import analyse_session
     from undulog.capture import Session
 
     with Session.open("run.mcap") as session:
@@ -18,33 +18,29 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from undulog.capture.lazy import attach
+from undulog.capture.common.lazy import attach
 
-from .notebook.shown import Presentation, present_with
+from .results.shown import Presentation, present_with
 
 if TYPE_CHECKING:
-    from .analyse import analyse_session
     from .compare.compare import Choices, compare_sessions
     from .compare.decisions import Margins
-    from .compare.result import Comparison
     from .experiment.analyse import analyse_experiment
-    from .notebook.files import load
-    from .notebook.picture import Picture
-    from .results.analysis import (
-        Analysis,
-        Estimate,
-        Index,
-        JointResult,
-    )
+    from .present.notebook.files import load
+    from .present.notebook.picture import Picture
+    from .present.text.table import render
+    from .results.analysis import Analysis, Index, JointResult
+    from .results.comparison import Comparison
     from .results.coupling import LocalCoupling
+    from .results.estimate import Estimate
     from .results.experiment import Experiment, Reversal
     from .results.sweep import LinearCoupling
-    from .stretch import Options
-    from .text.table import render
+    from .session.analyse import analyse_session
+    from .signals.stretch import Options
 
 
 def _presentation() -> Presentation:
-    from .notebook.presentation import Presenter
+    from .present.notebook.presentation import Presenter
 
     return Presenter()
 
@@ -56,21 +52,21 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     {
         "Analysis": "results.analysis",
         "Choices": "compare.compare",
-        "Comparison": "compare.result",
-        "Estimate": "results.analysis",
+        "Comparison": "results.comparison",
+        "Estimate": "results.estimate",
         "Experiment": "results.experiment",
         "Index": "results.analysis",
         "JointResult": "results.analysis",
         "LinearCoupling": "results.sweep",
         "LocalCoupling": "results.coupling",
         "Margins": "compare.decisions",
-        "Options": "stretch",
-        "Picture": "notebook.picture",
+        "Options": "signals.stretch",
+        "Picture": "present.notebook.picture",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
-        "analyse_session": "analyse",
+        "analyse_session": "session.analyse",
         "compare_sessions": "compare.compare",
-        "load": "notebook.files",
-        "render": "text.table",
+        "load": "present.notebook.files",
+        "render": "present.text.table",
     },
 )

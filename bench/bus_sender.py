@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture import load_robot
-from undulog.capture.log.frames import DIR_RX, DIR_TX, FRAME_DTYPE, empty_frames
-from undulog.capture.robot import Direction
+from undulog.capture.common.strict_table import Faults
+from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, FRAME_DTYPE, empty_frames
 from undulog.capture.robot.bus_map import database_messages
-from undulog.capture.strict_table import Faults
+from undulog.capture.robot.model import Direction
 
 LATE_NS = 20_000_000
 STEP_S = 0.002

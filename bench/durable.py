@@ -22,9 +22,9 @@ from accepting import EPOCH_NS, Accept, mcap_writer, measure
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from undulog.capture.log import durable_sink
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.mcap_sink import McapSink
+from undulog.capture.log.sinks import durable_sink
+from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.sinks.mcap_sink import McapSink
 
 SIZES = (100, 1000)
 CHUNKS = (1 << 18, 1 << 19, 1 << 20)

@@ -25,8 +25,8 @@ from rerun.experimental import ViewerClient
 
 from undulog.capture import Session
 from undulog.replay import write_recording
-from undulog.replay.headless import client_of
-from undulog.replay.viewer import LOOPBACK, free_ports, viewer_binary
+from undulog.replay.viewer.headless import client_of
+from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 BAR_S = 3.0
 REST_S = 5.0
@@ -37,7 +37,7 @@ SIZE = "--window-size=1440x900"
 VIEW = f"""
 import sys
 import undulog
-from undulog.replay import viewer
+from undulog.replay.viewer import viewer
 
 def without_window(*options):
     window = viewer.Viewer(["--headless", "{SIZE}", "--hide-welcome-screen", *options])

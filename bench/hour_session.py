@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.log.frames import DIR_TX, FRAME_DTYPE, FrameArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.log.messages.frames import DIR_TX, FRAME_DTYPE, FrameArray
+from undulog.capture.robot.model import Robot
 
 EPOCH_NS = 1_700_000_000_000_000_000
 JOINTS = 25

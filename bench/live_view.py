@@ -27,10 +27,10 @@ import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
 from undulog.capture import load_robot
-from undulog.capture.daemon.live_feed import LiveFeed
-from undulog.capture.log.cdr import encode, layout_of
-from undulog.capture.log.schemas import message_type, schema_text
-from undulog.replay.viewer import LOOPBACK, free_ports, viewer_binary
+from undulog.capture.log.messages.cdr import encode, layout_of
+from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.recorder.live_feed import LiveFeed
+from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 TICK_S = 0.005
 RATE_HZ = 100

@@ -36,10 +36,10 @@ from mcap.records import ChunkIndex
 from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture import Session
-from undulog.capture.console import progress
-from undulog.capture.log.joint_reader import OFFSET_TOPICS
-from undulog.capture.log.read_ahead import threads_or_default
-from undulog.capture.log.signals import JointSignals
+from undulog.capture.common.console import progress
+from undulog.capture.common.threads import threads_or_default
+from undulog.capture.log.read.joint_reader import OFFSET_TOPICS
+from undulog.capture.log.read.signals import JointSignals
 
 Loaded = tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]
 

@@ -32,10 +32,10 @@ import rerun as rr
 from analyse_hour import cost, verdict
 
 from undulog.capture import Session
+from undulog.replay.draw.scene.body import capsule_poses, capsule_shape
+from undulog.replay.draw.scene.motion import assemble, frames_of, read_head
 from undulog.replay.samples.quantities import quantities
 from undulog.replay.samples.tracks import read_columns, wanted_fields
-from undulog.replay.scene.body import capsule_poses, capsule_shape
-from undulog.replay.scene.motion import assemble, frames_of, read_head
 
 HOUR_S = 3600
 CONVERT_S, SIZE_MB, PEAK_MB = 30.0, 350.0, 500.0

@@ -26,11 +26,11 @@ from hour_session import write_session
 from rerun.chunk import Chunk, LazyChunkStream
 
 from undulog.capture import Session
-from undulog.replay.beside.alignment import Align, align
-from undulog.replay.beside.merge import chunks_of, send
-from undulog.replay.beside.side import convert, read_side
-from undulog.replay.beside.write import Converted, write_beside
-from undulog.replay.viewer import viewer_binary
+from undulog.replay.overlay.alignment import Align, align
+from undulog.replay.overlay.merge import chunks_of, send
+from undulog.replay.overlay.side import convert, read_side
+from undulog.replay.overlay.write import Converted, write_beside
+from undulog.replay.viewer.viewer import viewer_binary
 
 BAR_S = 3.0
 """For the merge of the two recordings; what is written beside it is told."""

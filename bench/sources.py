@@ -32,7 +32,7 @@ import can
 import numpy as np
 
 from undulog.capture import SessionWriter
-from undulog.capture.log.frames import FRAME_DTYPE, empty_frames
+from undulog.capture.log.messages.frames import FRAME_DTYPE, empty_frames
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceContext
 from undulog.capture.sources.registry import open_source

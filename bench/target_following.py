@@ -26,10 +26,10 @@ import numpy as np
 from scipy.stats import binom
 
 from undulog.sim import load_scenario
-from undulog.sim.physics.engine import Kernels
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.scenario import CONTROL_RATE_HZ
-from undulog.sim.twin import Twin
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.scenario import CONTROL_RATE_HZ
+from undulog.sim.twin.twin import Twin
 
 FOLLOW, WALK = "target-following", "random-walk"
 UNTUNED = range(101, 131)

@@ -22,13 +22,13 @@ from collections.abc import Callable
 
 import pybullet
 
-from undulog.capture.robot import Plane, Robot
-from undulog.sim.gait import SerpentineGait
-from undulog.sim.physics.engine import EngineKind, Kernels
-from undulog.sim.readings import Readings
-from undulog.sim.scenario import CONTROL_RATE_HZ, Scenario
-from undulog.sim.scenario_file import load_scenario
-from undulog.sim.twin import Twin
+from undulog.capture.robot.model import Plane, Robot
+from undulog.sim.gait.readings import Readings
+from undulog.sim.gait.serpentine import SerpentineGait
+from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.scenario.scenario import CONTROL_RATE_HZ, Scenario
+from undulog.sim.scenario.scenario_file import load_scenario
+from undulog.sim.twin.twin import Twin
 
 LENGTHS = (12, 25, 50, 100)
 BUILT_IN = "PyBullet contacts + motors"

@@ -2,7 +2,7 @@
 
 ::
 
-    from undulog.capture import Session
+    from .log.read.session import Session
 
     with Session.open("run.mcap") as session:
         measured = session.joints("/joint_states", "position")
@@ -17,25 +17,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .lazy import attach
+from .common.lazy import attach
 
 if TYPE_CHECKING:
-    from .log.session import Session
-    from .log.signals import JointSignals, Signal
-    from .log.topics import Channel
-    from .log.writer import SessionWriter
-    from .robot import Robot
+    from .log.columns.topics import Channel
+    from .log.read.session import Session
+    from .log.read.signals import JointSignals, Signal
+    from .log.write.writer import SessionWriter
     from .robot.description import load_robot, robot_names
+    from .robot.model import Robot
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
-        "Channel": "log.topics",
-        "JointSignals": "log.signals",
-        "Robot": "robot",
-        "Session": "log.session",
-        "SessionWriter": "log.writer",
-        "Signal": "log.signals",
+        "Channel": "log.columns.topics",
+        "JointSignals": "log.read.signals",
+        "Robot": "robot.model",
+        "Session": "log.read.session",
+        "SessionWriter": "log.write.writer",
+        "Signal": "log.read.signals",
         "load_robot": "robot.description",
         "robot_names": "robot.description",
     },

@@ -19,10 +19,10 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.fitting import fit_gait
+from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.segments.examine import Chain, examine
-from undulog.capture.following import JointMotion, joints_not_following
-from undulog.capture.following.motion import Samples
+from undulog.capture.following.find import joints_not_following
+from undulog.capture.following.motion import JointMotion, Samples
 
 GAIN, LAG = 0.95, np.radians(10.0)
 JOINTS = 9

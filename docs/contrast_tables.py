@@ -12,9 +12,10 @@ from scipy.signal import lfilter
 
 from undulog.analysis.estimators.contrasts import contrast_variance, lag_contrast_variance
 from undulog.analysis.estimators.harmonic import fit_at
+from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import Noise, residual_spectrum
-from undulog.analysis.response import respond, t_factor
+from undulog.analysis.response.response import respond
 
 JOINTS, RATE, OMEGA = 9, 100.0, 2 * np.pi * 0.97
 AMPLITUDE, GAIN, LAG = 0.5, 0.9, 0.3

@@ -11,14 +11,14 @@ import dataclasses
 import tempfile
 from pathlib import Path
 
-from undulog.analysis.analyse import measure_session
 from undulog.analysis.energy.ledger import TERMS, booked_energies, whole_robot
-from undulog.analysis.joints import joint_energies
-from undulog.analysis.reading import RESPONSE_TOPIC, read_columns
+from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.joints import joint_energies
+from undulog.analysis.signals.reading import RESPONSE_TOPIC, read_columns
 from undulog.capture import Session
 from undulog.sim import load_scenario, scenario_names
-from undulog.sim.physics.engine import Kernels
-from undulog.sim.recording import record
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.twin.recording import record
 
 BAR = 0.005
 """Largest error of an energy of the whole robot."""

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.signal import correlate, correlation_lags, hilbert, lfilter
 
 from undulog.analysis.estimators.harmonic import fit_at, fit_shared
+from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import Noise, residual_noise, residual_spectrum
-from undulog.analysis.response import respond, t_factor
+from undulog.analysis.response.response import respond
 
 GAIN, LAG = 0.9, 0.2
 """Truth: gain, and lag [rad]."""

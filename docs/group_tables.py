@@ -10,8 +10,8 @@ import sys
 import numpy as np
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.fitting import fit_gait
-from undulog.analysis.response import gain_estimate, lag_estimate
+from undulog.analysis.response.fitting import fit_gait
+from undulog.analysis.response.response import gain_estimate, lag_estimate
 
 GOLDEN = (1 + 5**0.5) / 2
 

@@ -22,13 +22,13 @@ import numpy as np
 from heterogeneity_tables import LEVEL, WAYS
 
 from undulog.analysis import analyse_session
-from undulog.analysis.reversal.mirror import mirror_test
-from undulog.analysis.reversal.modules import ordered_pairs
+from undulog.analysis.experiment.reversal.mirror import mirror_test
+from undulog.analysis.experiment.reversal.modules import ordered_pairs
 from undulog.capture import Session
 from undulog.sim import Wave, load_scenario, parse_scenario
-from undulog.sim.modules import Modules
-from undulog.sim.physics.engine import Kernels
-from undulog.sim.recording import record
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.modules import Modules
+from undulog.sim.twin.recording import record
 
 WEAKENED = (0.2, 0.1, 0.05)
 SCATTER = (0.05, 0.1, 0.3)

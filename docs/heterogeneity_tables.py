@@ -16,18 +16,18 @@ import numpy as np
 from scipy.signal import lfilter
 
 from undulog.analysis import analyse_session
-from undulog.analysis.reversal.mirror import (
+from undulog.analysis.experiment.reversal.mirror import (
     Strata,
     family_wise_p,
     label_scores,
     mirror_test,
     parts,
 )
-from undulog.analysis.reversal.modules import ordered_pairs
+from undulog.analysis.experiment.reversal.modules import ordered_pairs
 from undulog.capture import Session
 from undulog.sim import load_scenario
-from undulog.sim.modules import Modules
-from undulog.sim.recording import record
+from undulog.sim.scenario.modules import Modules
+from undulog.sim.twin.recording import record
 
 LEVEL = 0.05
 WAYS = ("weak-servo-pi3", "weak-servo-pi3-reverse")

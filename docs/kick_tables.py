@@ -14,9 +14,9 @@ import sys
 
 import numpy as np
 
-from undulog.analysis.kicks.local import Answers, nonlinearity
-from undulog.analysis.kicks.matrices import local_matrices
-from undulog.analysis.kicks.runs import Kick, Kind
+from undulog.analysis.experiment.kicks.local import Answers, nonlinearity
+from undulog.analysis.experiment.kicks.matrices import local_matrices
+from undulog.analysis.experiment.kicks.runs import Kick, Kind
 
 NOISE = np.radians(0.01)
 """Of one run's phase as its fit knows it [rad], and of its log amplitude."""

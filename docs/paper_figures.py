@@ -24,15 +24,17 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 from undulog.analysis import analyse_session
-from undulog.analysis.results.analysis import Analysis, BodyPoint, Estimate
+from undulog.analysis.results.analysis import Analysis, BodyPoint
+from undulog.analysis.results.estimate import Estimate
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
-from undulog.capture.palette import joint_hex
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.palette import joint_hex
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim import load_scenario
 from undulog.sim.control.laws import amplitude, bend, frequency
-from undulog.sim.recording import record
-from undulog.sim.world import Cylinder, Wall, World
+from undulog.sim.scenario.obstacles import Cylinder, Wall
+from undulog.sim.scenario.world import World
+from undulog.sim.twin.recording import record
 
 GREY = "#8c8c8c"
 STONE = "#c9cdd3"

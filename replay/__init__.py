@@ -4,7 +4,7 @@
 
     from pathlib import Path
     from undulog.capture import Session
-    from undulog.replay import write_recording
+    from .record.rrd import write_recording
 
     with Session.open("run.mcap") as session:
         recording = write_recording(session, Path("run.rrd"))
@@ -19,17 +19,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from undulog.capture.lazy import attach
+from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
-    from .content import Content
-    from .rrd import Recording, write_recording
+    from .content.content import Content
+    from .record.rrd import Recording, write_recording
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
-        "Content": "content",
-        "Recording": "rrd",
-        "write_recording": "rrd",
+        "Content": "content.content",
+        "Recording": "record.rrd",
+        "write_recording": "record.rrd",
     },
 )

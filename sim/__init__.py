@@ -1,6 +1,6 @@
 """The twin: body, ground, servos and gait of an undulating robot, recorded like the robot itself.
 
-This package imports light; :mod:`.sim.twin` and :mod:`.sim.recording` bring the physics engine.
+This package imports light; :mod:`.twin.twin` and :mod:`.twin.recording` bring the physics engine.
 """
 
 # pyright: reportUnusedImport=false
@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from undulog.capture.lazy import attach
+from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
     from .gait.contract import Gait, GaitTick
+    from .gait.readings import Readings
     from .gait.serpentine import Serpentine, SerpentineGait
     from .gait.wave import PlaneGait, Wave
-    from .readings import Readings
-    from .recording import record
-    from .scenario import Scenario
-    from .scenario_file import load_scenario, parse_scenario, scenario_names
-    from .sensing.model import (
+    from .scenario.field import RandomField
+    from .scenario.ground import FrictionLaw, Ground
+    from .scenario.obstacles import Box, Cylinder, ObstacleMaterial, Target, Wall
+    from .scenario.scenario import Scenario
+    from .scenario.scenario_file import load_scenario, parse_scenario, scenario_names
+    from .scenario.sensors import (
         AccelerometerModel,
         CompassModel,
         InfraredModel,
@@ -28,43 +30,41 @@ if TYPE_CHECKING:
         ServoPolling,
         SonarModel,
     )
-    from .twin import Twin
-    from .world.field import RandomField
-    from .world.ground import FrictionLaw, Ground
-    from .world.model import World
-    from .world.obstacles import Box, Cylinder, ObstacleMaterial, Target, Wall
+    from .scenario.world import World
+    from .twin.recording import record
+    from .twin.twin import Twin
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
-        "AccelerometerModel": "sensing.model",
-        "Box": "world.obstacles",
-        "CompassModel": "sensing.model",
-        "Cylinder": "world.obstacles",
-        "FrictionLaw": "world.ground",
+        "AccelerometerModel": "scenario.sensors",
+        "Box": "scenario.obstacles",
+        "CompassModel": "scenario.sensors",
+        "Cylinder": "scenario.obstacles",
+        "FrictionLaw": "scenario.ground",
         "Gait": "gait.contract",
         "GaitTick": "gait.contract",
-        "Ground": "world.ground",
-        "InfraredModel": "sensing.model",
-        "Noise": "sensing.model",
-        "ObstacleMaterial": "world.obstacles",
+        "Ground": "scenario.ground",
+        "InfraredModel": "scenario.sensors",
+        "Noise": "scenario.sensors",
+        "ObstacleMaterial": "scenario.obstacles",
         "PlaneGait": "gait.wave",
-        "RandomField": "world.field",
-        "Readings": "readings",
-        "Scenario": "scenario",
-        "SensorModels": "sensing.model",
+        "RandomField": "scenario.field",
+        "Readings": "gait.readings",
+        "Scenario": "scenario.scenario",
+        "SensorModels": "scenario.sensors",
         "Serpentine": "gait.serpentine",
         "SerpentineGait": "gait.serpentine",
-        "ServoPolling": "sensing.model",
-        "SonarModel": "sensing.model",
-        "Target": "world.obstacles",
-        "Twin": "twin",
-        "Wall": "world.obstacles",
+        "ServoPolling": "scenario.sensors",
+        "SonarModel": "scenario.sensors",
+        "Target": "scenario.obstacles",
+        "Twin": "twin.twin",
+        "Wall": "scenario.obstacles",
         "Wave": "gait.wave",
-        "World": "world.model",
-        "load_scenario": "scenario_file",
-        "parse_scenario": "scenario_file",
-        "record": "recording",
-        "scenario_names": "scenario_file",
+        "World": "scenario.world",
+        "load_scenario": "scenario.scenario_file",
+        "parse_scenario": "scenario.scenario_file",
+        "record": "twin.recording",
+        "scenario_names": "scenario.scenario_file",
     },
 )

@@ -17,6 +17,13 @@ TESTS = str(Path(__file__).parent)
 if TESTS not in sys.path:  # test folders are no packages: the fault zoo is imported by its name
     sys.path.append(TESTS)
 
+# In the background of a script or under nohup these are ignored, and every process that a test
+# starts would inherit that. A handler is not inherited; this one goes on ignoring SIGHUP here.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
+
 REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (

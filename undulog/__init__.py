@@ -15,88 +15,103 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cyclopts import App
 
-    from .capture.errors import MissingExtraError
+    from undulog.capture.common.errors import MissingExtraError
 
 VERBS: dict[str, tuple[str, str]] = {
-    "record": ("undulog.capture.record_cli:record", "Record a robot, or its twin, into a session."),
+    "record": (
+        "undulog.capture.commands.record:record",
+        "Record a robot, or its twin, into a session.",
+    ),
     "record status": (
-        "undulog.capture.record_control:status",
+        "undulog.capture.commands.record_control:status",
         "Say how the running recordings go.",
     ),
     "record mark": (
-        "undulog.capture.record_control:mark",
+        "undulog.capture.commands.record_control:mark",
         "Mark this moment of the running recording.",
     ),
     "record note": (
-        "undulog.capture.record_control:note",
+        "undulog.capture.commands.record_control:note",
         "Write a remark into the running recording.",
     ),
-    "record split": ("undulog.capture.record_control:split", "Have it begin a new part."),
+    "record split": ("undulog.capture.commands.record_control:split", "Have it begin a new part."),
     "record stop": (
-        "undulog.capture.record_control:stop",
+        "undulog.capture.commands.record_control:stop",
         "End the running recording in good order.",
     ),
-    "record unit": ("undulog.capture.record_control:unit", "Print a systemd unit for recordings."),
-    "import": ("undulog.capture.cli:import_log", "Bring in a foreign log: CAN traces, CSV."),
-    "log info": ("undulog.capture.log_info:log_info", "Say what a log holds."),
+    "record unit": (
+        "undulog.capture.commands.record_control:unit",
+        "Print a systemd unit for recordings.",
+    ),
+    "import": (
+        "undulog.capture.commands.import_export:import_log",
+        "Bring in a foreign log: CAN traces, CSV.",
+    ),
+    "log info": ("undulog.capture.commands.log_info:log_info", "Say what a log holds."),
     "log check": (
-        "undulog.capture.log_check:log_check",
+        "undulog.capture.commands.log_check:log_check",
         "Say whether a session is good, degraded or bad, and why.",
     ),
     "log recover": (
-        "undulog.capture.log_recover:log_recover",
+        "undulog.capture.commands.log_recover:log_recover",
         "Write a whole file from what a crash left.",
     ),
-    "log cut": ("undulog.capture.log_tools:log_cut", "Write a part of a log to a new file."),
-    "log merge": ("undulog.capture.log_tools:log_merge", "Put several logs into one new file."),
+    "log cut": (
+        "undulog.capture.commands.log_edit:log_cut",
+        "Write a part of a log to a new file.",
+    ),
+    "log merge": (
+        "undulog.capture.commands.log_edit:log_merge",
+        "Put several logs into one new file.",
+    ),
     "log export": (
-        "undulog.capture.cli:export_log",
+        "undulog.capture.commands.import_export:export_log",
         "Write frames or joint columns for other tools.",
     ),
-    "sim list": ("undulog.sim.cli:list_scenarios", "List the shipped scenarios."),
-    "sim run": ("undulog.sim.cli:run", "Simulate a scenario and record it."),
+    "sim list": ("undulog.sim.commands.run:list_scenarios", "List the shipped scenarios."),
+    "sim run": ("undulog.sim.commands.run:run", "Simulate a scenario and record it."),
     "sim fit": (
-        "undulog.replay.calibrate.cli:fit",
+        "undulog.replay.commands.fit:fit",
         "Fit the twin's servo and friction to a session.",
     ),
-    "sim null": ("undulog.sim.null_cli:null", "Model identical modules, for analyse --null."),
-    "sim serve": ("undulog.sim.serve.cli:serve", "Be a robot on a bus, in real time."),
-    "drive": ("undulog.sim.drive.cli:drive", "Drive a gait, a plan or recorded commands."),
+    "sim null": ("undulog.sim.commands.null:null", "Model identical modules, for analyse --null."),
+    "sim serve": ("undulog.sim.commands.serve:serve", "Be a robot on a bus, in real time."),
+    "drive": ("undulog.sim.commands.drive:drive", "Drive a gait, a plan or recorded commands."),
     "analyse": (
-        "undulog.analysis.cli:analyse",
+        "undulog.analysis.commands.analyse:analyse",
         "Numbers: response, energy, spread over the segments.",
     ),
     "predict": (
-        "undulog.analysis.oscillators.cli:predict",
+        "undulog.analysis.commands.predict:predict",
         "From kicks: how oscillators that feel their servos synchronise.",
     ),
     "compare": (
-        "undulog.analysis.compare.cli:compare",
+        "undulog.analysis.commands.compare:compare",
         "What differs between two sessions or groups.",
     ),
     "plan lag-sweep": (
-        "undulog.analysis.plan.sweep_cli:lag_sweep",
+        "undulog.analysis.commands.plan_sweep:lag_sweep",
         "Commands that tell the coupling without contact.",
     ),
     "plan multisine": (
-        "undulog.analysis.plan.sweep_cli:multisine",
+        "undulog.analysis.commands.plan_sweep:multisine",
         "The same at several frequencies at once.",
     ),
     "plan phase-kicks": (
-        "undulog.analysis.plan.cli:phase_kicks",
+        "undulog.analysis.commands.plan:phase_kicks",
         "Commands that tell the coupling.",
     ),
     "plan reversal": (
-        "undulog.analysis.plan.cli:reversal",
+        "undulog.analysis.commands.plan:reversal",
         "Commands that tell boundary from module.",
     ),
-    "report": ("undulog.analysis.report.cli:report", "The offline report, one HTML page."),
+    "report": ("undulog.analysis.commands.report:report", "The offline report, one HTML page."),
     "replay": (
-        "undulog.replay.again.cli:replay",
+        "undulog.replay.commands.replay:replay",
         "Run a recorded experiment again in the twin; compare.",
     ),
-    "view": ("undulog.replay.cli:view", "See a session in Rerun."),
-    "info": ("undulog.capture.environment:info", "Versions and extras, for a bug report."),
+    "view": ("undulog.replay.commands.view:view", "See a session in Rerun."),
+    "info": ("undulog.capture.commands.info:info", "Versions and extras, for a bug report."),
 }
 """Verb to the function behind it and its line in the list of verbs."""
 
@@ -192,7 +207,7 @@ def run(arguments: Sequence[str]) -> int:
     """
     from cyclopts import CycloptsError, UnknownCommandError
 
-    from .capture.errors import UndulogError, UsageError
+    from undulog.capture.common.errors import UndulogError, UsageError
 
     try:
         if "" in arguments:  # as a path it would be this folder
@@ -219,7 +234,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
-    from .capture.deferred import defer
+    from undulog.capture.common.deferred import defer
 
     defer()
     if not sys.stderr.isatty():
@@ -264,8 +279,8 @@ def _without_chunk_limit(arguments: Sequence[str]) -> list[str]:
     for word in rest:
         name, equals, value = word.partition("=")
         if name == option:
-            from .capture.errors import UsageError
-            from .capture.log.chunk import LARGEST_CHUNK_VARIABLE, largest_chunk
+            from undulog.capture.common.errors import UsageError
+            from undulog.capture.log.mcap.chunk import LARGEST_CHUNK_VARIABLE, largest_chunk
 
             os.environ[LARGEST_CHUNK_VARIABLE] = value if equals else next(rest, "")
             try:
@@ -294,7 +309,7 @@ def _unknown(arguments: Sequence[str]) -> str:
 
 def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtraError | None:
     """The extra that would mend the import, if one would."""
-    from .capture.errors import MissingExtraError
+    from undulog.capture.common.errors import MissingExtraError
 
     cause: BaseException | None = error
     while cause is not None:
@@ -307,7 +322,7 @@ def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtra
 
 
 def _complain(message: str, code: int) -> int:
-    from .capture.console import complain
+    from undulog.capture.common.console import complain
 
     complain(f"error: {message}")
     return code

@@ -7,16 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from undulog.capture.errors import DataError, LogError
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import DataError, LogError
+from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.series import Series
-from ..fitting import GaitFit
-from ..joints import Span
-from ..reading import Warn, by_plane, drag_ratio
-from ..remarks import Note
+from ..response.fitting import GaitFit
 from ..results.analysis import BodyResult
+from ..results.remarks import Note
+from ..signals.reading import by_plane, drag_ratio
+from ..signals.windows import Span
 from .places import observed, perfect_tracking, track
 
 ODOMETRY_TOPIC = "/odom"

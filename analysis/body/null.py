@@ -17,11 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
+from undulog.capture.robot.model import Plane, Robot
 
-DRAG_RATIO = 10.0
-"""K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""
+from ..signals.as_run import DRAG_RATIO
 
 
 @dataclass(frozen=True)

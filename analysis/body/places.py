@@ -7,17 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Plane, Robot
 
-from ..estimators.harmonic import HarmonicFit, HarmonicModel, fit_at
+from ..estimators.harmonic import HarmonicFit, fit_at
+from ..estimators.harmonic_moments import HarmonicModel
+from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
 from ..estimators.spectrum import residual_noise
-from ..gait import allowed_model
-from ..response import around, t_factor
-from ..results.analysis import BodyPoint, Estimate
-from .null import DRAG_RATIO, free_chain, one_cycle, places, viscous_chain
+from ..response.gait import allowed_model
+from ..results.analysis import BodyPoint
+from ..results.estimate import Estimate
+from ..signals.as_run import DRAG_RATIO
+from .null import free_chain, one_cycle, places, viscous_chain
 
 PLACES = ("head", "middle", "tail")
 TREND = 2

@@ -7,15 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.errors import DataError
+from undulog.capture.common.errors import DataError
 
-from ..experiment.runs import (
-    SAME_COMMAND,
-    GaitRun,
-    command_change,
-    other_frequency,
-)
-from ..text import formats
+from ..results import formats
+from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
 
 
 @dataclass(frozen=True)

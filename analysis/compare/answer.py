@@ -6,12 +6,12 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from undulog.capture.console import plain
+from undulog.capture.common.console import plain
 
-from ..results.analysis import Estimate, leaves_out_zero
-from ..text import formats
+from ..results import formats
+from ..results.comparison import BODY, BrokenJoint, Difference
+from ..results.estimate import Estimate, leaves_out_zero
 from .decisions import SIGNIFICANT, Decided
-from .result import BODY, BrokenJoint, Difference
 
 MOST = 4
 """Broken or differing joints that the sentence lists at most."""

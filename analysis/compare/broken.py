@@ -7,12 +7,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from undulog.capture.console import plain
+from undulog.capture.common.console import plain
 
 from ..results.answer import Answer, NotFollowing, StandOut
+from ..results.comparison import BrokenJoint
+from ..segments.answer import deviation_in_words, fault_in_words
 from ..segments.examine import OFFSET_RAD
-from ..text.answer import deviation_in_words, fault_in_words
-from .result import BrokenJoint
 from .side import Seen
 
 

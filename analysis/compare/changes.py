@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from undulog.capture import Session
-from undulog.capture.strict_table import read_toml
+from undulog.capture.common.strict_table import read_toml
 
-from .result import Change
+from ..results.comparison import Change
 
 _OF_THE_RUN = frozenset(
     {

@@ -9,20 +9,20 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.environment import base_versions
-from undulog.capture.errors import UsageError
+from undulog.capture.commands.info import base_versions
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import UsageError
 
-from ..reading import Warn
-from ..response import CONFIDENCE, around, t_factor
-from ..results.analysis import Estimate, Provenance
-from ..stretch import Options
+from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..results.comparison import Comparison, Waveform
+from ..results.estimate import Estimate, Provenance
+from ..signals.stretch import Options
 from .alignment import Alignment, align
 from .answer import answer_of
 from .broken import broken_joints
 from .changes import changes
 from .decisions import Margins, decide, differ, estimates_of, family
 from .differences import Quantities, independent
-from .result import Comparison, Waveform
 from .side import Seen, see, turned
 from .waveform import phases_rad
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
-from ..response import around
-from ..results.analysis import Estimate
+from ..estimators.intervals import around
+from ..results.comparison import BODY, Difference, Equivalence, NamedJoint
+from ..results.estimate import Estimate
 from .differences import Differences, Quantities, from_runs, holm, independent, paired
-from .result import BODY, Difference, Equivalence, NamedJoint
 from .side import Key, Seen
 
 SIGNIFICANT = 0.05

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import UsageError
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import UsageError
 
-from ..response import CONFIDENCE, welch_satterthwaite
+from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 
 MIN_RUNS = 2
 """Runs a side below which nothing is known of their scatter."""

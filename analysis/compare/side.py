@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import Warn
 
-from ..analyse import Measured, measure_session
-from ..experiment.runs import GaitRun, gait_run
-from ..reading import Warn
+from ..body.steps import body_steps, cost_of_transport, mean_of_cycles, speed
 from ..results.analysis import Analysis
-from ..stretch import Options
+from ..results.comparison import BODY
+from ..session.analyse import Measured, measure_session
+from ..session.runs import GaitRun, gait_run
+from ..signals.stretch import Options
 from .changes import facts_of
 from .differences import Quantities, from_runs
-from .motion import body_steps, cost_of_transport, mean_of_cycles, speed
-from .result import BODY
 from .waveform import cycles_by_phase, phases_rad
 
 Key = tuple[str, str]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series

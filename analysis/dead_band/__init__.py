@@ -3,9 +3,3 @@
 Dry friction (stick) and a gear's play both do that at every reversal, and both are mechanics: the
 joint is measured rightly, and its gain and lag stand. Here the width of the band is measured.
 """
-
-from __future__ import annotations
-
-from .find import dead_bands
-
-__all__ = ["dead_bands"]

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray
-from undulog.capture.log.signals import Signal
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.log.read.signals import Signal
 
+from ..artefacts.spans import runs
 from ..estimators.series import Series, clean, shared_times
-from ..fitting import GaitFit
-from ..flags.spans import runs
-from ..reading import Columns
+from ..response.fitting import GaitFit
 from ..results.dead_band import DeadBand, Reversal
+from ..signals.reading import Columns
 from .fit import Fitted, fit_dead_bands
 from .kind import Witness, decide
 from .model import BOTTOM, DELAY, TOP, WIDTH, Cycles, whole_cycles

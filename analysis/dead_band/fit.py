@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from ..response import t_factor
+from ..estimators.intervals import t_factor
 from .model import BOTTOM, DELAY, LAG, PARAMETERS, TOP, WIDTH, Cycles, Misfit, misfit
 
 _SHARES = np.array([0.0, 0.15, 0.4, 1.0])

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
-from undulog.capture.log.signals import Signal
+from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.log.read.signals import Signal
 
 from ..estimators.series import Series
-from ..reading import Columns
 from ..results.dead_band import EITHER, PLAY, STICK
+from ..signals.reading import Columns
 from .fit import Fitted
 from .model import DELAY, WIDTH, Cycles
 

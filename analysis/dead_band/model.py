@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import GAP_FACTOR, Series
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 
 def rested(command: FloatArray, width: float, top: float, bottom: float) -> FloatArray:

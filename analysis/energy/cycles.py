@@ -7,18 +7,13 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import Warn
 
-from ..joints import Energies, Span
-from ..reading import Columns, Warn
-from ..results.energy import (
-    Closure,
-    Each,
-    EnergyResult,
-    JointCycles,
-    Transport,
-)
-from .joint import Energy
+from ..results.energy import Closure, Each, EnergyResult, JointCycles, Transport
+from ..signals.reading import Columns
+from ..signals.windows import Span
+from .joint import Energies, Energy
 
 STEADY_SHARE = 0.2
 """A voltage that varies by less than this part of its mean is a supply's: a motor's follows the

@@ -3,7 +3,7 @@
 E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
 can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
 times motor current, signed and clipped. Where the log has the powers themselves, accumulated within
-each sampling interval (:class:`.capture.log.power_topics.PowerTopic`), their means are added up;
+each sampling interval (:class:`.PowerTopic`), their means are added up;
 else sampled factors are multiplied, and what the two do within an interval is lost. Gaps are not
 bridged: no time inside them counts.
 """
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.log.signals import Signal
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.log.read.signals import Signal
 
 from ..estimators.cycle_sums import Weighed, cycle_sums, weigh
 from ..estimators.series import Series, clean
@@ -135,3 +135,19 @@ def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
     for k in known.gaps:
         values[(t_s > known.t_s[k]) & (t_s < known.t_s[k + 1])] = np.nan
     return values
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Energies of one joint.
+
+    Attributes:
+        mechanical: By torque and velocity; None where they were not recorded.
+        electrical: By voltage and current; None likewise.
+        sampled: Which of the two are products of samples: what the factors do within a sampling
+            interval is not in them.
+    """
+
+    mechanical: Energy | None
+    electrical: Energy | None
+    sampled: frozenset[str] = frozenset()

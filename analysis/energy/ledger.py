@@ -11,12 +11,13 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.errors import DataError, LogError
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import DataError, LogError
 
 from ..estimators.series import clean
-from ..joints import Energies, Span
-from ..reading import Warn
 from ..results.energy import Closure
+from ..signals.windows import Span
+from .joint import Energies
 
 LEDGER_TOPIC = "/energy_ledger"
 TERMS = {

@@ -7,18 +7,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import Warn
+from undulog.capture.robot.model import Robot
 
-from ..compare.motion import GRAVITY, body_steps
+from ..body.steps import GRAVITY, body_steps
+from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
-from ..joints import Energies, Span
-from ..reading import Warn
-from ..remarks import Note
-from ..response import around, t_factor
-from ..results.analysis import Estimate
 from ..results.energy import Transport
-from .joint import Energy
+from ..results.estimate import Estimate
+from ..results.remarks import Note
+from ..signals.windows import Span
+from .joint import Energies, Energy
 
 LEAST_WAY = 0.01
 """Displacement in a cycle, over the body's length, below which a robot goes nowhere."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 
 from .spectrum import ResidualBins
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
 from .series import sample_weights
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from .cycle_sums import cycle_sums, starts_of
 from .rotation import cos_sin

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import stdtr
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 EQUIVALENT_GAIN = 0.02
 EQUIVALENT_LAG_RAD = np.pi / 180

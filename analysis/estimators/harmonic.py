@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray
-from undulog.capture.errors import DataError
-from undulog.capture.threads import in_threads
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.errors import DataError
+from undulog.capture.common.threads import in_threads
 
 from .harmonic_moments import HarmonicModel, Solved, solve
 from .series import Series, shared_times

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import DataError
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import DataError
 
 from .rotation import cos_sin
 from .series import Series

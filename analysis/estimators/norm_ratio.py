@@ -13,10 +13,10 @@ from typing import Protocol
 import numpy as np
 from scipy.special import chdtri
 
-from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ..response import CONFIDENCE
-from ..results.analysis import Estimate
+from ..results.estimate import Estimate
+from .intervals import CONFIDENCE
 
 DRAWS = 400
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from .harmonic import HarmonicFit
 from .harmonic_moments import basis, chunks, time_scale

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray, frozen
-from undulog.capture.log.signals import Signal
+from undulog.capture.common.arrays import FloatArray, IntArray, frozen
+from undulog.capture.log.read.signals import Signal
 
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""

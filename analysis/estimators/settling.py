@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from undulog.capture.arrays import ComplexArray
+from undulog.capture.common.arrays import ComplexArray
 
 from .cycle_sums import cycle_sums, starts_of
 from .harmonic import HarmonicFit

@@ -10,52 +10,24 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import ComplexArray
-from undulog.capture.environment import base_versions
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Robot
+from undulog.capture.commands.info import base_versions
+from undulog.capture.common.arrays import ComplexArray
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Robot
 
-from ..analyse import Examined, examine_session
-from ..coupling import one_gait_coupling
 from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
-from ..kicks.answer import kick_answer
-from ..kicks.coupling import kick_coupling
-from ..kicks.experiment import find_kicks
-from ..kicks.matrices import ROW_TOLERANCE
-from ..kicks.runs import MOST_KICK, MOST_PATTERN, SAME
+from ..estimators.intervals import CONFIDENCE
 from ..oscillators.body import body_oscillators
-from ..reading import Warn
-from ..response import CONFIDENCE, gain_estimate, lag_estimate
-from ..results.analysis import Analysis, Provenance
+from ..response.response import gain_estimate, lag_estimate
+from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
-from ..results.experiment import (
-    Experiment,
-    Headings,
-    PooledJoint,
-    PooledRuns,
-    Reversal,
-    Run,
-)
-from ..reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
-from ..reversal.modules import SAME_HEADING_RAD, SIGNIFICANT, reversal_of
-from ..reversal.posture import Posture, posture
-from ..reversal.shares import RESAMPLES
-from ..reversal.tilt import floor_lean
-from ..segments.pooled import pooled_answer
-from ..stretch import Options
-from ..sweep.answer import sweep_answer
-from ..sweep.coupling import NONLINEAR, sweep_coupling
-from ..sweep.runs import (
-    MOST_CONDITION,
-    CommandTones,
-    Sweep,
-    command_tones,
-    find_sweep,
-)
-from .answer import broken_first, experiment_answer
-from .indices import experiment_indices
-from .pooling import PooledResponse, pool_runs
-from .runs import (
+from ..results.estimate import Provenance
+from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
+from ..session.analyse import Examined, examine_session
+from ..session.coupling_of_one_gait import one_gait_coupling
+from ..session.posture import Posture, posture
+from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
     GaitRun,
@@ -65,6 +37,23 @@ from .runs import (
     responses,
     sort_runs,
 )
+from ..signals.stretch import Options
+from .answer import broken_first, experiment_answer
+from .indices import experiment_indices
+from .kick_answer import kick_answer
+from .kicks.coupling import kick_coupling
+from .kicks.experiment import find_kicks
+from .kicks.matrices import ROW_TOLERANCE
+from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME
+from .pooled_answer import pooled_answer
+from .pooling import PooledResponse, pool_runs
+from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
+from .reversal.modules import SAME_HEADING_RAD, SIGNIFICANT, reversal_of
+from .reversal.shares import RESAMPLES
+from .reversal.tilt import floor_lean
+from .sweep.coupling import NONLINEAR, sweep_coupling
+from .sweep.runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
+from .sweep_answer import sweep_answer
 
 _LOW_FLOOR = 0.01
 """A p-value that can't go below this leaves little room under the level."""

@@ -6,14 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..results import formats
 from ..results.analysis import Analysis
 from ..results.answer import Answer, NotFollowing
 from ..results.experiment import OrderedPair, Reversal
-from ..reversal.modules import SIGNIFICANT
-from ..text import formats
-from ..text.answer import NAMED, fault_in_words
+from ..segments.answer import NAMED, fault_in_words
+from ..session.runs import Role
 from .pooling import PooledResponse
-from .runs import Role
+from .reversal.modules import SIGNIFICANT
 
 OR_TILT = "or the floor is tilted"
 

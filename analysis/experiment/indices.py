@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray
+from undulog.capture.common.arrays import ComplexArray
 
-from ..heterogeneity import spread
-from ..results.analysis import Index, Interval
+from ..results.analysis import Index
+from ..results.estimate import Interval
 from ..results.experiment import Reversal
-from ..reversal.mirror import MIN_RUNS, parts
+from ..session.heterogeneity import spread
+from .reversal.mirror import MIN_RUNS, parts
 
 
 def experiment_indices(

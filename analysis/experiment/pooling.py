@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray, frozen
-from undulog.capture.errors import UsageError
+from undulog.capture.common.arrays import ComplexArray, FloatArray, frozen
+from undulog.capture.common.errors import UsageError
 
-from ..response import Response
+from ..response.response import Response
 
 
 @dataclass(frozen=True)

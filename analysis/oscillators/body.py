@@ -7,18 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtridf
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
+from ..estimators.intervals import CONFIDENCE
 from ..estimators.norm_ratio import noise_draws
-from ..response import CONFIDENCE
-from ..results.analysis import Estimate
+from ..results import formats
 from ..results.coupling import LocalCoupling, Matrix, rows_of
-from ..text import formats
-from .comparator import explicit_coupling, homogeneous
-from .entrainment import entrainment
-from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, spectrum
-from .pseudospectrum import pseudospectrum
-from .result import (
+from ..results.estimate import Estimate
+from ..results.oscillators import (
     ENTRAINMENT_LABEL,
     BodyOscillators,
     Comparator,
@@ -26,6 +22,10 @@ from .result import (
     Mode,
     RelativeCoupling,
 )
+from .comparator import explicit_coupling, homogeneous
+from .entrainment import entrainment
+from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, spectrum
+from .pseudospectrum import pseudospectrum
 
 EXPLICIT_DRAWS = 100
 """Draws of P for the interval of the explicit coupling, each a root to find."""

@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import fdtrc
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
-from ..response import CONFIDENCE, around, t_factor
-from ..results.analysis import Estimate
-from ..text.deciding import beyond, percent
+from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..results.deciding import beyond, percent
+from ..results.estimate import Estimate
+from ..results.oscillators import ChainCoupling, Link, Rate
 from .pieces import between_kicks
-from .result import ChainCoupling, Link, Rate
 from .weak_form import OscillatorFit, fit_oscillator, window_length
 
 MOST_CONDITION = 500.0

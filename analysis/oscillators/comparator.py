@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.optimize import brentq
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from .laplacian import STRONG, spectrum
 

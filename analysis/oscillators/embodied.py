@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 
 
 def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArray:

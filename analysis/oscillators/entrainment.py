@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
+from ..estimators.intervals import CONFIDENCE
 from ..estimators.norm_ratio import Noisy
-from ..response import CONFIDENCE
 
 MOST_CONDITION = 1e6
 """Condition number of P beyond which it isn't inverted."""

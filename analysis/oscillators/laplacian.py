@@ -24,11 +24,11 @@ import numpy as np
 from scipy.linalg import eig
 from scipy.optimize import linear_sum_assignment
 
-from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 
+from ..estimators.intervals import CONFIDENCE
 from ..estimators.norm_ratio import Noisy, noise_draws
-from ..response import CONFIDENCE
-from ..results.analysis import Estimate
+from ..results.estimate import Estimate
 
 STRONG = 0.1
 """A rate of I - P above this counts as strong: the body brings such a pattern back in 10/eps."""

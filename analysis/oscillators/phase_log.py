@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.errors import MissingChannelError
-from undulog.capture.log.signals import JointSignals, Signal
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.errors import MissingChannelError
+from undulog.capture.log.read.signals import JointSignals, Signal
 
-from ..reading import RESPONSE_TOPIC, planes_of
+from ..signals.reading import RESPONSE_TOPIC, planes_of
 
 GAIT_TOPIC = "/gait"
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from .weak_form import Piece
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 
+from ..estimators.intervals import CONFIDENCE
 from ..estimators.norm_ratio import Noisy, noise_draws
-from ..response import CONFIDENCE
 from .laplacian import of_deviations
 
 POINTS = 41

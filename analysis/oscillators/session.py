@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from undulog.capture import Session
 
+from ..results.oscillators import ChainCoupling
 from .chain import chain_coupling
 from .phase_log import read_phases
-from .result import ChainCoupling
 
 _NS = 1e9
 

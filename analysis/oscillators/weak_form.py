@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import UsageError
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import UsageError
 
 WINDOW_S = 0.1
 """Length of a test function: short beside 1/K, long beside the noise of a reading."""

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray, IntArray
-from undulog.capture.robot import Joint, Plane, Robot
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.robot.model import Joint, Plane, Robot
 
 TIME_CONSTANTS = 5.0
 """So many of the slowest mode's time constants are waited for: 0.7 % of it is left."""

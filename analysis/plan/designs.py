@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray
+from undulog.capture.common.arrays import ComplexArray
 
-from ..reversal.posture import HEADING
+from ..session.posture import HEADING
 
 KICK = 0.05
 """Of phase [rad] and of log amplitude."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import ComplexArray, FloatArray
-from undulog.capture.errors import UsageError
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.errors import UsageError
 
-from ..analyse import examine_session
-from ..reading import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
-from ..text.deciding import percent
+from ..results.deciding import percent
+from ..session.analyse import examine_session
+from ..signals.reading import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
 
 PURE = 0.01
 """Harmonics of a command above this share of its fundamental are no sine any more."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 
 from .designs import PlannedRun, Tone
 

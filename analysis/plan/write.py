@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import LogWriteError, UsageError
-from undulog.capture.part_file import part_file
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import LogWriteError, UsageError
+from undulog.capture.common.part_file import part_file
 
 from .designs import PlannedRun
 from .gait_base import BaseGait

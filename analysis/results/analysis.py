@@ -12,42 +12,17 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..notebook.shown import Shown
 from .answer import Answer
 from .artefact import Artefact
+from .coupling import Coupling
 from .dead_band import DeadBand
+from .estimate import Estimate, Interval, Provenance
+from .shown import Shown
 
 if TYPE_CHECKING:
-    from ..oscillators.result import ChainCoupling
     from .energy import EnergyResult
+    from .oscillators import ChainCoupling
     from .over_time import ResponseOverTime
-
-Interval = tuple[float, float]
-
-
-def leaves_out_zero(ci95: Interval | None) -> bool:
-    """Whether a value differs from zero beyond doubt.
-
-    Args:
-        ci95: Its 95 % interval, or None.
-
-    Returns:
-        False where there is no interval.
-    """
-    return ci95 is not None and (ci95[0] > 0 or ci95[1] < 0)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value with its 95 % interval.
-
-    Attributes:
-        value: The estimate, or None where it could not be computed.
-        ci95: Low and high end of the 95 % interval, or None.
-    """
-
-    value: float | None = None
-    ci95: Interval | None = None
 
 
 @dataclass(frozen=True)
@@ -222,42 +197,6 @@ class Index:
     p: float | None
     unit: str
     label: str
-
-
-@dataclass(frozen=True, repr=False)
-class Coupling(Shown):
-    """Whether the coupling can be told from this session.
-
-    Attributes:
-        identifiable: False for one gait alone (m numbers for m^2 unknowns).
-        why: Why not, or how.
-        record: What to record so that it can be.
-        matrix: Row = responding joint, column = commanded joint; None if not identifiable.
-        condition_number: Of the inversion, or None.
-    """
-
-    identifiable: bool
-    why: str
-    record: str | None = None
-    matrix: tuple[tuple[float, ...], ...] | None = None
-    condition_number: float | None = None
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """How the result was made, so that it can be made again.
-
-    Attributes:
-        command: The command line that makes it.
-        versions: Package name to version.
-        inputs: Input file to SHA-256.
-        options: Option name to value.
-    """
-
-    command: str
-    versions: dict[str, str]
-    inputs: dict[str, str]
-    options: dict[str, Any]
 
 
 @dataclass(frozen=True, repr=False)

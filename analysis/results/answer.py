@@ -23,7 +23,7 @@ class NotFollowing:
     Attributes:
         joint: Joint name.
         kinds: Kinds of fault that fit and that the data can't tell apart: keys of
-            :data:`.capture.following.KINDS`.
+            :data:`.capture.following.fault.KINDS`.
         since_s: From the session's start [s]; None where it holds from the beginning.
         until_s: Its end [s]; None where it holds to the end.
         share: Share of the session in which it holds, 0 to 1.

@@ -4,9 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from .analysis import Coupling, Estimate
+from .estimate import Estimate
+from .shown import Shown
+
+
+@dataclass(frozen=True, repr=False)
+class Coupling(Shown):
+    """Whether the coupling can be told from this session.
+
+    Attributes:
+        identifiable: False for one gait alone (m numbers for m^2 unknowns).
+        why: Why not, or how.
+        record: What to record so that it can be.
+        matrix: Row = responding joint, column = commanded joint; None if not identifiable.
+        condition_number: Of the inversion, or None.
+    """
+
+    identifiable: bool
+    why: str
+    record: str | None = None
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    condition_number: float | None = None
+
 
 Rows = tuple[tuple[float, ...], ...]
 

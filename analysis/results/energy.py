@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .analysis import Estimate
+from .estimate import Estimate
 
 Each = tuple[float, ...] | None
 """One value a cycle, or None where it was not recorded or a sensor falsifies it."""

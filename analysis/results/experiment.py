@@ -12,15 +12,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from ..notebook.shown import Shown
-from ..oscillators.result import BodyOscillators
-from .analysis import (
-    Analysis,
-    Coupling,
-    Estimate,
-    Index,
-    Provenance,
-)
+from .analysis import Analysis, Index
+from .coupling import Coupling
+from .estimate import Estimate, Provenance
+from .oscillators import BodyOscillators
+from .shown import Shown
 
 BLIND = (
     "blind to what is alike at both joints of a mirror pair and to the middle joint of an odd "

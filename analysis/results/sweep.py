@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from .analysis import Coupling, Estimate
-from .coupling import Rows
+from .coupling import Coupling, Rows
+from .estimate import Estimate
 
 
 class Route(StrEnum):

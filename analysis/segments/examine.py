@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
-from ..response import Response
+from ..response.response import Response
 from ..results.answer import Shape, StandOut
 from .family import LEVEL, Scatter, critical_value, scatter_of
 from .outliers import Deviation, standing_out

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from ..estimators.contrasts import ResponseErrors
 

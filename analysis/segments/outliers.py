@@ -18,7 +18,7 @@ from math import comb
 import numpy as np
 from scipy.stats import t
 
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from .profile import (
     ENDS,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from .family import Member, Scatter
 

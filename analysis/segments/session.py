@@ -8,20 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
-from undulog.capture.following import Fault, JointMotion, joints_not_following
-from undulog.capture.following.motion import BLOCKS, Samples
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.following.fault import Fault
+from undulog.capture.following.find import joints_not_following
+from undulog.capture.following.motion import BLOCKS, JointMotion, Samples
 from undulog.capture.following.session import motions_of
 from undulog.capture.following.windows import COHERENT
-from undulog.capture.robot import Robot
+from undulog.capture.robot.model import Robot
 
-from ..fitting import GaitFit
-from ..gait import DRIVEN_SHARE
-from ..reading import QUANTITIES, Columns, by_plane
+from ..response.fitting import GaitFit
+from ..response.gait import DRIVEN_SHARE
 from ..results.analysis import JointResult
 from ..results.answer import NotFollowing
 from ..results.artefact import Artefact
-from ..windows import Stretch
+from ..signals.reading import QUANTITIES, Columns, by_plane
+from ..signals.windows import Stretch
 from .examine import Chain, Findings, examine
 
 _COMPARABLE = {"lost_samples"}

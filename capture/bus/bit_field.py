@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..common.arrays import FloatArray
 
 if TYPE_CHECKING:
     from cantools.database.can.signal import Signal

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..common.arrays import FloatArray, IntArray
 
 LONGEST_ROUND_NS = 100_000_000
 """No round spans more than this [ns]: later samples belong to the next one."""

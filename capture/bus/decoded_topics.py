@@ -19,12 +19,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
-from ..log.channels import JointStateChannel
-from ..log.sensor_channels import open_sensor
-from ..log.writer import SessionWriter
-from ..robot import BusSignal, Quantity, Robot, Sensor, SensorKind
-from ..units import SESSION_UNIT
+from ..common.arrays import FloatArray, IntArray
+from ..log.write.channels import JointStateChannel
+from ..log.write.sensor_channels import open_sensor
+from ..log.write.writer import SessionWriter
+from ..robot.model import BusSignal, Quantity, Robot, Sensor, SensorKind
+from ..robot.units import SESSION_UNIT
 from .cycles import RoundGatherer, Rounds
 from .decoding import BusDecoder, DecodedSignals
 

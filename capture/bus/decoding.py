@@ -14,8 +14,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
-from ..log.frames import (
+from ..common.arrays import BoolArray, FloatArray, IntArray
+from ..log.health.undecoded import counts_text
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -25,9 +26,8 @@ from ..log.frames import (
     FrameArray,
     identifier_text,
 )
-from ..log.undecoded import counts_text
-from ..robot import BusSignal, Direction, Quantity, Robot
-from ..units import SESSION_UNIT
+from ..robot.model import BusSignal, Direction, Quantity, Robot
+from ..robot.units import SESSION_UNIT
 from .map_entry import MapEntry, bus_messages, compile_entry, frame_id
 
 _WAY = {Direction.RX: DIR_RX, Direction.TX: DIR_TX}
@@ -216,8 +216,8 @@ class BusDecoder:
         """Decode frames.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, or of
-                :data:`.capture.log.frames.FD_FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, or of
+                :data:`.capture.log.messages.frames.FD_FRAME_DTYPE`, shape (n,).
 
         Returns:
             The samples of the map entries that occur, and what became of the frames.

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from ..errors import DataError
-from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
-from ..robot import BusSignal, Direction, Quantity, Robot
+from ..common.errors import DataError
+from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
+from ..robot.model import BusSignal, Direction, Quantity, Robot
 from .bit_field import BitField
 from .map_entry import Conditions, MapEntry, bus_messages, compile_entry, conditions_of, frame_id
 
@@ -134,7 +134,7 @@ class BusEncoder:
             t_ns: Time of the frames, as host and as device time [ns].
 
         Returns:
-            Records of :data:`.capture.log.frames.FRAME_DTYPE`, in the order of the map: every frame
+            Records of :data:`.FRAME_DTYPE`, in the order of the map: every frame
             of which a value is given. Its other fields hold what the map names for unknown; else
             they are as they were sent last, at first the DBC's initial value, or zero.
         """

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
-from ..errors import DataError
-from ..log.frames import EXTENDED_FLAG
-from ..robot import Bus, BusSignal, Quantity, Robot
+from ..common.arrays import FloatArray
+from ..common.errors import DataError
+from ..common.strict_table import Faults
+from ..log.messages.frames import EXTENDED_FLAG
 from ..robot.bus_map import database_messages
-from ..strict_table import Faults
-from ..units import Unit, unit_for
+from ..robot.model import Bus, BusSignal, Quantity, Robot
+from ..robot.units import Unit, unit_for
 from .bit_field import BitField
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
 
 
 def frame_id(message: Message) -> int:
-    """A message's identifier with the flags of :mod:`.capture.log.frames`.
+    """A message's identifier with the flags of :mod:`.capture.log.messages.frames`.
 
     Args:
         message: The message.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import DataError
-from ..log.frames import DIR_TX, FrameArray, empty_frames
-from ..robot import Robot
+from ..common.errors import DataError
+from ..log.messages.frames import DIR_TX, FrameArray, empty_frames
+from ..robot.model import Robot
 from .bit_field import BitField
 from .map_entry import bus_messages, frame_id
 
@@ -20,7 +20,7 @@ def poll_frames(robot: Robot) -> FrameArray:
         robot: The robot.
 
     Returns:
-        Records of :data:`.capture.log.frames.FRAME_DTYPE`, without times, in the order of the map;
+        Records of :data:`.FRAME_DTYPE`, without times, in the order of the map;
         none where nothing has to be asked.
 
     Raises:

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import IntArray
 from ..bus.decoded_topics import DecodedTopics, Message
 from ..bus.decoding import BusDecoder, DecodedSignals, FrameTally
-from ..bus.frame_log import FrameLog, LogBlock
-from ..console import progress
-from ..errors import ImportFormatError
-from ..interruption import StopRequest
-from ..log.channels import FrameChannel
-from ..log.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
-from ..log.undecoded import undecoded
-from ..log.writer import SessionWriter
-from ..robot import Robot
+from ..common.arrays import IntArray
+from ..common.console import progress
+from ..common.errors import ImportFormatError
+from ..common.interruption import StopRequest
+from ..log.health.undecoded import undecoded
+from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
+from ..log.write.channels import FrameChannel
+from ..log.write.writer import SessionWriter
+from ..robot.model import Robot
 from .can_logs import log_suffix, open_frame_log
+from .frame_log import FrameLog, LogBlock
 from .import_output import ImportReport, imported_session
 
 DIRECTIONS_KEY = "import.directions"

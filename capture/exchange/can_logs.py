@@ -20,10 +20,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
-from ..errors import ImportFormatError
-from ..input_file import is_file
-from ..log.frames import (
+from ..common.errors import ImportFormatError
+from ..common.input_file import is_file
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -33,6 +32,7 @@ from ..log.frames import (
     REMOTE_FLAG,
 )
 from .candump import read_candump
+from .frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 from .mf4 import open_mf4
 from .undated import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 

@@ -23,11 +23,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray
-from ..bus.frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
-from ..errors import ImportFormatError
-from ..log.chunk import LAST_NS
-from ..log.frames import (
+from ..common.arrays import IntArray
+from ..common.errors import ImportFormatError
+from ..log.mcap.chunk import LAST_NS
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -37,6 +36,7 @@ from ..log.frames import (
     FrameArray,
     holds_fd,
 )
+from .frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
 
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"

@@ -24,16 +24,16 @@ from typing import Any, Protocol, TextIO
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
 from ..bus.decoded_topics import JOINT_TOPIC
-from ..console import progress, refuse_existing
-from ..errors import MissingChannelError, MissingExtraError, UsageError
-from ..interruption import StopRequest
-from ..log.joint_reader import UNITS
-from ..log.schemas import JOINT_STATE
-from ..log.session import Session
-from ..log.signals import JointSignals
-from ..part_file import check_stop, part_file
+from ..common.arrays import FloatArray, IntArray
+from ..common.console import progress, refuse_existing
+from ..common.errors import MissingChannelError, MissingExtraError, UsageError
+from ..common.interruption import StopRequest
+from ..common.part_file import check_stop, part_file
+from ..log.messages.schemas import JOINT_STATE
+from ..log.read.joint_reader import UNITS
+from ..log.read.session import Session
+from ..log.read.signals import JointSignals
 from .log_export import refuse_same
 
 DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())

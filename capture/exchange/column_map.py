@@ -27,12 +27,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import Fault, FaultyFileError, UsageError
-from ..input_file import read_input
-from ..robot import Quantity, Robot
+from ..common.errors import Fault, FaultyFileError, UsageError
+from ..common.input_file import read_input
+from ..common.strict_table import Faults, Table, listed, read_toml
 from ..robot.bus_map import JOINT_QUANTITIES
-from ..strict_table import Faults, Table, listed, read_toml
-from ..units import TIME_UNITS, unit_for, valid_units
+from ..robot.model import Quantity, Robot
+from ..robot.units import TIME_UNITS, unit_for, valid_units
 
 _DELIMITERS = (",", ";", "\t", " ")
 _OPTION_FORM = (

@@ -13,15 +13,15 @@ from typing import TextIO
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
 from ..bus.decoded_topics import JOINT_TOPIC
-from ..console import progress
-from ..errors import ImportFormatError
-from ..interruption import StopRequest
-from ..log.writer import SessionWriter
-from ..robot import Quantity, Robot
-from ..strict_table import listed
-from ..units import SESSION_UNIT, TIME_UNITS, unit_for
+from ..common.arrays import FloatArray, IntArray
+from ..common.console import progress
+from ..common.errors import ImportFormatError
+from ..common.interruption import StopRequest
+from ..common.strict_table import listed
+from ..log.write.writer import SessionWriter
+from ..robot.model import Quantity, Robot
+from ..robot.units import SESSION_UNIT, TIME_UNITS, unit_for
 from .can_logs import CSV_HEADER
 from .column_map import Column, ColumnMap
 from .import_output import ImportReport, imported_session

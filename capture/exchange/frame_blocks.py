@@ -8,10 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..arrays import IntArray
-from ..bus.frame_log import LogBlock
-from ..errors import MissingChannelError
-from ..log.frames import (
+from ..common.arrays import IntArray
+from ..common.errors import MissingChannelError
+from ..log.messages.frames import (
     FD_TOPIC_PREFIX,
     FRAME_TOPIC_PREFIX,
     FRAME_TOPIC_PREFIXES,
@@ -20,8 +19,9 @@ from ..log.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from ..log.session import Session
+from ..log.read.session import Session
 from .can_import import DIRECTIONS_KEY
+from .frame_log import LogBlock
 
 _MESSAGES_PER_BLOCK = 200  # of 10 to 100 ms each
 _LATEST_NS = 1_000_000_000  # a frame is logged at most this long after its time

@@ -8,7 +8,7 @@ Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`.capture.exchan
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from ..arrays import IntArray
-from ..bus.frame_log import LogBlock
-from ..log.frames import (
+from ..common.arrays import IntArray
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -32,18 +31,17 @@ from ..log.frames import (
 )
 from .candump import candump_lines
 from .frame_blocks import FrameFacts
+from .frame_log import LogBlock
 from .frame_losses import is_error, is_remote, without_content
-from .ros_frames import RosFrames
+from .ros_frames import RosFrames, WriteFrames
 
 if TYPE_CHECKING:
     from can.io.generic import MessageWriter
 
+
 _NS = 1_000_000_000
 _BLF_EPOCH_NS = 631_152_000 * _NS  # 1990: python-can takes less for no date
 _NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
-
-WriteFrames = Callable[[LogBlock], None]
-"""Writes a stretch of frames; of CAN FD frames only where the format holds them."""
 
 
 class FrameFormat(Protocol):

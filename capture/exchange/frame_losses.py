@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..log.frames import (
+from ..log.messages.frames import (
     DIR_RX,
     ERROR_FLAG,
     EXTENDED_FLAG,

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..console import refuse_existing
-from ..log.writer import SessionWriter
-from ..part_file import part_file
-from ..robot import Robot
+from ..common.console import refuse_existing
+from ..common.part_file import part_file
+from ..log.write.writer import SessionWriter
+from ..robot.model import Robot
 
 _NS = 1_000_000_000
 

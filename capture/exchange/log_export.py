@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..console import progress, refuse_existing
-from ..errors import UsageError
-from ..interruption import StopRequest
-from ..log.session import Session
-from ..part_file import check_stop, part_file
+from ..common.console import progress, refuse_existing
+from ..common.errors import UsageError
+from ..common.interruption import StopRequest
+from ..common.part_file import check_stop, part_file
+from ..log.read.session import Session
 from .frame_blocks import chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS
 from .frame_losses import LossTally

@@ -23,11 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, IntArray
-from ..bus.frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock
-from ..deferred import undefer
-from ..errors import ImportFormatError, MissingExtraError
-from ..log.frames import (
+from ..common.arrays import BoolArray, IntArray
+from ..common.deferred import undefer
+from ..common.errors import ImportFormatError, MissingExtraError
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -40,6 +39,7 @@ from ..log.frames import (
     empty_fd_frames,
     empty_frames,
 )
+from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock
 from .mf4_faults import readable, said
 from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
 

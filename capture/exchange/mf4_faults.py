@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..errors import ImportFormatError
+from ..common.errors import ImportFormatError
 
 
 @contextmanager

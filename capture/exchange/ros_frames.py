@@ -9,19 +9,17 @@ trace, so that frames of one time keep their order.
 from __future__ import annotations
 
 import re
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.writer import Writer
 
-from ..arrays import IntArray
-from ..bus.frame_log import LogBlock
-from ..log.cdr import encode, layout_of
-from ..log.frames import (
+from ..common.arrays import IntArray
+from ..log.messages.cdr import encode, layout_of
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -30,12 +28,10 @@ from ..log.frames import (
     REMOTE_FLAG,
     FrameArray,
 )
-from ..log.rosmsg import parse_message_type
-from ..log.schemas import schema_text
+from ..log.messages.rosmsg import parse_message_type
+from ..log.messages.schemas import schema_text
 from .frame_blocks import FrameFacts
-
-if TYPE_CHECKING:
-    from .frame_formats import WriteFrames
+from .frame_log import LogBlock
 
 TYPE_NAME = "can_msgs/msg/Frame"
 """The messages' type."""
@@ -154,3 +150,7 @@ def _namespace(bus: str) -> str:
     """A name of ROS 2 for a bus: letters, digits and underscores, no digit first."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", bus)
     return f"/can_{name}" if name[:1].isdigit() or not name else f"/{name}"
+
+
+WriteFrames = Callable[[LogBlock], None]
+"""Writes a stretch of frames; of CAN FD frames only where the format holds them."""

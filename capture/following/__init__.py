@@ -3,11 +3,3 @@
 Pure functions on arrays (:mod:`~.capture.following.find`), so that the health of a log, its
 analysis and its replay name the same joints.
 """
-
-from __future__ import annotations
-
-from .fault import KINDS, Fault
-from .find import joints_not_following
-from .motion import JointMotion
-
-__all__ = ["KINDS", "Fault", "JointMotion", "joints_not_following"]

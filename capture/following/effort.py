@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray
+from ..common.arrays import ComplexArray, FloatArray
 from .fault import Symptom
 from .motion import (
     BLOCKS,

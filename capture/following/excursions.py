@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray
+from ..common.arrays import BoolArray, FloatArray
 from .fault import Span, Symptom
 from .motion import BLOCKS, JointMotion, Response, predicted
 

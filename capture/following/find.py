@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..threads import in_threads
+from ..common.threads import in_threads
 from .effort import powerless, usual_effort
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray
+from ..common.arrays import BoolArray, FloatArray
 from .effort import PUSHING, SAME, UsualEffort, effort_there
 from .fault import Fault, Span, Symptom
 from .motion import JointMotion, Samples, record_span, within

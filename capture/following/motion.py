@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import BoolArray, ComplexArray, FloatArray
+from ..common.arrays import BoolArray, ComplexArray, FloatArray
 from .fault import Span
 
 BLOCKS = 4

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import bdtrc
 
-from ..threads import in_threads
+from ..common.threads import in_threads
 from .fault import Span, Symptom
 from .motion import JointMotion, Samples
 

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
-from ..errors import DataError, LogError, MissingChannelError
-from ..log.session import Session
-from ..log.signals import Signal
-from ..log.unbroken import longest_unbroken
+from ..common.arrays import FloatArray, IntArray
+from ..common.errors import DataError, LogError, MissingChannelError
+from ..log.read.session import Session
+from ..log.read.signals import Signal
+from ..log.read.unbroken import longest_unbroken
 from .fault import Fault
 from .find import joints_not_following
 from .motion import JointMotion, Samples

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..arrays import BoolArray, ComplexArray
+from ..common.arrays import BoolArray, ComplexArray
 from .fault import Span
 from .motion import JointMotion, Response
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from ..errors import UsageError
-from ..strict_table import Faults, Table, listed
-from ..units import unit_for, valid_units
+from ..common.errors import UsageError
+from ..common.strict_table import Faults, Table, listed
 from .model import Bus, BusPoll, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
+from .units import unit_for, valid_units
 
 if TYPE_CHECKING:
     from cantools.database.can import Message

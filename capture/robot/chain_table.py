@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..strict_table import Table, listed
+from ..common.strict_table import Table, listed
 from .mesh import MESH_TYPES, is_mesh
 from .model import Joint, Link, Plane, Servo
 from .repeated import note_repeated

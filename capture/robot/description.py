@@ -31,9 +31,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import Fault, RobotFileError
-from ..shipped import Shelf
-from ..strict_table import Faults, Table, read_toml
+from ..common.errors import Fault, RobotFileError
+from ..common.shipped import Shelf
+from ..common.strict_table import Faults, Table, read_toml
 from .bus_map import read_bus
 from .chain_table import read_joints, read_links
 from .mesh import read_meshes

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import FloatArray
-from ..errors import DataError
+from ..common.arrays import FloatArray
+from ..common.errors import DataError
 from .model import Plane, Robot
 
 

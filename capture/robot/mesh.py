@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import PurePosixPath
 
-from ..strict_table import Faults, shown
+from ..common.strict_table import Faults, shown
 from .model import Link
 
 MESH_TYPES = {

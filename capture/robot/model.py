@@ -15,7 +15,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, frozen
+from ..common.arrays import FloatArray, IntArray, frozen
 from .safety import Safety
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..strict_table import Faults
+from ..common.strict_table import Faults
 
 
 def note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:

@@ -9,30 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import FloatArray, frozen
-
-if TYPE_CHECKING:
-    from .model import Robot
-
-_EXAMPLES = {
-    "max_rate": "4.0            # rad/s, of commands",
-    "ramp_rate": "0.5           # rad/s, to the first pose and down again",
-    "max_tracking_error": "0.35 # rad, between command and measured angle",
-    "reply_timeout_s": "0.25    # a joint that says nothing for so long is lost",
-    "max_late_s": "0.2          # a control tick that is later stops the drive",
-    "max_current": "1.4         # A",
-    "max_temperature": "70.0    # degC",
-    "min_voltage": "5.0         # V",
-}
-_OF_QUANTITY = {
-    "max_current": "current",
-    "max_temperature": "temperature",
-    "min_voltage": "voltage",
-}
+from ..common.arrays import FloatArray, frozen
 
 JOINT_LIMITS = (
     "max_rate",
@@ -96,46 +76,3 @@ class Safety:
         own = {joint: value for joint, name, value in self.of if name == limit}
         fallback = math.nan if common is None else common
         return frozen(np.array([own.get(name, fallback) for name in joint_names]))
-
-
-def missing_limits(robot: Robot) -> tuple[str, ...]:
-    """The limits that a robot lacks to be driven over its bus.
-
-    Rates, tracking error and the two times are always needed; limits of current, temperature and
-    voltage where the robot tells these on its bus.
-
-    Args:
-        robot: The robot.
-
-    Returns:
-        Names of fields of :class:`Safety`, in its order; empty if there is nothing to add.
-    """
-    safety = robot.safety or Safety()
-    told = {
-        str(signal.quantity)
-        for signal in (robot.bus.signals if robot.bus is not None else ())
-        if signal.direction == "rx"
-    }
-    missing: list[str] = []
-    for limit in _EXAMPLES:
-        if _OF_QUANTITY.get(limit, "") not in {"", *told}:
-            continue
-        if limit in JOINT_LIMITS:
-            lacks = bool(np.isnan(safety.values(limit, robot.joint_names)).any())
-        else:
-            lacks = getattr(safety, limit) is None
-        if lacks:
-            missing.append(limit)
-    return tuple(missing)
-
-
-def safety_example(limits: tuple[str, ...]) -> str:
-    """A ``safety`` table as a robot's file would have it.
-
-    Args:
-        limits: Its fields, of :func:`missing_limits`.
-
-    Returns:
-        TOML, with units as comments.
-    """
-    return "\n".join(["[safety]", *(f"{name} = {_EXAMPLES[name]}" for name in limits)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..strict_table import Table
+from ..common.strict_table import Table
 from .model import Joint
 from .safety import JOINT_LIMITS, OnFault, Safety
 

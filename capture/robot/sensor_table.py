@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..strict_table import Table, listed
+from ..common.strict_table import Table, listed
 from .model import Link, Sensor, SensorKind
 from .repeated import note_repeated
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import PurePosixPath
 
-from ..errors import UsageError
+from ..common.errors import UsageError
 from .contract import SourceAddress
 
 FORM = "[NAME=]SCHEME:REST[?KEY=VALUE&...]"

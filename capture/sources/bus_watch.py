@@ -1,6 +1,6 @@
 """What error frames say: a node in trouble, a controller off the bus and back.
 
-An error frame is one with :data:`.capture.log.frames.ERROR_FLAG`; its identifier holds the classes
+An error frame is one with :data:`.ERROR_FLAG`; its identifier holds the classes
 of error and its data the details, as in ``linux/can/error.h``.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..log.frames import ERROR_FLAG, ID_MASK, FrameArray
+from ..log.messages.frames import ERROR_FLAG, ID_MASK, FrameArray
 from .contract import DEVICE_TIMES_END_NS
 from .events import ODD_TIME, Tally
 

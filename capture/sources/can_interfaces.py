@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import can
 from can.interfaces import BACKENDS
 
-from ..errors import UsageError
-from ..strict_table import listed
+from ..common.errors import UsageError
+from ..common.strict_table import listed
 
 LISTEN_ONLY: Mapping[str, Mapping[str, object]] = {
     "cantact": {"monitor": True},

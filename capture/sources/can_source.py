@@ -11,15 +11,9 @@ from collections.abc import Callable, Mapping
 import can
 from can.util import cast_from_string
 
-from ..errors import UsageError
-from ..strict_table import listed
-from .can_interfaces import (
-    DEVICE_TIME,
-    LISTEN_ONLY,
-    NO_CONTROLLER,
-    check_interface,
-    known_options,
-)
+from ..common.errors import UsageError
+from ..common.strict_table import listed
+from .can_interfaces import DEVICE_TIME, LISTEN_ONLY, NO_CONTROLLER, check_interface, known_options
 from .contract import Source, SourceAddress
 from .options import flag, number, only
 from .python_can import bus_class, python_can_source

@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from ..log.frames import FrameArray
-from ..robot import ClockDomain, Robot
+from ..log.messages.frames import FrameArray
+from ..robot.model import ClockDomain, Robot
 
 if TYPE_CHECKING:
-    from ..log.writer import SessionWriter
+    from ..log.write.writer import SessionWriter
 
 ENTRY_POINTS = "undulog.sources"
 """Entry point group: the name is the scheme, the object opens a source."""
@@ -66,12 +66,12 @@ class Polled:
     """What came since the last poll.
 
     Attributes:
-        frames: Arrays of records of :data:`.capture.log.frames.FRAME_DTYPE`, in the order they
+        frames: Arrays of records of :data:`.FRAME_DTYPE`, in the order they
             came. ``t_host_ns`` is the arrival on the session's clock, ``t_device_ns`` the device's
             own time, on the device's own clock and below :data:`DEVICE_TIMES_END_NS`, or equal to
             ``t_host_ns`` where it gives none.
         events: What happened.
-        fd_frames: The same of CAN FD frames: records of :data:`.capture.log.frames.FD_FRAME_DTYPE`.
+        fd_frames: The same of CAN FD frames: records of :data:`.FD_FRAME_DTYPE`.
     """
 
     frames: tuple[FrameArray, ...] = ()

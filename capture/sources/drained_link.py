@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
-from ..log.frames import FrameArray
+from ..log.messages.frames import FrameArray
 from .events import Tally
 from .link import Link
 

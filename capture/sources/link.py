@@ -12,9 +12,9 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from ..errors import SourceError
-from ..log.frames import FrameArray, holds_fd
-from ..robot import ClockDomain, Robot
+from ..common.errors import SourceError
+from ..log.messages.frames import FrameArray, holds_fd
+from ..robot.model import ClockDomain, Robot
 from .backoff import Backoff
 from .bus_watch import BusWatch
 from .contract import Polled, SourceAddress, SourceContext, SourceCounts

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ..errors import UsageError
-from ..strict_table import listed
+from ..common.errors import UsageError
+from ..common.strict_table import listed
 from .contract import SourceAddress
 
 _YES = {"1", "true", "yes", "on"}

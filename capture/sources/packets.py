@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import struct
 
-from ..log.frames import FRAME_DTYPE
+from ..log.messages.frames import FRAME_DTYPE
 
 RECORD_SIZE = FRAME_DTYPE.itemsize
 """Bytes of one frame."""

@@ -16,8 +16,8 @@ import can
 import numpy as np
 from can.interfaces import BACKENDS
 
-from ..errors import SourceError
-from ..log.frames import (
+from ..common.errors import SourceError
+from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -29,7 +29,7 @@ from ..log.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from ..robot import ClockDomain
+from ..robot.model import ClockDomain
 from .contract import DEVICE_TIMES_END_NS, SourceAddress
 from .events import ODD_TIME, Tally
 from .link import LinkedSource

@@ -20,7 +20,7 @@ import time
 from array import array
 from collections import deque
 
-from ..priority import share_priority
+from ..common.priority import share_priority
 from .receive_many import SO_TIMESTAMPNS, Batch, ReceiveMany
 
 _FEWEST, _MOST = 256, 1024  # rows; the kernel takes no more

@@ -7,15 +7,15 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..log.frames import FD_FRAME_DTYPE, FrameArray, frames_from_bytes
+from ..log.messages.frames import FD_FRAME_DTYPE, FrameArray, frames_from_bytes
 
 pack_record = struct.Struct("<QQIBB2x8s").pack
 """Packs ``t_device_ns, t_host_ns, id_flags, dlc, dir, data`` as
-:data:`.capture.log.frames.FRAME_DTYPE` has them; data is filled with zeros."""
+:data:`.capture.log.messages.frames.FRAME_DTYPE` has them; data is filled with zeros."""
 
 pack_fd_record = struct.Struct("<QQIBBBx64s").pack
 """Packs ``t_device_ns, t_host_ns, id_flags, len, dir, fd_flags, data`` as
-:data:`.capture.log.frames.FD_FRAME_DTYPE` has them; data is filled with zeros."""
+:data:`.capture.log.messages.frames.FD_FRAME_DTYPE` has them; data is filled with zeros."""
 
 
 def records(packed: Iterable[bytes]) -> FrameArray:

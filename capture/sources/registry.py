@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 from importlib.metadata import EntryPoint, entry_points
 from typing import cast
 
-from ..errors import MissingExtraError, SourceError, UndulogError, UsageError
-from ..strict_table import listed
+from ..common.errors import MissingExtraError, SourceError, UndulogError, UsageError
+from ..common.strict_table import listed
 from .address import parse_address
 from .contract import ENTRY_POINTS, Source, SourceAddress
 

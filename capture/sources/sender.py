@@ -19,8 +19,8 @@ from typing import Self
 
 import numpy as np
 
-from ..errors import DataError
-from ..log.frames import FRAME_DTYPE, FrameArray
+from ..common.errors import DataError
+from ..log.messages.frames import FRAME_DTYPE, FrameArray
 from .packets import HEAD, MOST_RECORDS
 from .receive_many import SO_SNDBUFFORCE, enlarge_buffer
 
@@ -59,7 +59,7 @@ class FrameSender:
         """Hand frames over, without waiting.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,). ``t_device_ns``
+            frames: Records of :data:`.FRAME_DTYPE`, shape (n,). ``t_device_ns``
                 is the sampling time on the sender's own clock; ``t_host_ns`` is set on receipt.
 
         Returns:

@@ -18,9 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import SourceError, UsageError
-from ..log.frames import FrameArray
-from ..robot import ClockDomain
+from ..common.errors import SourceError, UsageError
+from ..log.messages.frames import FrameArray
+from ..robot.model import ClockDomain
 from .contract import SourceAddress
 from .drained_link import DrainedLink
 from .events import Tally

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 
-from ..log.frames import (
+from ..log.messages.frames import (
     EXTENDED_FLAG,
     FD_BRS,
     FRAME_DTYPE,

@@ -16,9 +16,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SourceError
-from ..log.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
-from ..robot import ClockDomain
+from ..common.errors import SourceError
+from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
+from ..robot.model import ClockDomain
 from .contract import SourceAddress
 from .drained_link import DrainedLink
 from .events import Tally

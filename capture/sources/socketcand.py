@@ -10,9 +10,9 @@ import errno
 import socket
 from collections.abc import Mapping, Sequence
 
-from ..errors import UsageError
-from ..log.frames import FrameArray
-from ..robot import ClockDomain
+from ..common.errors import UsageError
+from ..log.messages.frames import FrameArray
+from ..robot.model import ClockDomain
 from .contract import SourceAddress
 from .events import Tally
 from .link import LinkedSource

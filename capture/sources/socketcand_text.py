@@ -16,7 +16,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from ..log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
+from ..log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
 from .events import ODD_TIME, Tally
 from .records import pack_record, records
 

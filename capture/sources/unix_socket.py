@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import SourceError, UsageError
-from ..log.frames import FrameArray, frames_from_bytes
-from ..priority import share_priority
-from ..robot import ClockDomain, Robot
+from ..common.errors import SourceError, UsageError
+from ..common.priority import share_priority
+from ..log.messages.frames import FrameArray, frames_from_bytes
+from ..robot.model import ClockDomain, Robot
 from .bus_watch import BusWatch
 from .contract import Polled, Source, SourceAddress, SourceContext, SourceCounts
 from .events import Tally

@@ -23,9 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import SimulationError
-from undulog.sim.world import FrictionLaw
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import SimulationError
+from undulog.sim.scenario.ground import FrictionLaw
 
 from .answers import Answers
 from .determined import Z95

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from undulog.analysis.reading import RESPONSE_TOPIC
+from undulog.analysis.signals.reading import RESPONSE_TOPIC
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import DataError
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import DataError
 from undulog.sim.drive.command_session import COMMANDS
-from undulog.sim.gait import Gait
-from undulog.sim.physics.engine import Kernels
-from undulog.sim.scenario import Scenario
-from undulog.sim.sensing import Noise, SensorModels
-from undulog.sim.twin import Twin
+from undulog.sim.gait.contract import Gait
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.scenario import Scenario
+from undulog.sim.scenario.sensors import Noise, SensorModels
+from undulog.sim.twin.twin import Twin
 
 from .parameters import DELAY, Unknown, with_values
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.analysis.analyse import examine_session
+from undulog.analysis.session.analyse import examine_session
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import DataError, UndulogError
-from undulog.sim.physics.engine import Kernels
-from undulog.sim.scenario import Scenario
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import DataError, UndulogError
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.scenario import Scenario
 
-from ..again.run import find_repetition
+from ..reproduce.run import find_repetition
 from .alternatives import Alternative, alternatives
 from .answers import Answers, read_measured
 from .determined import Ridge, half_widths, ridges, what_would_tell

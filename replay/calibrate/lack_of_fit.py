@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from .alternatives import Alternative
 from .answers import Measured

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 _STILL = 1e-3
 """A joint that moves less has no gain [rad, RMS]."""

@@ -31,7 +31,7 @@ import scipy.linalg
 from scipy.optimize import minimize_scalar
 from scipy.signal import fftconvolve
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 FLOOR = 1e-7
 """No encoder is better than this [rad]; keeps the weights of a noiseless session finite."""

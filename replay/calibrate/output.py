@@ -13,12 +13,12 @@ from typing import Any, cast
 
 import tomlkit
 
-from undulog.capture.console import plain
-from undulog.capture.errors import DataError
-from undulog.capture.part_file import part_file, write_text
-from undulog.capture.robot import Robot
+from undulog.capture.common.console import plain
+from undulog.capture.common.errors import DataError
+from undulog.capture.common.part_file import part_file, write_text
 from undulog.capture.robot.description import parse_robot
-from undulog.sim.modules import Modules
+from undulog.capture.robot.model import Robot
+from undulog.sim.scenario.modules import Modules
 
 from .fit import Calibration
 

@@ -12,11 +12,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Servo
-from undulog.sim.scenario import Scenario
-from undulog.sim.world import FrictionLaw, Ground
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Servo
+from undulog.sim.scenario.ground import FrictionLaw, Ground
+from undulog.sim.scenario.scenario import Scenario
 
 SERVO = {
     "stall_torque": "N m",

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import SimulationError
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import SimulationError
 
 from .answers import Answers
 from .noise import deviations, memory, score_covariance

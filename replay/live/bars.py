@@ -13,17 +13,12 @@ import numpy as np
 import rerun as rr
 from rerun.components import InterpolationMode
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..cycles.heat_maps import POWER
-from ..cycles.steps import (
-    CYCLES,
-    GAIN,
-    LAG,
-    Quantity,
-)
-from ..plots.joints import Color, Series
-from ..plots.response import SEGMENTS, Chart
+from ..content.entities import GAIN, LAG, Chart, Color, Quantity, Series
+from ..draw.cycles.heat_maps import POWER
+from ..draw.cycles.response import SEGMENTS
+from ..draw.cycles.steps import CYCLES
 from ..samples.timeline import SESSION_TIME, Clock
 from ..samples.tracks import Track
 from .cycles import Cycle

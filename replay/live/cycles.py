@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.analysis.cycles import LEAST_COVERED
-from undulog.analysis.demodulation_session import LoggedGait
 from undulog.analysis.estimators.cycle_sums import weigh
 from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
 from undulog.analysis.estimators.series import Series, clean
-from undulog.analysis.reading import planes_of
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.robot import Robot
+from undulog.analysis.session.cycles import LEAST_COVERED
+from undulog.analysis.session.demodulation_session import LoggedGait
+from undulog.analysis.signals.reading import planes_of
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.robot.model import Robot
 
-from ..plots.power import products
+from ..samples.quantities import products
 from ..samples.survey import GAIT
 from ..samples.tracks import Track
 from .decode import Batch

@@ -12,27 +12,21 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.daemon.live_wire import LiveMessage
-from undulog.capture.errors import DataError, RobotFileError
-from undulog.capture.log.cdr import Layout, layout_of
-from undulog.capture.log.joint_reader import OFFSET_TOPICS
-from undulog.capture.log.joint_rows import JointRows, merge_rows
-from undulog.capture.log.rosmsg import MessageType, parse_message_type
-from undulog.capture.log.sink import Description
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.errors import DataError, RobotFileError
+from undulog.capture.log.messages.cdr import Layout, layout_of
+from undulog.capture.log.messages.rosmsg import MessageType, parse_message_type
+from undulog.capture.log.read.joint_reader import OFFSET_TOPICS
+from undulog.capture.log.read.joint_rows import JointRows, merge_rows
+from undulog.capture.log.sinks.sink import Description
+from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.model import Robot
 
-from ..plots.gait import MODE
+from ..draw.plots.gait import MODE
+from ..draw.scene.motion import POSE, HeadPath, tracked_head
 from ..samples.sampling import ordered
-from ..samples.tracks import (
-    JOINT_STATE,
-    OFFSETS,
-    Columns,
-    Track,
-    without_filler,
-)
-from ..scene.motion import POSE, HeadPath, tracked_head
+from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, without_filler
 
 _NS = 1_000_000_000
 _FAR_NS = 3600 * _NS
@@ -292,7 +286,7 @@ class LiveLog:
         return self._shifted(group.stamps, group.log_ns)
 
     def _shifted(self, stamp_ns: IntArray, log_ns: IntArray) -> IntArray:
-        """Stamps on the log's clock; see :mod:`.capture.log.stamp_clock`."""
+        """Stamps on the log's clock; see :mod:`.capture.log.read.stamp_clock`."""
         if not stamp_ns.any():
             return log_ns
         if self._shift_ns is None:

@@ -15,8 +15,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from undulog.capture.daemon.live_wire import HEAD_SIZE, MAX_DATAGRAM, DatagramHead, Kind, read_head
-from undulog.capture.errors import DataError, UsageError
+from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.recorder.live_wire import (
+    HEAD_SIZE,
+    MAX_DATAGRAM,
+    DatagramHead,
+    Kind,
+    read_head,
+)
 
 _LOOK_S = 0.01
 

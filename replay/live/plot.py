@@ -8,15 +8,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from ..plots.joints import (
-    DEGREES,
-    SCALARS,
-    Color,
-    Series,
-    log_look,
-    log_rows,
-    part_entity,
-)
+from ..content.entities import SCALARS, Color, Series
+from ..draw.plots.joints import DEGREES, log_look, log_rows, part_entity
 from ..samples.sampling import GAP_STEPS, mark_gaps, typical_step_ns
 from ..samples.timeline import Clock
 from ..samples.tracks import Table, Track, tables

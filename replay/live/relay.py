@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from undulog.capture.daemon.live_wire import Kind, LiveMessage, read_records
-from undulog.capture.errors import DataError, LogWriteError
-from undulog.capture.interruption import StopRequest, interruptible
-from undulog.capture.part_file import part_file
+from undulog.capture.common.errors import DataError, LogWriteError
+from undulog.capture.common.interruption import StopRequest, interruptible
+from undulog.capture.common.part_file import part_file
+from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
-from ..rrd import APPLICATION, recording_id, require_whole
-from ..viewer import Viewer
+from ..record.rrd import APPLICATION, recording_id, require_whole
+from ..viewer.viewer import Viewer
 from .decode import LiveLog
 from .inbox import Datagram, Inbox
 from .plot import LiveStream

@@ -14,38 +14,22 @@ from datetime import UTC, datetime
 import numpy as np
 import rerun as rr
 
-from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
-from ..blueprint import build_blueprint
-from ..content import (
-    Content,
-    Signal,
-    Start,
-    signal_title,
-)
-from ..drawing import palette_of, start_of
-from ..facts import code, escaped, log_facts
-from ..plots import gait, joints, power
-from ..samples.quantities import DRAWN, SIGNALS, topic_entity
+from ..content import entities
+from ..content.content import Content, Signal, Start, signal_title
+from ..draw.drawing import palette_of, start_of
+from ..draw.facts import code, escaped, log_facts
+from ..draw.plots import gait, joints, power
+from ..draw.scene import body, markers, ranges, trail
+from ..draw.scene.body import body_title
+from ..draw.scene.motion import BODY_RATE_HZ, SPARSE_RATE_HZ, HeadPath, Motion, assemble, still_head
+from ..layout.blueprint import build_blueprint
+from ..samples import quantities
+from ..samples.quantities import DRAWN, SIGNALS, power_limit, topic_entity
 from ..samples.sampling import hold
 from ..samples.timeline import Clock
 from ..samples.tracks import Track
-from ..scene import (
-    body,
-    markers,
-    ranges,
-    trail,
-)
-from ..scene.colors import power_limit
-from ..scene.motion import (
-    BODY_RATE_HZ,
-    SPARSE_RATE_HZ,
-    HeadPath,
-    Motion,
-    assemble,
-    still_head,
-)
-from ..views import body_title
 from .bars import CycleBars
 from .cycles import CycleMeter
 from .decode import Batch, LiveLog
@@ -77,15 +61,15 @@ class LiveScene:
         self._rec, self._log, self._session_id = rec, log, session_id
         self._clock = Clock(epoch_ns)
         self._window, self._fresh = Window(), Fresh()
-        self._measured = LivePlot(joints.MEASURED, degrees=True)
-        self._commanded = LivePlot(joints.COMMANDED, degrees=True)
-        self._errors = LivePlot(joints.ERROR, degrees=True)
-        self._joint_power = LivePlot(power.MECHANICAL)
+        self._measured = LivePlot(entities.MEASURED, degrees=True)
+        self._commanded = LivePlot(entities.COMMANDED, degrees=True)
+        self._errors = LivePlot(entities.ERROR, degrees=True)
+        self._joint_power = LivePlot(entities.MECHANICAL)
         self._meter, self._bars = CycleMeter(epoch_ns), CycleBars()
         self._signals: dict[str, LivePlot] = {}
-        self._palette: dict[str, joints.Color] = {}
+        self._palette: dict[str, entities.Color] = {}
         self._of_joints: dict[str, bool] = {}
-        self._places: joints.Places | None = None
+        self._places: entities.Places | None = None
         self._place_plots: dict[tuple[str, tuple[str, ...]], LivePlot] = {}
         self._start: Start | None = None
         self._origin_ns: int | None = None
@@ -163,7 +147,7 @@ class LiveScene:
 
     # -- plots -----------------------------------------------------------------------------
 
-    def _draw_angles(self, batch: Batch, palette: dict[str, joints.Color]) -> None:
+    def _draw_angles(self, batch: Batch, palette: dict[str, entities.Color]) -> None:
         rec, clock = self._rec, self._clock
         measured = batch.columns.get(("/joint_states", "position"), ())
         commanded = batch.columns.get(("/joint_commands", "position"), ())
@@ -171,17 +155,17 @@ class LiveScene:
         self._commanded.write(rec, clock, commanded)
         window = self._window.tracks("/joint_states"), self._window.tracks("/joint_commands")
         new = self._fresh.tracks("error", window[0])
-        self._errors.write(rec, clock, joints.tracking_errors(new, window[1]), palette)
+        self._errors.write(rec, clock, quantities.tracking_errors(new, window[1]), palette)
         self._choose_places(window[1] or window[0])
         if self._places is not None:
             self._draw_places(self._places, measured, commanded, palette)
 
     def _draw_places(
         self,
-        places: joints.Places,
+        places: entities.Places,
         measured: tuple[Track, ...],
         commanded: tuple[Track, ...],
-        palette: dict[str, joints.Color],
+        palette: dict[str, entities.Color],
     ) -> None:
         """Head, middle and tail once more, for a plot that can be read at a glance."""
         for kind, tracks, colors in (
@@ -193,7 +177,7 @@ class LiveScene:
                 LivePlot(
                     f"{joints.PLACES}/{kind}",
                     degrees=True,
-                    component=joints.SCALARS,
+                    component=entities.SCALARS,
                     titles=joints.places_titles(places, kind),
                     width=joints.PLACES_WIDTHS[kind],
                 ),
@@ -217,12 +201,12 @@ class LiveScene:
                 return
         self._places = found
 
-    def _draw_power(self, palette: dict[str, joints.Color]) -> None:
+    def _draw_power(self, palette: dict[str, entities.Color]) -> None:
         columns = self._window.columns
-        mechanical = power.mechanical_power(columns)
-        electrical = power.electrical_power(columns)
+        mechanical = quantities.mechanical_power(columns)
+        electrical = quantities.electrical_power(columns)
         for kind, tracks in (("electrical", electrical), ("mechanical", mechanical)):
-            whole = power.total(tracks)
+            whole = quantities.total(tracks)
             if whole is None:
                 continue
             upto_ns = self._window.ready_ns([tracks])
@@ -234,7 +218,7 @@ class LiveScene:
             self._rec, self._clock, self._fresh.tracks("power", mechanical, upto_ns), palette
         )
 
-    def _draw_signals(self, batch: Batch, palette: dict[str, joints.Color]) -> None:
+    def _draw_signals(self, batch: Batch, palette: dict[str, entities.Color]) -> None:
         for (topic, field), tracks in batch.columns.items():
             if topic in DRAWN or field != "position":
                 continue
@@ -258,13 +242,13 @@ class LiveScene:
 
     # -- the body --------------------------------------------------------------------------
 
-    def _draw_body(self, palette: dict[str, joints.Color]) -> None:
+    def _draw_body(self, palette: dict[str, entities.Color]) -> None:
         robot, positions = self._log.robot, self._window.tracks("/joint_states")
         if robot is None or not positions:
             return
         head = self._window.head or still_head(positions[0].t_ns)
         commands = self._window.tracks("/joint_commands")
-        drive = power.mechanical_power(self._window.columns)
+        drive = quantities.mechanical_power(self._window.columns)
         upto_ns = self._window.ready_ns([positions, drive], head.t_ns)
         fresh = self._fresh.rows("body", head.t_ns, upto_ns)
 
@@ -360,7 +344,7 @@ class LiveScene:
         self._rec.send_blueprint(build_blueprint(content))
 
     def _facts(self, content: Content, dropped: int, *, ended: bool) -> str:
-        """The session in words, as in :mod:`.replay.facts`."""
+        """The session in words, as in :mod:`.replay.draw.facts`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         facts = [

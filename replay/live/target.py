@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from .. import viewer
-from ..viewer import Viewer
+from ..viewer import viewer
+from ..viewer.viewer import Viewer
 
 _WINDOW = "--memory-limit=1GB"
 _SERVER = "--server-memory-limit=256MB"

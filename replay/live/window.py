@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
+from ..draw.scene.motion import HeadPath
 from ..samples.sampling import ordered
 from ..samples.tracks import Columns, Track
-from ..scene.motion import HeadPath
 from .decode import Batch
 
 KEPT_NS = 2_000_000_000

@@ -2,22 +2,141 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import rerun as rr
 
-from ..plots.joints import (
-    COMMANDED,
-    ERROR,
-    MEASURED,
-    tracking_errors,
-)
-from ..plots.power import (
-    MECHANICAL,
-    TOTAL,
-    electrical_power,
-    mechanical_power,
-    total,
-)
+from undulog.capture.common.arrays import FloatArray
+
+from ..content.entities import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
+from .sampling import hold, interpolate
 from .tracks import Columns, Track
+
+
+def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tuple[Track, ...]:
+    """Measured minus commanded angle, at the measurement's times.
+
+    Args:
+        measured: Measured angles [rad].
+        commanded: Commanded angles [rad].
+
+    Returns:
+        A track for each joint that has both [rad]; the command is the last one given by then.
+    """
+    command = {track.name: track for track in commanded}
+    return tuple(
+        Track(
+            track.name,
+            track.t_ns,
+            track.values - hold(command[track.name].t_ns, command[track.name].values, track.t_ns),
+        )
+        for track in measured
+        if track.name in command
+    )
+
+
+def mechanical_power(columns: Columns) -> tuple[Track, ...]:
+    """Power at the joints, tau q', at the sampling times of the efforts.
+
+    Args:
+        columns: The session's columns.
+
+    Returns:
+        A track [W] for each joint with effort and velocity; positive where the joint drives.
+    """
+    return products(
+        columns.get(("/joint_states", "effort"), ()), columns.get(("/joint_states", "velocity"), ())
+    )
+
+
+def electrical_power(columns: Columns) -> tuple[Track, ...]:
+    """Power of the motors, u i, at the sampling times of the currents.
+
+    Args:
+        columns: The session's columns.
+
+    Returns:
+        A track [W] for each joint with current and voltage.
+    """
+    return products(
+        columns.get(("/joint_current", "position"), ()),
+        columns.get(("/joint_voltage", "position"), ()),
+    )
+
+
+def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ...]:
+    """Product of two quantities of each joint.
+
+    Args:
+        first: Gives the sampling times.
+        second: Taken at those times.
+
+    Returns:
+        A track for each joint that has both; NaN where either is missing.
+    """
+    other = {track.name: track for track in second}
+    return tuple(
+        Track(
+            track.name,
+            track.t_ns,
+            track.values
+            * interpolate(other[track.name].t_ns, other[track.name].values, track.t_ns),
+        )
+        for track in first
+        if track.name in other
+    )
+
+
+def total(tracks: Sequence[Track]) -> Track | None:
+    """Sum over the joints, at the first joint's sampling times.
+
+    Args:
+        tracks: The joints' power [W].
+
+    Returns:
+        The sum [W], NaN where any joint's power is missing; None without joints.
+    """
+    if not tracks:
+        return None
+    t_ns = tracks[0].t_ns
+    parts = [interpolate(track.t_ns, track.values, t_ns) for track in tracks]
+    return Track("total", t_ns, np.sum(parts, axis=0))
+
+
+def power_limit(power_w: FloatArray) -> float:
+    """The power at which the colour is full: the 99th percentile of its magnitude.
+
+    Args:
+        power_w: Mechanical power [W], any shape; NaN where it isn't known.
+
+    Returns:
+        [W], rounded up to two digits so that it can be written beside the picture; 1 where no
+        power is known or all of it is zero.
+    """
+    known = np.abs(power_w[np.isfinite(power_w)])
+    limit = float(np.percentile(known, 99.0)) if known.size else 0.0
+    if limit <= 0.0:
+        return 1.0
+    unit = 10.0 ** (np.floor(np.log10(limit)) - 1.0)
+    return float(np.ceil(limit / unit) * unit)
+
+
+def segment_power(joint_power_w: FloatArray) -> FloatArray:
+    """Share of the joints' power that each link shows: half of that of the joint at either end.
+
+    Args:
+        joint_power_w: Mechanical power of the joints [W], shape (..., m).
+
+    Returns:
+        [W], shape (..., m + 1); the sum over the links is the sum over the joints.
+    """
+    half = joint_power_w / 2.0
+    shares = np.zeros((*half.shape[:-1], half.shape[-1] + 1))
+    shares[..., :-1] += half
+    shares[..., 1:] += half
+    return shares
+
 
 DRAWN = {"/joint_states", "/joint_commands", "/gait"}
 """JointState topics that have views of their own."""

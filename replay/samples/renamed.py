@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
 from undulog.capture import Session
-from undulog.capture.errors import MissingChannelError
-from undulog.capture.log.signals import JointSignals
-from undulog.capture.log.topics import Channel
+from undulog.capture.common.errors import MissingChannelError
+from undulog.capture.log.columns.topics import Channel
+from undulog.capture.log.read.signals import JointSignals
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 LEVELS = 500
 """Steps that the range of a plotted line is cut into, at least."""

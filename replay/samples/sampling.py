@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 GAP_STEPS = 5.0
 """Two samples further apart than this many typical steps have a gap between them."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import IntArray
+from undulog.capture.common.arrays import IntArray
 
 from .tracks import Columns, read_columns
 

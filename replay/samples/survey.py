@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.errors import DataError, MissingChannelError
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.errors import DataError, MissingChannelError
+from undulog.capture.robot.model import Robot
 
-from ..plots.joints import MEASURED
-from ..plots.power import MECHANICAL
-from ..scene.body import segment_power
-from ..scene.colors import power_limit
-from .quantities import quantities
+from ..content.entities import MEASURED, MECHANICAL
+from .quantities import power_limit, quantities, segment_power
 from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
 from .stretches import stretches
 from .tracks import OFFSETS, Track, in_turn, resampled, wanted_fields

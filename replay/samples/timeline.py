@@ -3,7 +3,7 @@
 ``session_time`` counts from the first sample. ``gait_cycle`` is the gait's cumulative phase over
 2 pi, so that two runs at different frequencies can be scrubbed in step; Rerun has no timeline
 of real numbers, so one cycle is drawn as one second: ``+3.25s`` there reads 3.25 cycles.
-``ensemble_cycle`` counts the degrees of a mean cycle (:mod:`.replay.cycles.mean_cycle`), which
+``ensemble_cycle`` counts the degrees of a mean cycle (:mod:`.replay.draw.cycles.mean_cycle`), which
 is computed; samples are never folded into one cycle.
 """
 
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from .sampling import interpolate
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray, IntArray
 from undulog.capture.bus.decoded_topics import JOINT_TOPIC
-from undulog.capture.errors import DataError, MissingChannelError
-from undulog.capture.log.signals import JointSignals
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.errors import DataError, MissingChannelError
+from undulog.capture.log.read.signals import JointSignals
 
 from .sampling import interpolate, ordered
 

@@ -17,7 +17,7 @@ from typing import Self
 
 from undulog.capture import Session
 
-from ..layer import Layer
+from ..content.layer import Layer
 
 _NICENESS = 10
 
@@ -90,9 +90,9 @@ def main(arguments: Sequence[str]) -> None:
         arguments: The session's path, the topics of commands and responses.
     """
     os.nice(_NICENESS)
-    from undulog.analysis.stretch import Options
+    from undulog.analysis.signals.stretch import Options
 
-    from ..results import computed
+    from ..record.results import computed
 
     path, command, response = arguments
     options = Options(command_topic=command, response_topic=response)

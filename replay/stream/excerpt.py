@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.log.signals import JointSignals
-from undulog.capture.log.topics import Channel
+from undulog.capture.log.columns.topics import Channel
+from undulog.capture.log.read.signals import JointSignals
 
 from ..samples.renamed import RenamedSession
 from ..samples.stretches import STRETCH_NS

@@ -10,15 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..content import AwaitedMap, Content
-from ..cycles import mean_cycle
-from ..cycles.heat_maps import MAPS, POWER
-from ..cycles.mean_cycle import MeanCycle
-from ..cycles.steps import CYCLES, ENERGY, GAIN, LAG, Quantity
-from ..plots.joints import Series
-from ..plots.response import Chart
+from ..content.content import AwaitedMap, Content
+from ..content.entities import ENERGY, GAIN, LAG, MAPS, Chart, MeanCycle, Quantity, Series
+from ..draw.cycles import mean_cycle
+from ..draw.cycles.heat_maps import POWER
+from ..draw.cycles.steps import CYCLES
+from ..layout.views import build_views
 from ..samples.timeline import Rhythm
-from ..views import build_views
 
 
 def foreseen(content: Content, rhythm: Rhythm | None) -> Content:

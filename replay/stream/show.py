@@ -17,21 +17,21 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from undulog.capture import Session
-from undulog.capture.console import Progress
-from undulog.capture.errors import DataError, MissingChannelError, UndulogError
-from undulog.capture.interruption import StopRequest
+from undulog.capture.common.console import Progress
+from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
+from undulog.capture.common.interruption import StopRequest
 
-from ..blueprint import build_blueprint
-from ..drawing import Drawing, Sources, clock_of
-from ..layer import Layer
-from ..plots.gait import MODE
-from ..rrd import open_recording, recording_id, send_properties
+from ..content.content import Tab
+from ..content.layer import Layer
+from ..draw.drawing import Drawing, Sources, clock_of
+from ..draw.plots.gait import MODE
+from ..draw.scene.motion import BODY_RATE_HZ
+from ..layout.blueprint import build_blueprint
+from ..record.rrd import open_recording, recording_id, send_properties
 from ..samples.stretches import STRETCH_NS, Span, Stretch, stretches
 from ..samples.survey import GAIT, Survey, survey
 from ..samples.tracks import wanted_fields
-from ..scene.motion import BODY_RATE_HZ
-from ..single import Tab
-from ..viewer import Viewer
+from ..viewer.viewer import Viewer
 from .apart import Analysing
 from .excerpt import Excerpt, Glimpse
 from .foresight import foreseen, same_arrangement

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.robot.model import Plane, Robot
 
-from ..gait import WALK, GaitTick, Generator, Modulation
-from ..readings import Readings
+from ..gait.contract import WALK, GaitTick, Generator, Modulation
+from ..gait.readings import Readings
+from ..scenario.controllers import Controller
+from ..scenario.sensor_layout import layout
 from .course import Course
 from .distances import Distances
-from .layout import layout
 from .lookout import Lookout
 from .moment import Moment
-from .parameters import Controller
 from .phase_history import BodyWave
 from .reactions import Haste, Shrinking, Steering
 from .reckoning import Reckoning

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..gait import Gait, generator
+from ..gait.build import generator
+from ..gait.contract import Gait
+from ..scenario.controllers import RandomTurns, TargetHeading
 from .adaptive import AdaptiveGait
 from .course import Course, RandomCourse, StraightOn, TargetCourse
-from .parameters import RandomTurns, TargetHeading
 from .reckoning import turned
 
 if TYPE_CHECKING:
-    from ..scenario import Scenario
+    from ..scenario.scenario import Scenario
 
 
 def build_gait(scenario: Scenario) -> Gait:

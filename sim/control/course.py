@@ -7,12 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot, SensorKind
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot, SensorKind
 
+from ..scenario.controllers import RandomTurns, TargetHeading
 from .filters import LowPass
 from .moment import Moment
-from .parameters import RandomTurns, TargetHeading
 from .phase_history import TURN
 from .reckoning import turned
 

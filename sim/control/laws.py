@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 
 def bend(distance: float, side: float, f0: float, k: float) -> float:

@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
-from .layout import Layout, bearing
+from ..scenario.controllers import Lookout as Parameters
+from ..scenario.sensor_layout import Layout, bearing
 from .moment import Moment
-from .parameters import Lookout as Parameters
 from .reckoning import turned
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..readings import Readings
+from ..gait.readings import Readings
 from .reckoning import Pose
 
 

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Plane, Robot
 
 
 class SlipOdometry:

@@ -11,7 +11,7 @@ from bisect import bisect_left
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 TURN = 2.0 * math.pi
 """One gait period, in phase [rad]."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Plane, Robot
 
+from ..scenario.controllers import HeadSteering, SideShrinking, TailHaste
+from ..scenario.sensor_layout import Layout
 from .distances import Distances
 from .filters import LowPass, SideLatch
 from .laws import amplitude, bend, frequency
-from .layout import Layout
 from .lookout import InTheWay
 from .moment import Moment
-from .parameters import HeadSteering, SideShrinking, TailHaste
 from .phase_history import TURN, PhaseHistory
 
 

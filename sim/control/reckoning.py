@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
-from ..readings import Readings
+from ..gait.readings import Readings
+from ..scenario.controllers import Calibration
 from .odometry import SlipOdometry
-from .parameters import Calibration
 from .phase_history import PathHeading
 
 

@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.capture.daemon.bus_recorder import BusRecorder
-from undulog.capture.daemon.source_clock import SourceClock
-from undulog.capture.log.channels import StringChannel
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.frames import FrameArray
-from undulog.capture.log.wal_segment import require_space
-from undulog.capture.log.writer import SessionWriter
-from undulog.capture.robot import ClockDomain, Robot
+from undulog.capture.log.messages.frames import FrameArray
+from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.wal.wal_segment import require_space
+from undulog.capture.log.write.channels import StringChannel
+from undulog.capture.log.write.writer import SessionWriter
+from undulog.capture.recorder.bus_recorder import BusRecorder
+from undulog.capture.recorder.source_clock import SourceClock
+from undulog.capture.robot.model import ClockDomain, Robot
 from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
-from ..gait import GaitTick
+from ..gait.contract import GaitTick
 from ..gate.outcome import How, Outcome
 from ..gate.tick import Remark
-from ..session_log import GAIT_UNIT
+from ..twin.session_log import GAIT_UNIT
 from .loop import BusTick
 
 _EVENTS_OF = "drive"

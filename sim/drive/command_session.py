@@ -16,14 +16,14 @@ from typing import Self
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.errors import DataError, JointSetError
-from undulog.capture.log.signals import JointSignals
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.errors import DataError, JointSetError
+from undulog.capture.log.read.signals import JointSignals
+from undulog.capture.robot.model import Robot
 
-from ..gait import GaitTick
-from ..readings import Readings
-from ..scenario import CONTROL_RATE_HZ
+from ..gait.contract import GaitTick
+from ..gait.readings import Readings
+from ..scenario.scenario import CONTROL_RATE_HZ
 
 COMMANDS = "/joint_commands"
 REPLAY = "replay"

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from undulog.capture import Session
-from undulog.capture.errors import DataError, JointSetError, PlanError, UsageError
-from undulog.capture.robot import Plane, Robot
-from undulog.capture.shipped import Shelf
+from undulog.capture.common.errors import DataError, JointSetError, PlanError, UsageError
+from undulog.capture.common.shipped import Shelf
+from undulog.capture.robot.model import Plane, Robot
 
 from ..control.build import build_gait
-from ..gait import Gait
-from ..physics.engine import Kernels
-from ..scenario import Scenario
-from ..scenario_file import load_scenario, parse_scenario, scenario_names
+from ..gait.contract import Gait
+from ..scenario.engines import Kernels
+from ..scenario.scenario import Scenario
+from ..scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 from .command_session import CommandReplay, RecordedCommands
 from .plan import PlanGait
 from .plan_file import is_plan, parse_plan
@@ -159,7 +159,7 @@ def find_driven(
             commands (MCAP).
         world: Where it will be run, if that is known: its robot takes recorded commands.
         changes: Of recorded commands: what to change of the world that they were recorded in, see
-            :func:`.sim.scenario_file.parse_scenario`.
+            :func:`.sim.scenario.scenario_file.parse_scenario`.
         robot: Who takes recorded commands, whatever the session or the world say.
 
     Returns:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Plane, Robot
 
-from ..gait import Gait, GaitTick
+from ..gait.contract import Gait, GaitTick
 from ..gait.limits import smoothstep
-from ..readings import Readings
+from ..gait.readings import Readings
 
 FADE_S = 1.0
 """A gait that is to stop comes to rest within this time [s]."""

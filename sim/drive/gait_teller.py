@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from undulog.capture.daemon.control_client import ControlClient
-from undulog.capture.errors import ControlError
+from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder.control_client import ControlClient
 
-from ..gait import GaitTick
+from ..gait.contract import GaitTick
 
 _MOST_HELD = 1000
 _AT_ONCE = 64

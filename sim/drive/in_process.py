@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from undulog.capture.interruption import StopRequest
+from undulog.capture.common.interruption import StopRequest
 
-from ..recording import Driver, Recording, record
-from ..scenario import Scenario
-from ..twin import Sample
+from ..scenario.scenario import Scenario
+from ..twin.recording import Driver, Recording, record
+from ..twin.twin import Sample
 from .driven import Driven
 from .fading import FadingGait
 

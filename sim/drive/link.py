@@ -18,10 +18,10 @@ from typing import Protocol
 
 import numpy as np
 
-from undulog.capture.arrays import IntArray
-from undulog.capture.errors import SourceError
-from undulog.capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.arrays import IntArray
+from undulog.capture.common.errors import SourceError
+from undulog.capture.log.messages.frames import EXTENDED_FLAG, ID_MASK, FrameArray
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.contract import SourceAddress
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import connect, enter_raw_mode, read_answer, server_of
@@ -50,7 +50,7 @@ class Link(Protocol):
         """Take what has come, without waiting.
 
         Returns:
-            Arrays of records of :data:`.capture.log.frames.FRAME_DTYPE`, in the order they came.
+            Arrays of records of :data:`.FRAME_DTYPE`, in the order they came.
 
         Raises:
             SourceError: If the bus is lost.
@@ -61,7 +61,7 @@ class Link(Protocol):
         """Put frames on the bus.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            frames: Records of :data:`.FRAME_DTYPE`, data frames, shape (n,).
             earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
                 None: at once.
 
@@ -199,7 +199,7 @@ class VirtualRobotLink:
         """Put frames on the bus, all of them at once.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            frames: Records of :data:`.FRAME_DTYPE`, data frames, shape (n,).
             earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
                 None: at once.
 

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
 from undulog.capture.bus.encoding import BusEncoder, BusValue
 from undulog.capture.bus.polling import poll_frames
-from undulog.capture.errors import SourceError, UndulogError
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import FrameArray, empty_frames
-from undulog.capture.robot import Direction, Quantity, Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import SourceError, UndulogError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.messages.frames import FrameArray, empty_frames
+from undulog.capture.robot.model import Direction, Quantity, Robot
 
 from ..gate.confirmation import Confirmation
 from ..gate.faults import FaultKind, GateFault
@@ -22,7 +22,7 @@ from ..gate.gate import Gate
 from ..gate.presence import Presence
 from ..gate.spacing import Spacing
 from ..gate.tick import GateStep, Heard, Phase
-from ..scenario import CONTROL_RATE_HZ
+from ..scenario.scenario import CONTROL_RATE_HZ
 from .console_watch import ConsoleWatch
 from .link import Link
 from .pace import Pace
@@ -98,7 +98,7 @@ class CommandEncoder:
             command: Joint angles [rad], shape (m,).
 
         Returns:
-            Records of :data:`.capture.log.frames.FRAME_DTYPE`, without times.
+            Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, without times.
         """
         return self._encoder.encode(dict(zip(self._keys, command.tolist(), strict=True)))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from undulog.capture.errors import UsageError
+from undulog.capture.common.errors import UsageError
 from undulog.capture.sources.contract import SourceAddress
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.options import flag

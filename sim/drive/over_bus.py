@@ -8,16 +8,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from undulog.capture.daemon.clock import SessionClock
-from undulog.capture.errors import LogWriteError, UsageError
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import FrameArray, identifier_text
-from undulog.capture.robot import Bus, Direction, Quantity, Robot
+from undulog.capture.common.errors import LogWriteError, UsageError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.messages.frames import FrameArray, identifier_text
+from undulog.capture.recorder.clock import SessionClock
+from undulog.capture.robot.model import Bus, Direction, Quantity, Robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceAddress, SourceCounts
 from undulog.capture.sources.events import Tally
 
-from ..garbage import quick_collections
 from ..gate.confirmation import Confirmation
 from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate
@@ -25,7 +24,8 @@ from ..gate.lateness import jitter
 from ..gate.limits import GateLimits, gate_limits
 from ..gate.outcome import How, Outcome
 from ..gate.spacing import Spacing
-from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from ..twin.garbage import quick_collections
 from .bus_report import UNASKED, BusReport, Feedback, remarks_of
 from .bus_session import BusSession, stamped
 from .console_watch import ConsoleWatch

@@ -6,8 +6,8 @@ import time
 from collections.abc import Sequence
 from typing import Protocol
 
-from undulog.capture.errors import SourceError
-from undulog.capture.log.frames import FrameArray
+from undulog.capture.common.errors import SourceError
+from undulog.capture.log.messages.frames import FrameArray
 
 from .link import Link, VirtualRobotLink
 

@@ -19,14 +19,15 @@ from itertools import accumulate
 
 import numpy as np
 
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.robot.model import Plane, Robot
 
-from ..gait import WALK, GaitTick, PlaneGait
+from ..gait.contract import WALK, GaitTick
 from ..gait.limits import started
+from ..gait.readings import Readings
 from ..gait.rhythm import Change, IntegratedPhase, Swing
+from ..gait.wave import PlaneGait
 from ..gait.waves import WaveGenerator
-from ..readings import Readings
-from ..scenario import Scenario
+from ..scenario.scenario import Scenario
 
 
 @dataclass(frozen=True)

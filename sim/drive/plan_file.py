@@ -37,15 +37,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from undulog.capture.errors import Fault, PlanError
-from undulog.capture.input_file import is_file
-from undulog.capture.robot import Plane
-from undulog.capture.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
+from undulog.capture.common.errors import Fault, PlanError
+from undulog.capture.common.input_file import is_file
+from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
+from undulog.capture.robot.model import Plane
 
-from ..gait import WALK, PlaneGait, Serpentine, Wave
-from ..gait.toml import read_gait
-from ..scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
-from ..scenario_file import load_scenario, scenario_names
+from ..gait.contract import WALK
+from ..gait.serpentine import Serpentine
+from ..gait.wave import PlaneGait, Wave
+from ..scenario.gaits_toml import read_gait
+from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from ..scenario.scenario_file import load_scenario, scenario_names
 from .plan import Plan, Segment
 
 _HIGHEST_HZ = CONTROL_RATE_HZ / 4

@@ -9,10 +9,10 @@ import can
 import numpy as np
 from can.util import cast_from_string
 
-from undulog.capture.arrays import IntArray
-from undulog.capture.errors import SourceError, UsageError
-from undulog.capture.log.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.arrays import IntArray
+from undulog.capture.common.errors import SourceError, UsageError
+from undulog.capture.log.messages.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.can_interfaces import DEVICE_TIME, check_interface, known_options
 from undulog.capture.sources.contract import SourceAddress
 from undulog.capture.sources.events import Tally
@@ -125,7 +125,7 @@ class PythonCanBus:
         """Put frames on the bus, one after the other.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, data frames, shape (n,).
+            frames: Records of :data:`.FRAME_DTYPE`, data frames, shape (n,).
             earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
                 None: at once.
 

@@ -11,13 +11,13 @@ import math
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray, frozen
 from undulog.capture.bus.decoding import BusDecoder, DecodedSignals, FrameTally
-from undulog.capture.log.frames import FrameArray
-from undulog.capture.robot import Quantity, Robot
+from undulog.capture.common.arrays import FloatArray, IntArray, frozen
+from undulog.capture.log.messages.frames import FrameArray
+from undulog.capture.robot.model import Quantity, Robot
 
+from ..gait.readings import Readings
 from ..gate.status import JointStatus
-from ..readings import Readings
 
 OLDEST_S = 0.5
 """A value older than this counts as unknown [s]; the slowest sensors come several times in it."""
@@ -73,7 +73,7 @@ class BusReadings:
         """Take frames, in the order in which they came.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
             time_s: When they came, on the loop's clock [s].
         """
         samples, tally = self._decoder.decode(frames)

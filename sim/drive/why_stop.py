@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 
-from undulog.capture.interruption import StopRequest
+from undulog.capture.common.interruption import StopRequest
 
 _WORDS = {
     signal.SIGINT: "asked to stop (Ctrl-C)",

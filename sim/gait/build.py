@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from undulog.capture.robot import Robot
+from undulog.capture.robot.model import Robot
 
 from .contract import Generator
 from .delay_blocks import DelayBlockGait, DelayBlocks

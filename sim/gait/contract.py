@@ -13,9 +13,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, frozen
+from undulog.capture.common.arrays import FloatArray, frozen
 
-from ..readings import Readings
+from .readings import Readings
 
 WALK = "walk"
 """The mode of a gait that only goes on."""

@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from undulog.capture.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 
 _State = TypeVar("_State", FloatArray, ComplexArray)
 

@@ -26,13 +26,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.robot.model import Plane, Robot
 
-from ..readings import Readings
 from .approach import Approach
 from .coupled import Coupling, HopfOscillators, PhaseOscillators
 from .coupled import Oscillators as OscillatorState
+from .readings import Readings
 from .rhythm import Change, IntegratedPhase, Swing
 from .wave import PlaneGait
 from .waves import WaveGenerator

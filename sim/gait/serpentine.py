@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.robot.model import Plane, Robot
 
-from ..readings import Readings
 from .limits import started
+from .readings import Readings
 from .rhythm import Change, IntegratedPhase, Swing
 from .wave import PlaneGait
 from .waves import WaveGenerator

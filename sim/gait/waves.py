@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Plane, Robot
 
-from ..readings import Readings
 from .contract import WALK, GaitTick, Modulation
 from .limits import within_limits
+from .readings import Readings
 from .rhythm import Change, Rhythm
 from .wave import JOINT_VALUE_NAMES, VALUE_NAMES
 

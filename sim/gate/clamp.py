@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from .limits import GateLimits
 

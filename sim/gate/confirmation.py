@@ -32,7 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
 _MOST_ROUNDS = 2
 """Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import OnFault
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.safety import OnFault
 
 from .limits import GateLimits
 from .ramp import Ramp

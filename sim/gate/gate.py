@@ -18,11 +18,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import SourceError, UsageError
-from undulog.capture.robot import OnFault
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import SourceError, UsageError
+from undulog.capture.robot.safety import OnFault
 
-from ..gait import Gait, GaitTick
+from ..gait.contract import Gait, GaitTick
 from .clamp import Clamp, Clamped
 from .ending import Ending
 from .faults import MUTE, FaultKind, GateFault

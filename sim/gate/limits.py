@@ -7,10 +7,69 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, frozen
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import OnFault, Robot, Safety
-from undulog.capture.robot.safety import missing_limits, safety_example
+from undulog.capture.common.arrays import FloatArray, frozen
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Robot
+from undulog.capture.robot.safety import JOINT_LIMITS, OnFault, Safety
+
+_EXAMPLES = {
+    "max_rate": "4.0            # rad/s, of commands",
+    "ramp_rate": "0.5           # rad/s, to the first pose and down again",
+    "max_tracking_error": "0.35 # rad, between command and measured angle",
+    "reply_timeout_s": "0.25    # a joint that says nothing for so long is lost",
+    "max_late_s": "0.2          # a control tick that is later stops the drive",
+    "max_current": "1.4         # A",
+    "max_temperature": "70.0    # degC",
+    "min_voltage": "5.0         # V",
+}
+_OF_QUANTITY = {
+    "max_current": "current",
+    "max_temperature": "temperature",
+    "min_voltage": "voltage",
+}
+
+
+def missing_limits(robot: Robot) -> tuple[str, ...]:
+    """The limits that a robot lacks to be driven over its bus.
+
+    Rates, tracking error and the two times are always needed; limits of current, temperature and
+    voltage where the robot tells these on its bus.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Names of fields of :class:`Safety`, in its order; empty if there is nothing to add.
+    """
+    safety = robot.safety or Safety()
+    told = {
+        str(signal.quantity)
+        for signal in (robot.bus.signals if robot.bus is not None else ())
+        if signal.direction == "rx"
+    }
+    missing: list[str] = []
+    for limit in _EXAMPLES:
+        if _OF_QUANTITY.get(limit, "") not in {"", *told}:
+            continue
+        if limit in JOINT_LIMITS:
+            lacks = bool(np.isnan(safety.values(limit, robot.joint_names)).any())
+        else:
+            lacks = getattr(safety, limit) is None
+        if lacks:
+            missing.append(limit)
+    return tuple(missing)
+
+
+def safety_example(limits: tuple[str, ...]) -> str:
+    """A ``safety`` table as a robot's file would have it.
+
+    Args:
+        limits: Its fields, of :func:`missing_limits`.
+
+    Returns:
+        TOML, with units as comments.
+    """
+    return "\n".join(["[safety]", *(f"{name} = {_EXAMPLES[name]}" for name in limits)])
 
 
 @dataclass(frozen=True)

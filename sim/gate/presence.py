@@ -6,10 +6,16 @@ from collections import Counter
 
 import numpy as np
 
-from undulog.capture.arrays import IntArray
 from undulog.capture.bus.map_entry import bus_messages, frame_id
-from undulog.capture.log.frames import DIR_RX, ERROR_FLAG, REMOTE_FLAG, FrameArray, identifier_text
-from undulog.capture.robot import Direction, Robot
+from undulog.capture.common.arrays import IntArray
+from undulog.capture.log.messages.frames import (
+    DIR_RX,
+    ERROR_FLAG,
+    REMOTE_FLAG,
+    FrameArray,
+    identifier_text,
+)
+from undulog.capture.robot.model import Direction, Robot
 from undulog.capture.sources.bus_watch import BUS_OFF
 
 from .faults import FaultKind, GateFault
@@ -47,7 +53,7 @@ class Presence:
         """Take what came.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
+            frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
 
         Returns:
             What must end a drive: bus-off, or commands that somebody else sends.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from ..gait.limits import smoothstep
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
 _NS = 1e9
 

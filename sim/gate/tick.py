@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..gait import GaitTick
-from ..readings import Readings
+from ..gait.contract import GaitTick
+from ..gait.readings import Readings
 from .faults import GateFault
 from .status import JointStatus
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from .faults import FaultKind, GateFault
 from .limits import GateLimits

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 _LESS = 0.8
 _MORE = 0.02

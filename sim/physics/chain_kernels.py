@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from undulog.capture.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 
 @njit(cache=True)

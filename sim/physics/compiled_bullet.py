@@ -14,8 +14,8 @@ from operator import itemgetter
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Plane, Robot
 
 from . import chain_kernels
 from .bullet import BulletEngine, pybullet

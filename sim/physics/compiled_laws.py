@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
-from ..world import Ground
+from ..scenario.ground import Ground
 from . import kernels
 from .servo import Servos
 from .steps import Steps

@@ -17,9 +17,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..world.ground import FrictionLaw, Ground
+from ..scenario.ground import FrictionLaw, Ground
 from .engine import BodyState
 
 _TINY = 1e-300

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from .contact import into_link_axes
 from .servo import COULOMB_SPEED, Servos

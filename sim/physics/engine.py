@@ -7,37 +7,15 @@ laws and their results can be held against each other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from importlib import import_module
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
-
-class EngineKind(StrEnum):
-    """The engines there are, each named after its package."""
-
-    BULLET = "bullet"
-    MUJOCO = "mujoco"
-
-    @property
-    def package(self) -> str:
-        """Name of its package in the package index."""
-        return {EngineKind.BULLET: "pybullet", EngineKind.MUJOCO: "mujoco"}[self]
-
-
-class Kernels(StrEnum):
-    """What computes the force laws, and the body's kinematics where that pays.
-
-    Results of the two agree within rounding, not bit by bit, so the default does not depend on what
-    is installed.
-    """
-
-    NUMPY = "numpy"
-    NUMBA = "numba"
+from ..scenario.engines import EngineKind, Kernels
 
 
 class BodyState(NamedTuple):

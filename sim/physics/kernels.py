@@ -12,9 +12,9 @@ import math
 
 from numba import njit
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..world.ground import FrictionLaw
+from ..scenario.ground import FrictionLaw
 from .servo import COULOMB_SPEED
 
 LAWS = tuple(FrictionLaw)

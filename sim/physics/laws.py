@@ -6,12 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
-from ..world import Ground
+from ..scenario.engines import Kernels
+from ..scenario.ground import Ground
 from .contact import GroundContact
-from .engine import Kernels
 from .servo import Servos
 from .steps import Steps
 

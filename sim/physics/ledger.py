@@ -19,9 +19,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
+from ..scenario.engines import Kernels
 from .energy_flows import (
     GROUND_TERMS,
     JOINT_TERMS,
@@ -32,7 +33,7 @@ from .energy_flows import (
     obstacle_flows,
     push_flow,
 )
-from .engine import BodyState, Kernels
+from .engine import BodyState
 from .servo import Servos
 from .steps import Step, Steps
 from .vectors import into_frames

@@ -6,7 +6,7 @@ import math
 
 from numba import njit
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from .kernels import rotor_friction
 from .servo import COULOMB_SPEED

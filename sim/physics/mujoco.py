@@ -20,9 +20,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Plane, Robot
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Plane, Robot
 
 from .engine import BodyState
 from .vectors import cross

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..scenario import CONTROL_RATE_HZ, Scenario
-from ..world.obstacle_contact import obstacle_law
-from ..world.push import pushes_during
-from .engine import Kernels, engine_type
+from ..scenario.engines import Kernels
+from ..scenario.push import pushes_during
+from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from .engine import engine_type
 from .laws import laws_for
+from .obstacle_contact import obstacle_law
 from .servo import Servos
 from .steps import Step, Steps
 

@@ -30,8 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, frozen
-from undulog.capture.robot import Servo
+from undulog.capture.common.arrays import FloatArray, frozen
+from undulog.capture.robot.model import Servo
 
 COULOMB_SPEED = 0.05
 """Rotor speed at which Coulomb friction is smoothed [rad/s]."""
@@ -67,7 +67,7 @@ class Servos:
     """The servos of all joints, as arrays.
 
     Attributes:
-        table: All parameters of :class:`.capture.robot.Servo`, SI, in the order of the attributes
+        table: All parameters of :class:`.Servo`, SI, in the order of the attributes
             below, shape (12, m).
         supply, resistance, torque_constant, gain, inertia, viscous, coulomb, gear_stiffness,
             gear_damping, play, static, stribeck: Its rows, each of shape (m,).

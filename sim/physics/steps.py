@@ -13,11 +13,11 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..world.obstacle_contact import NO_CONTACT, ObstacleContact
 from .contact import Contact
 from .engine import BodyState
+from .obstacle_contact import NO_CONTACT, ObstacleContact
 from .servo import Drive, Rotors
 
 

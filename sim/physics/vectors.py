@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, frozen
+from undulog.capture.common.arrays import FloatArray, frozen
 
 _NEXT, _LAST = frozen(np.array([1, 2, 0])), frozen(np.array([2, 0, 1]))
 

@@ -12,13 +12,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot, Sensor
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..physics.vectors import cross, into_frames, out_of_frames
+from ..scenario.sensors import AccelerometerModel
 from .contract import VectorSample
-from .model import AccelerometerModel
 from .mount import Mounts
 from .quantise import quantised
 

@@ -13,14 +13,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray
-from undulog.capture.robot import Robot, Sensor
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..physics.vectors import into_frames
+from ..scenario.sensors import CompassModel
 from .accelerometer import measured
 from .contract import VectorSample
-from .model import CompassModel
 from .mount import Mounts, Schedule
 from .quantise import quantised
 

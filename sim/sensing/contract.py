@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol, TypeAlias
 
-from undulog.capture.arrays import FloatArray
+from undulog.capture.common.arrays import FloatArray
 
+from ..gait.readings import Readings
 from ..physics.steps import Steps
-from ..readings import Readings
 
 
 class JointSample(NamedTuple):

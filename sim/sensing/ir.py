@@ -14,16 +14,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.robot import Robot, Sensor
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.steps import Steps
-from ..world.rays import RayCaster
+from ..scenario.sensors import InfraredModel
 from .contract import RangeSample
-from .model import InfraredModel
 from .mount import Schedule
 from .quantise import quantised
 from .ranging import Ranging
+from .rays import RayCaster
 
 STREAM = 3
 """Number of the random stream that the sensors' noise is drawn from."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray, frozen
-from undulog.capture.robot import Robot, Sensor
+from undulog.capture.common.arrays import FloatArray, IntArray, frozen
+from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.engine import BodyState
 from ..physics.vectors import out_of_frames

@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray, frozen
+from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 
 from ..physics.steps import Steps
+from ..scenario.sensors import Noise, ServoPolling
 from .contract import JointSample
-from .model import Noise, ServoPolling
 from .quantise import quantised
 
 STREAM = 1

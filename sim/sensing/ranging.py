@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
-from undulog.capture.robot import Robot, Sensor
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..physics.vectors import out_of_frames
-from ..world.rays import RayCaster
 from .contract import RangeSample
 from .mount import Mounts, Schedule
+from .rays import RayCaster
 
 
 class Ranging:

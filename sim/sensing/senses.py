@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from undulog.capture.robot import Sensor, SensorKind
+from undulog.capture.robot.model import Sensor, SensorKind
 
+from ..gait.readings import Readings
 from ..physics.steps import Steps
-from ..readings import Readings
-from ..scenario import CONTROL_RATE_HZ, Scenario
-from ..world.rays import RayCaster
+from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
 from .accelerometer import Accelerometer
 from .compass import Compass
 from .contract import JointSample, RangeSample, SensorSample, VectorSample
 from .ir import Infrared
 from .polling import JointPolling
+from .rays import RayCaster
 from .sonar import Sonar
 
 

@@ -6,8 +6,8 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 
-from undulog.capture.errors import UsageError
-from undulog.capture.log.frames import FrameArray, empty_frames
+from undulog.capture.common.errors import UsageError
+from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.sources.records import records
 from undulog.capture.sources.sender import FrameSender
 
@@ -127,7 +127,7 @@ class VirtualBus:
         """Let everyone hear frames of the robot.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE` with device times, (n,).
+            frames: Records of :data:`.FRAME_DTYPE` with device times, (n,).
         """
         self.sent += len(frames)
         self._give(frames, None)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray, frozen
 from undulog.capture.bus.decoding import BusDecoder
-from undulog.capture.log.frames import FrameArray
-from undulog.capture.robot import Direction, Quantity, Robot
+from undulog.capture.common.arrays import BoolArray, FloatArray, frozen
+from undulog.capture.log.messages.frames import FrameArray
+from undulog.capture.robot.model import Direction, Quantity, Robot
 
 WATCHDOG_S = 0.5
 """After so long without a command a servo's silence is told; it holds its angle all the while."""

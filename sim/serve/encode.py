@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import FloatArray, IntArray
 from undulog.capture.bus.encoding import BusEncoder, BusValue
 from undulog.capture.bus.map_entry import bus_messages, frame_id
-from undulog.capture.log.frames import FrameArray, empty_frames
-from undulog.capture.robot import Direction, Quantity, Robot, SensorKind
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.log.messages.frames import FrameArray, empty_frames
+from undulog.capture.robot.model import Direction, Quantity, Robot, SensorKind
 
-from ..scenario import CONTROL_RATE_HZ
+from ..scenario.scenario import CONTROL_RATE_HZ
 from ..sensing.contract import JointSample, RangeSample, SensorSample
 
 _OF_JOINT = (

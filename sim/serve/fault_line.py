@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray, FloatArray
-from undulog.capture.log.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
+from undulog.capture.robot.model import Robot
 from undulog.capture.sources.bus_watch import BUS_OFF, RESTARTED
 
+from ..scenario.bus_faults import BusFault, FaultKind
 from ..sensing.contract import JointSample, SensorSample
 from .encode import ReplyEncoder
-from .faults import BusFault, FaultKind
 
 STREAM = 50
 """Number of the random stream that decides which frames are hit."""

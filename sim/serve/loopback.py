@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 
-from undulog.capture.errors import UsageError
+from undulog.capture.common.errors import UsageError
 
 
 def listen_on_loopback(host: str, port: int) -> socket.socket:

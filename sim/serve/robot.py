@@ -14,24 +14,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.arrays import BoolArray
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import FrameArray
-from undulog.capture.robot import Robot
+from undulog.capture.common.arrays import BoolArray
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.messages.frames import FrameArray
+from undulog.capture.robot.model import Robot
 from undulog.capture.sources.records import records
 
-from ..gait import GaitTick
-from ..garbage import quick_collections
-from ..readings import Readings
-from ..scenario import CONTROL_RATE_HZ, Scenario
+from ..gait.contract import GaitTick
+from ..gait.readings import Readings
+from ..scenario.bus_faults import BusFault
+from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
 from ..sensing.contract import SensorSample
-from ..twin import Twin
+from ..twin.garbage import quick_collections
+from ..twin.twin import Twin
 from .bus import VirtualBus
 from .bus_client import Sent
 from .commands import WATCHDOG_S, CommandLatch
 from .encode import ReplyEncoder
 from .fault_line import FaultLine
-from .faults import BusFault
 from .pacing import Pacer, PaceTally
 
 _NS = 1_000_000_000
@@ -70,7 +70,7 @@ class Served:
 
 
 class VirtualRobot:
-    """A robot on a bus; as a :class:`.sim.gait.Gait` it hands the bus's commands to the twin."""
+    """A robot on a bus; as a :class:`.Gait` it hands the bus's commands to the twin."""
 
     def __init__(
         self,

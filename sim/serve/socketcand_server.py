@@ -18,7 +18,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from undulog.capture.log.frames import FrameArray
+from undulog.capture.log.messages.frames import FrameArray
 
 from .bus_client import BusClient, Sent
 from .loopback import listen_on_loopback
@@ -124,7 +124,7 @@ class SocketcandServer:
         """Give frames to every client in raw mode.
 
         Args:
-            frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,); their device
+            frames: Records of :data:`.FRAME_DTYPE`, shape (n,); their device
                 times are told.
             but: Number of the client that sent them.
         """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from undulog.capture.log.frames import (
+from undulog.capture.log.messages.frames import (
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
@@ -30,7 +30,7 @@ def frame_text(frames: FrameArray) -> bytes:
     """Frames as the raw mode has them, each with its device time to the microsecond.
 
     Args:
-        frames: Records of :data:`.capture.log.frames.FRAME_DTYPE`, shape (n,).
+        frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
 
     Returns:
         ``< frame 201 12.345678 1122 >``, ``< rtr 201 12.345678 2 >`` or ``< error 040 12.345678 >``

@@ -7,18 +7,17 @@ from undulog.analysis.results.analysis import (
     Analysis,
     BodyPoint,
     BodyResult,
-    Coupling,
-    Estimate,
     GaitFacts,
     Index,
     JointResult,
-    Provenance,
     SessionFacts,
     Window,
 )
 from undulog.analysis.results.answer import Shape
+from undulog.analysis.results.coupling import Coupling
+from undulog.analysis.results.estimate import Estimate, Provenance
+from undulog.analysis.segments.answer import Facts, compose
 from undulog.analysis.segments.examine import Findings
-from undulog.analysis.text.answer import Facts, compose
 
 
 def answered(analysis, shape=()):

@@ -6,9 +6,9 @@ import pytest
 from undulog.analysis.estimators.harmonic import fit_at, fit_shared
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.settling import worst_drift
-from undulog.analysis.fitting import fit_gait
-from undulog.analysis.gait import driven, find_rhythm, phase_step, wave_name
-from undulog.analysis.windows import Stretch, covered, settled, steady_runs, whole_cycles
+from undulog.analysis.response.fitting import fit_gait
+from undulog.analysis.response.gait import driven, find_rhythm, phase_step, wave_name
+from undulog.analysis.signals.windows import Stretch, covered, settled, steady_runs, whole_cycles
 
 
 def channels(make, count=4, duration=10.0, rate=100.0):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.notebook.files import load
+from undulog.analysis.present.notebook.files import load
 from undulog.capture import SessionWriter
 
 HERE = Path(__file__)

@@ -9,12 +9,17 @@ import pytest
 
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.harmonic_moments import HarmonicModel
+from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import residual_noise
-from undulog.analysis.fitting import fit_gait
-from undulog.analysis.groups import find_groups
-from undulog.analysis.mixing import further_lines, group_model, mixed_tones, with_mixed_lines
-from undulog.analysis.response import t_factor
+from undulog.analysis.response.fitting import fit_gait
+from undulog.analysis.response.groups import find_groups
+from undulog.analysis.response.mixing import (
+    further_lines,
+    group_model,
+    mixed_tones,
+    with_mixed_lines,
+)
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "group_tables.py")))

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.coupling import one_gait_coupling
-from undulog.analysis.heterogeneity import energy_indices, gini, response_indices, spread
-from undulog.analysis.response import Response, welch_satterthwaite
+from undulog.analysis.estimators.intervals import welch_satterthwaite
+from undulog.analysis.response.response import Response
+from undulog.analysis.session.coupling_of_one_gait import one_gait_coupling
+from undulog.analysis.session.heterogeneity import energy_indices, gini, response_indices, spread
 
 BINS = 10
 

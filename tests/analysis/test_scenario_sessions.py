@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from undulog.analysis.analyse import analyse_session
+from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
 from undulog.sim import load_scenario, scenario_names
-from undulog.sim.physics.engine import EngineKind, Kernels
-from undulog.sim.recording import record
+from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.twin.recording import record
 
 STEADY = [
     *("caterpillar", "caterpillar-pi2", "combined", "delay-blocks", "flat", "horizontal"),

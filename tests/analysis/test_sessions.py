@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.analysis.stretch import Options
-from undulog.capture.errors import DataError, MissingChannelError, UsageError
+from undulog.analysis.signals.stretch import Options
+from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 
 analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 

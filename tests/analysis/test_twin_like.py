@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.body.null import (
-    SAMPLES,
-    one_cycle,
-    places,
-    viscous_chain,
-)
-from undulog.analysis.stretch import Options
+from undulog.analysis.body.null import SAMPLES, one_cycle, places, viscous_chain
+from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 
 analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 

@@ -17,9 +17,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2.writer import Writer as RosWriter
 
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.frames import empty_frames
-from undulog.capture.log.schemas import schema_text
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 JOINTS = ("joint01", "joint02", "joint03", "joint04")

@@ -116,7 +116,7 @@ def _mutated(data: bytes, suffix: str, rng: random.Random, scratch: Path) -> byt
 def read_session(path: Path) -> None:
     """Everything that a session offers; errors of the error tree are answers too."""
     from undulog.capture import Session
-    from undulog.capture.errors import UndulogError
+    from undulog.capture.common.errors import UndulogError
 
     def tried(part: Callable[[], object]) -> None:
         try:

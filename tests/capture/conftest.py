@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import SessionWriter
-from undulog.capture.log.frames import (
+from undulog.capture.log.messages.frames import (
     EXTENDED_FLAG,
     FD_BRS,
     REMOTE_FLAG,

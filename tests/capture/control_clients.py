@@ -9,8 +9,8 @@ import sys
 import threading
 import time
 
-from undulog.capture.daemon.control import LATER
-from undulog.capture.errors import DataError
+from undulog.capture.common.errors import DataError
+from undulog.capture.recorder.control import LATER
 
 PATIENCE_S = 60.0
 
@@ -90,8 +90,8 @@ def start_recorder(path, extra=""):
     code = (
         "import sys, time\n"
         "from pathlib import Path\n"
-        "from undulog.capture.daemon.control import ControlServer\n"
-        "from undulog.capture.errors import ControlError\n"
+        "from undulog.capture.recorder.control import ControlServer\n"
+        "from undulog.capture.common.errors import ControlError\n"
         f"{extra}\n"
         "try:\n"
         f"    server = ControlServer(Path({str(path)!r}), lambda request: {{}})\n"

@@ -13,8 +13,8 @@ import time
 
 from mcap.records import Channel, Metadata, Schema
 
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.schemas import schema_text
+from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STRING = "std_msgs/msg/String"

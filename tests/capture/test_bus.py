@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from undulog.capture import load_robot
 from undulog.capture.bus.bit_field import BitField
 from undulog.capture.bus.decoding import BusDecoder
-from undulog.capture.errors import DataError
-from undulog.capture.log.frames import (
+from undulog.capture.common.errors import DataError
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -24,7 +24,7 @@ from undulog.capture.log.frames import (
     empty_frames,
 )
 from undulog.capture.robot.description import parse_robot
-from undulog.capture.units import UNITS
+from undulog.capture.robot.units import UNITS
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ from undulog.capture import load_robot
 from undulog.capture.bus.bit_field import BitField
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.errors import DataError
-from undulog.capture.log.frames import DIR_RX, DIR_TX
-from undulog.capture.robot import Direction, Quantity
+from undulog.capture.common.errors import DataError
+from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.model import Direction, Quantity
 
 
 @settings(max_examples=400, deadline=None)

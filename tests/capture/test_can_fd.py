@@ -17,14 +17,13 @@ from mcap_ros2.decoder import DecoderFactory
 
 import undulog
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.daemon.clock import SessionClock
-from undulog.capture.daemon.recorder import Ending, Recorder
-from undulog.capture.errors import DataError
+from undulog.capture.common.errors import DataError
+from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.can_logs import RELATIVE_EPOCH_NS
 from undulog.capture.exchange.log_export import export_log
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import (
+from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
     EXTENDED_FLAG,
@@ -35,7 +34,8 @@ from undulog.capture.log.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from undulog.capture.log.session_check import check_session
+from undulog.capture.recorder.clock import SessionClock
+from undulog.capture.recorder.recorder import Ending, Recorder
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceContext

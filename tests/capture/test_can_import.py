@@ -10,13 +10,19 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from undulog.capture import Session, load_robot
-from undulog.capture.errors import ImportFormatError, OutputExistsError
+from undulog.capture.common.errors import ImportFormatError, OutputExistsError
+from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.can_logs import RELATIVE_EPOCH_NS
 from undulog.capture.exchange.log_export import export_log
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
-from undulog.capture.log.session_check import check_session
+from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    REMOTE_FLAG,
+)
 
 ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"
 RECORDING = ARCSNAKE / "linear_trajectory.candump.log"
@@ -455,7 +461,7 @@ def test_nothing_is_overwritten(tmp_path: Path):
 
 
 def test_a_stopped_import_leaves_a_whole_file(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("undulog.capture.exchange.candump.FRAMES_PER_BLOCK", 4)
+    monkeypatch.setattr("undulog.capture.exchange.frame_log.FRAMES_PER_BLOCK", 4)
     stop = StopRequest()
     two_buses(tmp_path / "x.log")
     stop.signal = 15
@@ -468,7 +474,7 @@ def test_a_stopped_import_leaves_a_whole_file(tmp_path: Path, monkeypatch):
 
 def test_blocks_make_no_difference(tmp_path: Path, polled, monkeypatch):
     source = polled[0].parent / "poll.asc"
-    monkeypatch.setattr("undulog.capture.exchange.can_logs.FRAMES_PER_BLOCK", 37)
+    monkeypatch.setattr("undulog.capture.exchange.frame_log.FRAMES_PER_BLOCK", 37)
     import_can(source, tmp_path / "a.mcap", load_robot("snake25"))
     with Session.open(tmp_path / "a.mcap") as small, Session.open(polled[0]) as large:
         assert small.frames("/can/can0").tobytes() == large.frames("/can/can0").tobytes()

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.errors import ImportFormatError
+from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.candump import candump_lines, read_candump
-from undulog.capture.log.frames import (
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,

@@ -10,18 +10,18 @@ import pytest
 
 import undulog
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.errors import (
+from undulog.capture.common.errors import (
     DataError,
     LogWriteError,
     MissingChannelError,
     MissingExtraError,
     UsageError,
 )
+from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.column_export import TABLE_FORMATS, export_columns
 from undulog.capture.exchange.column_map import column_map_from_options
 from undulog.capture.exchange.csv_import import import_csv
-from undulog.capture.interruption import StopRequest
 
 RECORDING = (
     Path(__file__).parents[2].parent / "shared/data/arcsnake" / "linear_trajectory.candump.log"
@@ -120,8 +120,8 @@ def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
     # One message a servo, some without velocity: the fields don't share times.
     from mcap.writer import Writer
 
-    from undulog.capture.log.cdr import encode
-    from undulog.capture.log.schemas import message_type, schema_text
+    from undulog.capture.log.messages.cdr import encode
+    from undulog.capture.log.messages.schemas import message_type, schema_text
 
     kind = message_type("sensor_msgs/msg/JointState")
     with (tmp_path / "run.mcap").open("wb") as stream:

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.daemon import control
-from undulog.capture.daemon.control import MAX_CLIENTS, ControlServer
-from undulog.capture.daemon.control_client import ControlClient
-from undulog.capture.daemon.control_lines import BUFFER
-from undulog.capture.errors import ControlError
+from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder import control
+from undulog.capture.recorder.control import MAX_CLIENTS, ControlServer
+from undulog.capture.recorder.control_client import ControlClient
+from undulog.capture.recorder.control_lines import BUFFER
 
 shared = runpy.run_path(str(Path(__file__).with_name("control_clients.py")))
 PATIENCE_S = shared["PATIENCE_S"]

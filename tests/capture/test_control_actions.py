@@ -8,11 +8,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from undulog.capture.daemon.control import ControlServer
-from undulog.capture.daemon.control_client import ControlClient
-from undulog.capture.daemon.control_requests import OPERATOR, OperatorLog, request_handler
-from undulog.capture.errors import ControlError, DataError
-from undulog.capture.log.writer import SessionWriter
+from undulog.capture.common.errors import ControlError, DataError
+from undulog.capture.log.write.writer import SessionWriter
+from undulog.capture.recorder.control import ControlServer
+from undulog.capture.recorder.control_client import ControlClient
+from undulog.capture.recorder.control_requests import OPERATOR, OperatorLog, request_handler
 
 shared = runpy.run_path(str(Path(__file__).with_name("control_clients.py")))
 polled = shared["polled"]

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from undulog.capture.daemon.control import TEND_POLLS, ControlServer
-from undulog.capture.daemon.control_client import ControlClient
-from undulog.capture.daemon.control_socket import default_sockets, find_sockets, socket_folder
-from undulog.capture.errors import ControlError
+from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder.control import TEND_POLLS, ControlServer
+from undulog.capture.recorder.control_client import ControlClient
+from undulog.capture.recorder.control_socket import default_sockets, find_sockets, socket_folder
 
 shared = runpy.run_path(str(Path(__file__).with_name("control_clients.py")))
 PATIENCE_S = shared["PATIENCE_S"]

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, load_robot
-from undulog.capture.errors import FaultyFileError, ImportFormatError, UsageError
-from undulog.capture.exchange.can_logs import RELATIVE_EPOCH_NS
+from undulog.capture.common.errors import FaultyFileError, ImportFormatError, UsageError
+from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.column_map import column_map_from_options, read_column_map
 from undulog.capture.exchange.csv_import import import_csv, is_frame_csv
-from undulog.capture.interruption import StopRequest
+from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
 
 ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"
 GEAR = 22

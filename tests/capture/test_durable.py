@@ -16,12 +16,12 @@ from mcap.records import Channel, Metadata
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.daemon.tapped_sink import TappedSink
-from undulog.capture.errors import DataError, LogWriteError, OutputExistsError
-from undulog.capture.log.diagnostics import ERROR, OK, DiagnosticStatus
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.schemas import schema_text
-from undulog.capture.log.session_check import check_session
+from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.diagnostics import ERROR, OK, DiagnosticStatus
+from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.recorder.tapped_sink import TappedSink
 
 CHILD = Path(__file__).with_name("durable_child.py")
 recorder = SimpleNamespace(**runpy.run_path(str(CHILD)))
@@ -216,7 +216,7 @@ def small_disk(disk_of):
 # In a child, for the failure to be feared is a SIGBUS.
 FILL = """
 import runpy, sys, time
-from undulog.capture.errors import LogWriteError
+from undulog.capture.common.errors import LogWriteError
 
 def take_the_rest():  # as somebody else would
     with open(sys.argv[2] + "/hog", "wb", buffering=0) as hog:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from undulog.capture import SessionWriter
-from undulog.capture.log.mcap_payloads import McapPayloads
+from undulog.capture.log.mcap.mcap_payloads import McapPayloads
 
 READS = """
 import gc, sys, weakref
-from undulog.capture.log.mcap_payloads import McapPayloads
+from undulog.capture.log.mcap.mcap_payloads import McapPayloads
 from pathlib import Path
 
 class Ring:

@@ -19,7 +19,7 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.log_export import export_log
 from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
-from undulog.capture.log.frames import (
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,

@@ -16,13 +16,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import undulog
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.errors import LogWriteError, UsageError
+from undulog.capture.common.errors import LogWriteError, UsageError
+from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.can_logs import RELATIVE_EPOCH_NS
 from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.log_export import export_log
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import (
+from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,

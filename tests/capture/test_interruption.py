@@ -14,7 +14,7 @@ from undulog.capture import Session
 RECORDER = """
 import sys, time
 from undulog.capture import SessionWriter
-from undulog.capture.interruption import interruptible
+from undulog.capture.common.interruption import interruptible
 
 with interruptible() as stop, SessionWriter(sys.argv[1], session_id="s", epoch_ns=10**18) as writer:
     channel = writer.joint_state("/joint_states", ["a"], unit="rad")

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from undulog.capture import load_robot
-from undulog.capture.errors import DataError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import (
     link_poses,
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
+from undulog.capture.robot.model import Plane
 
 ROBOT = load_robot("snake13")
 RNG = np.random.default_rng(5)

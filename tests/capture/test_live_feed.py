@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from undulog.capture.daemon import live_feed
-from undulog.capture.daemon.live_feed import LiveFeed
-from undulog.capture.daemon.live_wire import (
+from undulog.capture.common.errors import DataError
+from undulog.capture.recorder import live_feed
+from undulog.capture.recorder.live_feed import LiveFeed
+from undulog.capture.recorder.live_wire import (
     MAX_DATAGRAM,
     MAX_MESSAGE,
     DatagramHead,
@@ -27,7 +28,6 @@ from undulog.capture.daemon.live_wire import (
     read_head,
     read_records,
 )
-from undulog.capture.errors import DataError
 
 EPOCH_NS = 1_735_689_600_000_000_000
 STEP_NS = 10_000_000

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 import undulog
 from undulog.capture import SessionWriter
-from undulog.capture.log.session_check import SessionHealth, check_session
-from undulog.capture.log.tallies import SequenceTally, TimingTally
+from undulog.capture.log.health.session_check import SessionHealth, check_session
+from undulog.capture.log.health.tallies import SequenceTally, TimingTally
 
 shared = runpy.run_path(str(Path(__file__).with_name("checked_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

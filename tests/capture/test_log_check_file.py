@@ -15,9 +15,9 @@ from mcap_ros2.writer import Writer as RosWriter
 
 import undulog
 from undulog.capture import SessionWriter
-from undulog.capture.log.chunk import walk_records
-from undulog.capture.log.schemas import schema_text
-from undulog.capture.log.session_check import check_session
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.mcap.chunk import walk_records
+from undulog.capture.log.messages.schemas import schema_text
 
 shared = runpy.run_path(str(Path(__file__).with_name("checked_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

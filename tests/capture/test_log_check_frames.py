@@ -10,9 +10,9 @@ import pytest
 
 import undulog
 from undulog.capture import SessionWriter
-from undulog.capture.log.bus_tally import BusTally, frame_bits
-from undulog.capture.log.frames import ERROR_FLAG, EXTENDED_FLAG, empty_frames
-from undulog.capture.log.session_check import check_session
+from undulog.capture.log.health.bus_tally import BusTally, frame_bits
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, empty_frames
 
 shared = runpy.run_path(str(Path(__file__).with_name("checked_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from undulog.capture.errors import UndulogError
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.cut import cut_log
-from undulog.capture.log.merge import merge_logs
-from undulog.capture.log.schemas import schema_text
+from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.messages.schemas import schema_text
 
 shared = runpy.run_path(str(Path(__file__).with_name("edited_logs.py")))
 EPOCH_NS = shared["EPOCH_NS"]
@@ -90,7 +90,7 @@ def test_a_stop_leaves_nothing(tmp_path: Path):
 
 SLOW = """
 import sys, time, undulog
-from undulog.capture.log import edit
+from undulog.capture.log.edit import edit
 write = edit.EditedLog.write
 def slowly(*arguments):
     print("writing", flush=True)

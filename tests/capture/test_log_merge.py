@@ -16,10 +16,10 @@ from rosbags.highlevel import AnyReader
 
 import undulog
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.errors import DataError, UsageError
-from undulog.capture.log.cut import cut_log
-from undulog.capture.log.merge import merge_logs
-from undulog.capture.log.schemas import schema_text
+from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.messages.schemas import schema_text
 
 shared = runpy.run_path(str(Path(__file__).with_name("edited_logs.py")))
 EPOCH_NS = shared["EPOCH_NS"]

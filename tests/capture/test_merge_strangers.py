@@ -10,8 +10,8 @@ from mcap.reader import make_reader
 
 import undulog
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.errors import UsageError
-from undulog.capture.log.merge import merge_logs
+from undulog.capture.common.errors import UsageError
+from undulog.capture.log.edit.merge import merge_logs
 
 hostile = runpy.run_path(str(Path(__file__).parents[2] / "bench" / "hostile_logs.py"))
 HostileLog, EPOCH_NS, NS = hostile["HostileLog"], hostile["EPOCH_NS"], hostile["NS"]

@@ -14,11 +14,17 @@ import pytest
 
 import undulog
 from undulog.capture import Session, load_robot
-from undulog.capture.errors import ImportFormatError
+from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.can_logs import open_frame_log
 from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
-from undulog.capture.log.frames import DIR_RX, DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from undulog.capture.log.messages.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    REMOTE_FLAG,
+)
 
 asammdf = pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
 from asammdf.blocks.v4_blocks import SourceInformation  # noqa: E402

@@ -5,8 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from undulog.capture.errors import InputFileError, NullModelError
-from undulog.capture.null_model import NullModel, SharedParameter, read_null_model, write_null_model
+from undulog.capture.common.errors import InputFileError, NullModelError
+from undulog.capture.robot.null_model import (
+    NullModel,
+    SharedParameter,
+    read_null_model,
+    write_null_model,
+)
 
 
 def some_model():

@@ -12,10 +12,10 @@ import pytest
 
 import undulog
 from undulog.capture import Session
-from undulog.capture.errors import DataError
-from undulog.capture.log.merge import merge_logs
-from undulog.capture.log.rosmsg import parse_message_type
-from undulog.capture.log.session_check import check_session
+from undulog.capture.common.errors import DataError
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.rosmsg import parse_message_type
 from undulog.replay.samples.tracks import drawn_topics
 
 hostile = runpy.run_path(str(Path(__file__).parents[2] / "bench" / "hostile_logs.py"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from undulog.capture.palette import joint_colors, joint_hex
+from undulog.capture.common.palette import joint_colors, joint_hex
 
 
 def lightness(colors: np.ndarray) -> np.ndarray:

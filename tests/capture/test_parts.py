@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 
 import undulog
 from undulog.capture import Session, SessionWriter
-from undulog.capture.errors import LogError, LogWriteError, NotALogError, OutputExistsError
-from undulog.capture.log.cut import cut_log
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.merge import merge_logs
-from undulog.capture.log.part_names import later_parts, part_path, split_part_path
-from undulog.capture.log.session_check import check_session
+from undulog.capture.common.errors import LogError, LogWriteError, NotALogError, OutputExistsError
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.file.part_names import later_parts, part_path, split_part_path
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.sinks.durable_sink import DurableSink
 
 recorder = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("durable_child.py"))))
 read = runpy.run_path(str(Path(__file__).with_name("read_back.py")))["read"]

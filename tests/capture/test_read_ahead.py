@@ -12,11 +12,11 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.errors import UsageError
-from undulog.capture.log import arenas
-from undulog.capture.log.durable_sink import DurableSink
-from undulog.capture.log.read_ahead import Piece, ahead, helpers
-from undulog.capture.log.storage import LogFile
+from undulog.capture.common.errors import UsageError
+from undulog.capture.log.columns import arenas
+from undulog.capture.log.columns.read_ahead import Piece, ahead, helpers
+from undulog.capture.log.file.storage import LogFile
+from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

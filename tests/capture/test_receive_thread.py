@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.daemon.bus_recorder import BusRecorder
-from undulog.capture.daemon.source_clock import SourceClock
-from undulog.capture.log.frames import empty_frames
-from undulog.capture.priority import raised_priority
+from undulog.capture.common.priority import raised_priority
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.recorder.bus_recorder import BusRecorder
+from undulog.capture.recorder.source_clock import SourceClock
 from undulog.capture.sources.receive_thread import ReceiveThread
 
 ROOT = Path(__file__).parents[2]

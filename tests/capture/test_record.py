@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, load_robot
-from undulog.capture.daemon.live_health import LiveHealth
-from undulog.capture.daemon.record import Recording
-from undulog.capture.daemon.settings import resolve
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import DIR_TX, empty_frames
-from undulog.capture.log.session_check import check_session
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import DIR_TX, empty_frames
+from undulog.capture.recorder.live_health import LiveHealth
+from undulog.capture.recorder.record import Recording
+from undulog.capture.recorder.settings import resolve
 
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]

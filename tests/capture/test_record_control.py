@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import undulog
-from undulog.capture.daemon.control_client import ControlClient
-from undulog.capture.daemon.control_socket import find_sockets
+from undulog.capture.recorder.control_client import ControlClient
+from undulog.capture.recorder.control_socket import find_sockets
 
 PATIENCE_S = 60.0
 
@@ -26,7 +26,7 @@ def place(tmp_path, monkeypatch):
     runtime.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    monkeypatch.setattr("undulog.capture.daemon.control_socket._SYSTEM_FOLDER", tmp_path / "none")
+    monkeypatch.setattr("undulog.capture.recorder.control_socket._SYSTEM_FOLDER", tmp_path / "none")
     return tmp_path
 
 
@@ -174,7 +174,7 @@ def test_a_controller_in_another_process_tells_its_gait_for_a_while(recorder, pl
     controller = (
         "import sys, math\n"
         "from pathlib import Path\n"
-        "from undulog.capture.daemon.control_client import ControlClient\n"
+        "from undulog.capture.recorder.control_client import ControlClient\n"
         "with ControlClient(Path(sys.argv[1])) as recorder:\n"
         "    for k in range(200):\n"
         "        values = {'horizontal.A': 0.4, 'horizontal.phase': math.pi * k / 100}\n"

@@ -25,10 +25,10 @@ from mcap.reader import make_reader
 
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.decoding import BusDecoder
-from undulog.capture.daemon.bus_recorder import BusRecorder
-from undulog.capture.daemon.source_clock import SourceClock
-from undulog.capture.log.channels import JointStateChannel
-from undulog.capture.log.frames import DIR_TX, FrameArray, empty_frames
+from undulog.capture.log.messages.frames import DIR_TX, FrameArray, empty_frames
+from undulog.capture.log.write.channels import JointStateChannel
+from undulog.capture.recorder.bus_recorder import BusRecorder
+from undulog.capture.recorder.source_clock import SourceClock
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
@@ -264,8 +264,8 @@ def test_a_duration_ends_sources_of_simulated_time(tmp_path: Path) -> None:
 
 
 PLUG_IN = """
-from undulog.capture.log.frames import empty_frames
-from undulog.capture.robot import ClockDomain
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.contract import Polled, SourceCounts
 
 class Source:

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from undulog.capture.log.frames import empty_frames
-from undulog.capture.log.session_check import check_session
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.sources.packets import HEAD
 
 ROOT = Path(__file__).parents[2]

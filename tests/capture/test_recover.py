@@ -19,17 +19,17 @@ from rosbags.highlevel import AnyReader
 
 import undulog
 from undulog.capture import Session, SessionWriter
-from undulog.capture.errors import (
+from undulog.capture.common.errors import (
     LogError,
     NotALogError,
     OutputExistsError,
     UndulogError,
     UsageError,
 )
-from undulog.capture.log.cut import cut_log
-from undulog.capture.log.merge import merge_logs
-from undulog.capture.log.recover import recover_log, recovered_path
-from undulog.capture.log.session_check import check_session
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.edit.recover import recover_log, recovered_path
+from undulog.capture.log.health.session_check import check_session
 
 CHILD = Path(__file__).with_name("durable_child.py")
 recorder = SimpleNamespace(**runpy.run_path(str(CHILD)))

@@ -21,12 +21,12 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from undulog.capture import Session
-from undulog.capture.daemon.ring_storage import RingStorage
-from undulog.capture.errors import LogWriteError, UsageError
-from undulog.capture.log.mcap_sink import McapSink
-from undulog.capture.log.ring_mark import MARK_RECORD
-from undulog.capture.log.ring_sink import MAX_WAITING, MESSAGE_OVERHEAD, RingSink
-from undulog.capture.log.writer import SessionWriter
+from undulog.capture.common.errors import LogWriteError, UsageError
+from undulog.capture.log.sinks.mcap_sink import McapSink
+from undulog.capture.log.sinks.ring_mark import MARK_RECORD
+from undulog.capture.log.sinks.ring_sink import MAX_WAITING, MESSAGE_OVERHEAD, RingSink
+from undulog.capture.log.write.writer import SessionWriter
+from undulog.capture.recorder.ring_storage import RingStorage
 
 EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -330,7 +330,7 @@ def test_a_process_that_ends_without_a_close_still_writes_its_mark(tmp_path):
     code = (
         "from pathlib import Path\n"
         "from mcap.records import Channel\n"
-        "from undulog.capture.log.ring_sink import RingSink\n"
+        "from undulog.capture.log.sinks.ring_sink import RingSink\n"
         f"ring = RingSink(Path({str(tmp_path)!r}) / 'run.mcap', 10**9)\n"
         "ring.define(Channel(1, '/a', 'cdr', {}, 0))\n"
         "for k in range(50_000):\n"

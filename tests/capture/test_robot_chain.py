@@ -4,9 +4,9 @@ import pytest
 from mcap.reader import make_reader
 
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.errors import RobotFileError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import RobotFileError
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.model import Plane
 
 LINK = """
 [defaults.link]

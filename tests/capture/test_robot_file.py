@@ -7,21 +7,20 @@ import cantools
 import pytest
 
 from undulog.capture import load_robot, robot_names
-from undulog.capture.errors import RobotFileError, UsageError
-from undulog.capture.robot import (
+from undulog.capture.common.errors import RobotFileError, UsageError
+from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.model import (
     BusPoll,
     ClockDomain,
     Direction,
-    OnFault,
     Plane,
     Quantity,
-    Safety,
     Sensor,
     SensorKind,
     Servo,
 )
-from undulog.capture.robot.description import parse_robot
-from undulog.capture.robot.safety import missing_limits, safety_example
+from undulog.capture.robot.safety import OnFault, Safety
+from undulog.sim.gate.limits import missing_limits, safety_example
 
 MINIMAL = """
 name = "worm"

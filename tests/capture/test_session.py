@@ -12,12 +12,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.errors import (
-    DataError,
-    LogWriteError,
-    OutputExistsError,
-)
-from undulog.capture.log.frames import DIR_TX, EXTENDED_FLAG, empty_frames
+from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
+from undulog.capture.log.messages.frames import DIR_TX, EXTENDED_FLAG, empty_frames
 
 shared = runpy.run_path(str(Path(__file__).with_name("written_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

@@ -11,12 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from undulog.capture import Session, load_robot
-from undulog.capture.errors import (
-    DataError,
-    LogError,
-    MissingChannelError,
-    NotALogError,
-)
+from undulog.capture.common.errors import DataError, LogError, MissingChannelError, NotALogError
 
 shared = runpy.run_path(str(Path(__file__).with_name("written_sessions.py")))
 write_session = shared["write_session"]

@@ -12,9 +12,9 @@ from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture import Session
-from undulog.capture.errors import MissingChannelError
-from undulog.capture.log.cdr import encode
-from undulog.capture.log.schemas import message_type, schema_text
+from undulog.capture.common.errors import MissingChannelError
+from undulog.capture.log.messages.cdr import encode
+from undulog.capture.log.messages.schemas import message_type, schema_text
 
 shared = runpy.run_path(str(Path(__file__).with_name("written_sessions.py")))
 EPOCH_NS = shared["EPOCH_NS"]

@@ -13,16 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.capture.daemon.amounts import (
+from undulog.capture.common.amounts import (
     DURATION_UNITS,
     SIZE_UNITS,
     format_size,
     parse_duration_ns,
     parse_size,
 )
-from undulog.capture.daemon.setting_values import PARSERS
-from undulog.capture.daemon.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, resolve
-from undulog.capture.errors import DataError, InputFileError, SettingsError
+from undulog.capture.common.errors import DataError, InputFileError, SettingsError
+from undulog.capture.recorder.setting_values import PARSERS
+from undulog.capture.recorder.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, resolve
 
 MANUAL = Path(__file__).parents[2] / "docs" / "recording.md"
 NEEDED = {"sources": ("can:virtual:a",), "output": "run.mcap"}
@@ -181,7 +181,7 @@ def test_the_command_line_beats_the_environment_beats_the_file(tmp_path, name, p
 
 
 def test_every_setting_is_tested_and_the_docstring_s_example_holds_all(tmp_path):
-    from undulog.capture.daemon import settings as module
+    from undulog.capture.recorder import settings as module
 
     assert set(GOOD) == set(PARSERS)
     text = module.__doc__.split("A file::\n", 1)[1].split("Required are", 1)[0]

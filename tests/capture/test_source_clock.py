@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.arrays import IntArray
-from undulog.capture.daemon.envelope import Envelope
-from undulog.capture.daemon.source_clock import JUMP_NS, ClockEstimate, SourceClock
+from undulog.capture.common.arrays import IntArray
+from undulog.capture.recorder.envelope import Envelope
+from undulog.capture.recorder.source_clock import JUMP_NS, ClockEstimate, SourceClock
 from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.registry import open_source, open_sources, schemes
 
@@ -88,7 +88,7 @@ def test_two_sources_need_two_names(tmp_path) -> None:
 def test_a_source_without_its_extra_says_which() -> None:
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
-        "from undulog.capture.errors import MissingExtraError\n"
+        "from undulog.capture.common.errors import MissingExtraError\n"
         "from undulog.capture.sources.registry import open_sources\n"
         "try:\n"
         "    open_sources(['twin:flat'])\n"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from undulog.capture.log.frames import ERROR_FLAG, empty_frames
+from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.sources.backoff import Backoff
 from undulog.capture.sources.bus_watch import BUS_OFF, RESTARTED, BusWatch
 from undulog.capture.sources.events import EventLog, Tally

@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from undulog.capture.errors import SourceError
-from undulog.capture.log.frames import FRAME_DTYPE
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.errors import SourceError
+from undulog.capture.log.messages.frames import FRAME_DTYPE
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.drained_link import DrainedLink
 from undulog.capture.sources.link import LinkedSource

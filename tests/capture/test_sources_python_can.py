@@ -4,8 +4,8 @@ import can
 import numpy as np
 import pytest
 
-from undulog.capture.errors import SourceError, UsageError
-from undulog.capture.log.frames import (
+from undulog.capture.common.errors import SourceError, UsageError
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     ERROR_FLAG,
     EXTENDED_FLAG,
@@ -14,7 +14,7 @@ from undulog.capture.log.frames import (
     ID_MASK,
     REMOTE_FLAG,
 )
-from undulog.capture.robot import ClockDomain
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.can_interfaces import (
     DEVICE_TIME,

@@ -14,9 +14,15 @@ import numpy as np
 import pytest
 from can.util import len2dlc
 
-from undulog.capture.errors import SourceError, UsageError
-from undulog.capture.log.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG, empty_frames
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.errors import SourceError, UsageError
+from undulog.capture.log.messages.frames import (
+    EXTENDED_FLAG,
+    FD_BRS,
+    ID_MASK,
+    REMOTE_FLAG,
+    empty_frames,
+)
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.registry import open_source

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
-from undulog.capture.errors import SourceError
-from undulog.capture.log.frames import (
+from undulog.capture.common.errors import SourceError
+from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
     ERROR_FLAG,
@@ -24,7 +24,7 @@ from undulog.capture.log.frames import (
     ID_MASK,
     REMOTE_FLAG,
 )
-from undulog.capture.robot import ClockDomain
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.receive_many import (

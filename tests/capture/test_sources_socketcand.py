@@ -11,9 +11,15 @@ import can
 import numpy as np
 import pytest
 
-from undulog.capture.errors import UsageError
-from undulog.capture.log.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, empty_frames
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.errors import UsageError
+from undulog.capture.log.messages.frames import (
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    ID_MASK,
+    REMOTE_FLAG,
+    empty_frames,
+)
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.registry import open_source

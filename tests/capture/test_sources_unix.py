@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.capture.errors import DataError, SourceError, UsageError
-from undulog.capture.log.frames import ERROR_FLAG, empty_frames
-from undulog.capture.robot import ClockDomain
+from undulog.capture.common.errors import DataError, SourceError, UsageError
+from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
+from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.registry import open_source
 from undulog.capture.sources.sender import FrameSender

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from undulog.capture.daemon.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
-from undulog.capture.errors import UsageError
+from undulog.capture.common.errors import UsageError
+from undulog.capture.recorder.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
 
 PATIENCE_S = 60.0
 EXPOSURE = 2.0  # of 10, as `systemd-analyze security` counts; 2.5 would still be "OK"

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Quantity
-from undulog.capture.units import SESSION_UNIT, UNITS, unit_for, valid_units
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Quantity
+from undulog.capture.robot.units import SESSION_UNIT, UNITS, unit_for, valid_units
 
 
 @pytest.mark.parametrize(

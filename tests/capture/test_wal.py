@@ -12,15 +12,15 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from mcap.writer import Writer
 
-from undulog.capture.errors import (
+from undulog.capture.common.errors import (
     DataError,
     LogError,
     LogWriteError,
     NotALogError,
     OutputExistsError,
 )
-from undulog.capture.log.wal import WriteAheadLog, wal_folder
-from undulog.capture.log.wal_recover import recover
+from undulog.capture.log.wal.wal import WriteAheadLog, wal_folder
+from undulog.capture.log.wal.wal_recover import recover
 
 shared = runpy.run_path(str(Path(__file__).with_name("wal_messages.py")))
 CHANNEL = shared["CHANNEL"]

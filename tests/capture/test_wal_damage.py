@@ -17,10 +17,10 @@ from pathlib import Path
 
 import pytest
 
-from undulog.capture.errors import LogError
-from undulog.capture.log.wal import WriteAheadLog
-from undulog.capture.log.wal_format import SegmentHeader
-from undulog.capture.log.wal_recover import recover
+from undulog.capture.common.errors import LogError
+from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.wal_format import SegmentHeader
+from undulog.capture.log.wal.wal_recover import recover
 
 shared = runpy.run_path(str(Path(__file__).with_name("wal_messages.py")))
 CHANNEL = shared["CHANNEL"]
@@ -36,7 +36,7 @@ KILLED = (
     + """
 import os, sys
 from mcap.records import Channel
-from undulog.capture.log.wal import WriteAheadLog
+from undulog.capture.log.wal.wal import WriteAheadLog
 
 wal = WriteAheadLog(sys.argv[1], segment_size=int(sys.argv[2]), sync_interval_s=0.05)
 for channel in (1, 2, 3):

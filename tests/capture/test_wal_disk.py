@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from undulog.capture.errors import LogWriteError
-from undulog.capture.log.wal import WriteAheadLog
-from undulog.capture.log.wal_recover import recover
-from undulog.capture.log.wal_segment import free_bytes, require_space
+from undulog.capture.common.errors import LogWriteError
+from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.wal_recover import recover
+from undulog.capture.log.wal.wal_segment import free_bytes, require_space
 
 shared = runpy.run_path(str(Path(__file__).with_name("wal_messages.py")))
 MESSAGE = shared["MESSAGE"]
@@ -107,8 +107,8 @@ FILL = (
     MESSAGE
     + """
 import sys
-from undulog.capture.errors import LogWriteError
-from undulog.capture.log.wal import WriteAheadLog
+from undulog.capture.common.errors import LogWriteError
+from undulog.capture.log.wal.wal import WriteAheadLog
 
 wal = WriteAheadLog(sys.argv[1], segment_size=1 << 16)
 accepted = 0

@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from undulog.capture import Session
-from undulog.capture.log.frames import empty_frames
-from undulog.capture.log.wal import WriteAheadLog
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.log.wal.wal import WriteAheadLog
 from undulog.capture.sources.sender import FrameSender
 
 ROOT = Path(__file__).parents[2]

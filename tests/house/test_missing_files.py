@@ -11,7 +11,7 @@ import pytest
 
 import undulog
 from undulog.sim import load_scenario
-from undulog.sim.recording import record
+from undulog.sim.twin.recording import record
 
 # What isn't there is {no} with a suffix, what is there {run}; outputs go to {out}.
 LINES = [

@@ -141,7 +141,7 @@ def test_results_cross_to_a_spawned_process(tmp_path: Path) -> None:
     script.write_text(
         "import json, multiprocessing\n"
         "from undulog.analysis import Estimate\n"
-        "from undulog.capture.errors import UsageError\n"
+        "from undulog.capture.common.errors import UsageError\n"
         "def work(value):\n"
         "    return type(value).__module__, value\n"
         "if __name__ == '__main__':\n"

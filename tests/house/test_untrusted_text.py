@@ -18,8 +18,8 @@ import pytest
 from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
-from undulog.capture.log.cdr import encode
-from undulog.capture.log.schemas import message_type, schema_text
+from undulog.capture.log.messages.cdr import encode
+from undulog.capture.log.messages.schemas import message_type, schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -241,7 +241,7 @@ def test_pages_have_no_markup_from_names(folder, command):
 
 
 def test_notebooks_show_names_as_text(folder):
-    from undulog.analysis.analyse import analyse_session
+    from undulog.analysis.session.analyse import analyse_session
     from undulog.capture import Session
 
     with Session.open(folder / "a.mcap") as session:
@@ -252,7 +252,7 @@ def test_notebooks_show_names_as_text(folder):
 
 
 def test_markdown_shows_names_as_text():
-    from undulog.replay.facts import code, escaped
+    from undulog.replay.draw.facts import code, escaped
 
     assert escaped("[x](http://y)<b>*a*\n# h") == r"\[x\]\(http://y\)\<b\>\*a\*\\n\# h"
     assert code("a|b\n") == r"`a\|b\n`"

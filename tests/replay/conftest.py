@@ -9,18 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from undulog.analysis.results.analysis import (
-    Analysis,
-    Coupling,
-    Estimate,
-    GaitFacts,
-    JointResult,
-    Provenance,
-    SessionFacts,
-    Window,
-)
+from undulog.analysis.results.analysis import Analysis, GaitFacts, JointResult, SessionFacts, Window
+from undulog.analysis.results.coupling import Coupling
+from undulog.analysis.results.estimate import Estimate, Provenance
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 
 EPOCH_NS = 1_735_689_600_000_000_000
 
@@ -280,7 +273,7 @@ def read_back():
 @pytest.fixture(scope="session")
 def recording(session_file, analysis, tmp_path_factory):
     """The whole session as a recording: (what was said, what is in the file)."""
-    from undulog.replay.rrd import write_recording
+    from undulog.replay.record.rrd import write_recording
 
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     with Session.open(session_file) as session:
@@ -291,7 +284,7 @@ def recording(session_file, analysis, tmp_path_factory):
 @pytest.fixture(scope="session")
 def rerun_command():
     """Runs Rerun's own command line; returns its standard output."""
-    from undulog.replay.viewer import viewer_binary
+    from undulog.replay.viewer.viewer import viewer_binary
 
     def run(*arguments):
         done = subprocess.run(
@@ -310,7 +303,7 @@ def rerun_command():
 @pytest.fixture(scope="module")
 def show(vulkan):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
-    from undulog.replay.headless import HeadlessViewer
+    from undulog.replay.viewer.headless import HeadlessViewer
 
     with ExitStack() as stack:
 

@@ -24,11 +24,11 @@ import rerun.blueprint as rrb
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from undulog.analysis.analyse import analyse_session
+from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
-from undulog.replay.headless import HeadlessViewer
-from undulog.replay.rrd import APPLICATION, write_recording
-from undulog.replay.views import build_views
+from undulog.replay.layout.views import build_views
+from undulog.replay.record.rrd import APPLICATION, write_recording
+from undulog.replay.viewer.headless import HeadlessViewer
 
 FOLDER = Path(__file__).with_name("golden")
 SESSION = FOLDER / "session.mcap"

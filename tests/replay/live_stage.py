@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from undulog.capture.daemon import live_feed
-from undulog.capture.daemon.live_feed import LiveFeed
+from undulog.capture.recorder import live_feed
+from undulog.capture.recorder.live_feed import LiveFeed
 
 EPOCH_NS = 1_735_689_600_000_000_000
 STEP_NS = 20_000_000

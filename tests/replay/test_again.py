@@ -7,7 +7,7 @@ import pytest
 
 import undulog as front
 from undulog.capture import Session, SessionWriter
-from undulog.replay.again.sameness import sameness
+from undulog.replay.reproduce.sameness import sameness
 
 ROBOT = """name = "chain5"
 description = "Five yaw joints."

@@ -12,15 +12,15 @@ import pytest
 import undulog
 from undulog.analysis.compare.compare import Choices, compare_sessions
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.errors import LogWriteError
-from undulog.capture.interruption import StopRequest
-from undulog.capture.palette import joint_colors
-from undulog.replay.beside.alignment import Align, align, times_of
-from undulog.replay.beside.layout import all_views
-from undulog.replay.beside.side import convert, read_side
-from undulog.replay.beside.stoppable import StoppableSession
-from undulog.replay.beside.together import bring_together
-from undulog.replay.beside.write import Converted, write_beside
+from undulog.capture.common.errors import LogWriteError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.palette import joint_colors
+from undulog.replay.overlay.alignment import Align, align, times_of
+from undulog.replay.overlay.layout import all_views
+from undulog.replay.overlay.side import convert, read_side
+from undulog.replay.overlay.stoppable import StoppableSession
+from undulog.replay.overlay.together import bring_together
+from undulog.replay.overlay.write import Converted, write_beside
 from undulog.replay.samples.timeline import Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000

@@ -5,17 +5,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from undulog.capture.robot.kinematics import link_poses
-from undulog.replay.samples.tracks import Track
-from undulog.replay.scene.body import (
+from undulog.replay.draw.scene.body import (
     ROUNDING,
     TURN_ROUNDING,
     capsule_columns,
     capsule_poses,
     capsule_shape,
-    segment_power,
 )
-from undulog.replay.scene.markers import above_joints
-from undulog.replay.scene.motion import HeadPath, assemble, frames_of
+from undulog.replay.draw.scene.markers import above_joints
+from undulog.replay.draw.scene.motion import HeadPath, assemble, frames_of
+from undulog.replay.samples.quantities import segment_power
+from undulog.replay.samples.tracks import Track
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,14 @@ from scipy.signal import lfilter
 
 import undulog as front
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.interruption import StopRequest
-from undulog.replay.calibrate import cli
+from undulog.capture.common.interruption import StopRequest
 from undulog.replay.calibrate.determined import ridges
 from undulog.replay.calibrate.misfit import misfit
 from undulog.replay.calibrate.noise import memory, score_covariance
 from undulog.replay.calibrate.parameters import Unknown
 from undulog.replay.calibrate.solve import solve
-from undulog.sim.scenario_file import load_scenario
+from undulog.replay.commands import fit as cli
+from undulog.sim.scenario.scenario_file import load_scenario
 
 TRACE = Path(__file__).parents[2].parent / "shared/data/arcsnake/linear_trajectory.candump.log"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import undulog
-from undulog.replay.viewer import viewer_binary
+from undulog.replay.viewer.viewer import viewer_binary
 
 
 def run(capsys, *arguments):

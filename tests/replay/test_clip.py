@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 import undulog
-from undulog.capture.errors import UsageError
-from undulog.replay.clip.files import open_film
-from undulog.replay.clip.film import Shot
+from undulog.capture.common.errors import UsageError
+from undulog.replay.film.files import open_film
+from undulog.replay.film.film import Shot
 
 VERMILION = (255, 84, 48)
 GROUND = (16, 18, 22)

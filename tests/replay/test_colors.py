@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from undulog.replay.scene.colors import power_colors, power_limit
+from undulog.replay.draw.scene.colors import power_colors
+from undulog.replay.samples.quantities import power_limit
 
 
 def test_sign_and_size_of_power_can_be_read_from_the_colour():

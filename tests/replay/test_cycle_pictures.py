@@ -7,10 +7,10 @@ import pytest
 
 import undulog
 from undulog.capture import Session
-from undulog.capture.palette import joint_colors
-from undulog.replay.blueprint import build_blueprint
-from undulog.replay.results import computed
-from undulog.replay.rrd import write_recording
+from undulog.capture.common.palette import joint_colors
+from undulog.replay.layout.blueprint import build_blueprint
+from undulog.replay.record.results import computed
+from undulog.replay.record.rrd import write_recording
 
 pytestmark = pytest.mark.slow
 

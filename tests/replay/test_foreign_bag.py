@@ -10,8 +10,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import undulog
 from undulog.capture import Session
-from undulog.capture.errors import MissingChannelError
-from undulog.replay.plots.other_topics import is_foreign, log_others
+from undulog.capture.common.errors import MissingChannelError
+from undulog.replay.draw.plots.other_topics import is_foreign, log_others
 from undulog.replay.samples.renamed import RenamedSession
 
 EPOCH_NS = 1_700_000_000_000_000_000

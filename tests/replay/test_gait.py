@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from undulog.replay.plots.gait import changes, rhythm_of
+from undulog.replay.draw.plots.gait import changes, rhythm_of
+from undulog.replay.draw.scene.trail import trail_segments
 from undulog.replay.samples.tracks import Track
-from undulog.replay.scene.trail import trail_segments
 
 T = np.arange(500, dtype=np.int64) * 10_000_000
 

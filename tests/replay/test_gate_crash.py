@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.log.session_check import check_session
+from undulog.capture.log.health.session_check import check_session
 
 stage = runpy.run_path(str(Path(__file__).with_name("gate_stage.py")))
 staged, Written = stage["staged"], stage["Written"]

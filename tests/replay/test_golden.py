@@ -11,7 +11,7 @@ from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from scipy.spatial.transform import Rotation
 
-from undulog.replay.headless import HeadlessViewer
+from undulog.replay.viewer.headless import HeadlessViewer
 
 pytestmark = pytest.mark.slow
 

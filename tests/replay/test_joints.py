@@ -2,10 +2,15 @@
 
 import numpy as np
 
-from undulog.capture.palette import joint_colors
-from undulog.capture.robot import Plane
-from undulog.replay.plots.joints import head_middle_tail, joint_palette, tracking_errors
-from undulog.replay.plots.power import electrical_power, mechanical_power, total
+from undulog.capture.common.palette import joint_colors
+from undulog.capture.robot.model import Plane
+from undulog.replay.draw.plots.joints import head_middle_tail, joint_palette
+from undulog.replay.samples.quantities import (
+    electrical_power,
+    mechanical_power,
+    total,
+    tracking_errors,
+)
 from undulog.replay.samples.tracks import Track
 
 T = np.arange(200, dtype=np.int64) * 10_000_000

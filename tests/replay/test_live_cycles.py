@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from undulog.analysis.analyse import analyse_session
+from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session, SessionWriter
-from undulog.capture.daemon.live_wire import LiveMessage
-from undulog.capture.robot import Plane
+from undulog.capture.recorder.live_wire import LiveMessage
+from undulog.capture.robot.model import Plane
 from undulog.replay.live.cycles import CycleMeter
 from undulog.replay.live.decode import LiveLog
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.replay.rrd import write_recording
+from undulog.replay.record.rrd import write_recording
 
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
 EPOCH_NS = shared["EPOCH_NS"]
@@ -36,7 +36,7 @@ def live(session_file, tmp_path_factory, read_back):
 @pytest.fixture(scope="module")
 def replay(session_file, tmp_path_factory, read_back):
     """The same session as a replay."""
-    path = tmp_path_factory.mktemp("replay") / "undulog.replay.rrd"
+    path = tmp_path_factory.mktemp("replay") / "undulog.replay.record.rrd"
     with Session.open(session_file) as session:
         write_recording(session, path)
     return read_back(path)

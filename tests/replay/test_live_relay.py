@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from undulog.capture import SessionWriter
-from undulog.capture.daemon import live_feed
-from undulog.capture.daemon.live_spawn import spawn_relay
-from undulog.capture.daemon.live_wire import DatagramHead, Kind, pack_datagram
-from undulog.capture.errors import UsageError
+from undulog.capture.common.errors import UsageError
+from undulog.capture.recorder import live_feed
+from undulog.capture.recorder.live_spawn import spawn_relay
+from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
 from undulog.replay.live.inbox import Inbox
 
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
@@ -235,7 +235,7 @@ def test_spawned_relay_says_why_it_ended(tmp_path):
 
 
 def test_frozen_relay_that_was_spawned_can_be_ended(stage, monkeypatch):
-    monkeypatch.setattr("undulog.capture.daemon.live_spawn._GRACE_S", 0.2)
+    monkeypatch.setattr("undulog.capture.recorder.live_spawn._GRACE_S", 0.2)
     relay = spawn_relay(stage.path, ["--connect", "rerun+http://127.0.0.1:9/proxy"])
     until(lambda: stage.path.is_socket() or relay.poll() is not None)
     freeze(relay.pid)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import undulog
-from undulog.replay.viewer import free_ports, viewer_binary
+from undulog.replay.viewer.viewer import free_ports, viewer_binary
 
 shared = runpy.run_path(str(Path(__file__).with_name("live_stage.py")))
 WAIT_S = shared["WAIT_S"]

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import undulog
-from undulog.analysis.analyse import measure_session
-from undulog.analysis.cycles import cycle_maps
-from undulog.analysis.results.analysis import Estimate
 from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.cycles import cycle_maps
 from undulog.capture import Session
-from undulog.replay.cycles.steps import cycle_tables
-from undulog.replay.results import computed
-from undulog.replay.rrd import write_recording
+from undulog.replay.draw.cycles.steps import cycle_tables
+from undulog.replay.record.results import computed
+from undulog.replay.record.rrd import write_recording
 from undulog.replay.samples.timeline import ENSEMBLE_CYCLE
 
 CHAIN = """name = "chain5"

@@ -5,9 +5,9 @@ import pytest
 import rerun.blueprint as rrb
 
 from undulog.capture import Session
-from undulog.capture.palette import joint_colors
-from undulog.replay.rrd import write_recording
-from undulog.replay.views import build_views
+from undulog.capture.common.palette import joint_colors
+from undulog.replay.layout.views import build_views
+from undulog.replay.record.rrd import write_recording
 
 pytestmark = pytest.mark.slow
 

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from undulog.analysis.results.analysis import Estimate
-from undulog.replay.plots.response import charts
+from undulog.analysis.results.estimate import Estimate
+from undulog.replay.draw.cycles.response import charts
 
 
 def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):

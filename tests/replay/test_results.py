@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.compare.result import Comparison, NamedJoint
-from undulog.analysis.null_model.result import ModelledAnalysis, ModuleDeviation, NullModelResult
-from undulog.analysis.results.analysis import Coupling, Estimate, Provenance
+from undulog.analysis.results.comparison import Comparison, NamedJoint
+from undulog.analysis.results.coupling import Coupling
+from undulog.analysis.results.estimate import Estimate, Provenance
 from undulog.analysis.results.experiment import (
     Experiment,
     FloorTilt,
@@ -17,10 +17,11 @@ from undulog.analysis.results.experiment import (
     Reversal,
     Run,
 )
+from undulog.analysis.results.null_model import ModelledAnalysis, ModuleDeviation, NullModelResult
 from undulog.capture import Session
-from undulog.capture.errors import DataError
+from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import link_poses
-from undulog.replay.results import saved
+from undulog.replay.record.results import saved
 
 PINK = 0xFF5FBEFF
 NO_COUPLING = Coupling(identifiable=False, why="one gait")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.errors import DataError, LogWriteError
-from undulog.capture.palette import joint_colors
-from undulog.replay.rrd import recording_id, write_recording
-from undulog.replay.scene.body import ROUNDING
+from undulog.capture.common.errors import DataError, LogWriteError
+from undulog.capture.common.palette import joint_colors
+from undulog.replay.draw.scene.body import ROUNDING
+from undulog.replay.record.rrd import recording_id, write_recording
 
 START = 1_735_689_600_000_000_000
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.errors import UndulogError
-from undulog.capture.interruption import StopRequest
-from undulog.replay.drawing import clock_of
-from undulog.replay.layer import Layer
-from undulog.replay.results import computed
-from undulog.replay.rrd import recording_id, write_recording
+from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.interruption import StopRequest
+from undulog.replay.content.layer import Layer
+from undulog.replay.draw.drawing import clock_of
+from undulog.replay.record.results import computed
+from undulog.replay.record.rrd import recording_id, write_recording
 from undulog.replay.stream.apart import Analysing
 from undulog.replay.stream.excerpt import Excerpt
 from undulog.replay.stream.foresight import foreseen, same_arrangement
 from undulog.replay.stream.show import NoLongerWantedError, Task, show_session
-from undulog.replay.viewer import Viewer
+from undulog.replay.viewer.viewer import Viewer
 
 TOPICS = ("/joint_commands", "/joint_states")
 NS = 1_000_000_000

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rerun.experimental import ViewerClient
 
-from undulog.replay.viewer import Viewer
+from undulog.replay.viewer.viewer import Viewer
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +24,7 @@ LONG_S = 4000
 HEADLESS = """
 import sys
 import undulog
-from undulog.replay import viewer
+from undulog.replay.viewer import viewer
 
 def without_window(*options):
     window = viewer.Viewer(["--headless", "--hide-welcome-screen", "--window-size=1440x900"])

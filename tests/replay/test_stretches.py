@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.robot import Plane
-from undulog.replay.rrd import write_recording
+from undulog.capture.robot.model import Plane
+from undulog.replay.record.rrd import write_recording
 from undulog.replay.samples import stretches
 from undulog.replay.samples.stretches import Span
 from undulog.replay.samples.survey import survey

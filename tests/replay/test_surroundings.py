@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, SessionWriter
-from undulog.replay.rrd import write_recording
+from undulog.replay.record.rrd import write_recording
 from undulog.sim import load_scenario
-from undulog.sim.world import Cylinder, Wall
+from undulog.sim.scenario.obstacles import Cylinder, Wall
 
 EPOCH_NS = 1_735_689_600_000_000_000
 

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from undulog.replay.samples.timeline import (
-    GAIT_CYCLE,
-    ROWS_PER_CHUNK,
-    SESSION_TIME,
-    Clock,
-    Rhythm,
-)
+from undulog.replay.samples.timeline import GAIT_CYCLE, ROWS_PER_CHUNK, SESSION_TIME, Clock, Rhythm
 
 MS = 1_000_000
 T = np.arange(400, dtype=np.int64) * 10 * MS

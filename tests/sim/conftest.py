@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.robot import ClockDomain, Joint, Link, Plane, Robot, Servo
+from undulog.capture.robot.model import ClockDomain, Joint, Link, Plane, Robot, Servo
 from undulog.sim import PlaneGait, Scenario, Serpentine, World
 
 

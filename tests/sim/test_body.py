@@ -8,14 +8,15 @@ import numpy as np
 import pybullet
 import pytest
 
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Link
+from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Link
 from undulog.sim.physics.bullet import BulletEngine
-from undulog.sim.physics.engine import EngineKind, Kernels, engine_type
+from undulog.sim.physics.engine import engine_type
 from undulog.sim.physics.steps import Steps
-from undulog.sim.twin import Twin
-from undulog.sim.urdf import frame_origins, urdf
+from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.twin.twin import Twin
+from undulog.sim.twin.urdf import frame_origins, urdf
 
 
 @pytest.fixture

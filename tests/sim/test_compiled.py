@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.robot import Link
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Link
 from undulog.sim import FrictionLaw, Ground, World, load_scenario
 from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
 from undulog.sim.physics.compiled_laws import CompiledLaws
-from undulog.sim.physics.engine import EngineKind, Kernels
 from undulog.sim.physics.laws import NumpyLaws
 from undulog.sim.physics.servo import Servos
 from undulog.sim.physics.steps import Steps
-from undulog.sim.recording import record
-from undulog.sim.twin import Twin
-from undulog.sim.world import Cylinder
+from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.scenario.obstacles import Cylinder
+from undulog.sim.twin.recording import record
+from undulog.sim.twin.twin import Twin
 
 START = {"gravity": (0.3, 0, -9.81), "height": 0.3, "heading": 0.7, "velocity": (0.2, 0.1, 0.0)}
 

@@ -6,17 +6,19 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.robot import Plane, Robot, Sensor, SensorKind
 from undulog.capture.robot.description import load_robot
+from undulog.capture.robot.model import Plane, Robot, Sensor, SensorKind
 from undulog.sim import PlaneGait, Readings, Serpentine
 from undulog.sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
 from undulog.sim.control.course import RandomCourse, StraightOn, TargetCourse
 from undulog.sim.control.distances import Distances
-from undulog.sim.control.layout import layout
 from undulog.sim.control.lookout import Lookout
 from undulog.sim.control.moment import Moment
 from undulog.sim.control.odometry import SlipOdometry
-from undulog.sim.control.parameters import (
+from undulog.sim.control.reckoning import Pose
+from undulog.sim.gait.build import generator
+from undulog.sim.gait.contract import WALK
+from undulog.sim.scenario.controllers import (
     Controller,
     ControllerKind,
     HeadSteering,
@@ -25,9 +27,8 @@ from undulog.sim.control.parameters import (
     TailHaste,
     TargetHeading,
 )
-from undulog.sim.control.parameters import Lookout as LookoutParameters
-from undulog.sim.control.reckoning import Pose
-from undulog.sim.gait import WALK, generator
+from undulog.sim.scenario.controllers import Lookout as LookoutParameters
+from undulog.sim.scenario.sensor_layout import layout
 
 SNAKE = load_robot("snake25")
 WAVE = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 0.5, math.pi / 6)}, ramp_s=0.0)

@@ -10,9 +10,9 @@ import pytest
 
 from undulog.capture import Session
 from undulog.sim import load_scenario
-from undulog.sim.recording import record
-from undulog.sim.twin import Twin
-from undulog.sim.world import Target
+from undulog.sim.scenario.obstacles import Target
+from undulog.sim.twin.recording import record
+from undulog.sim.twin.twin import Twin
 
 PERIOD = 200
 """Ticks of a gait period at 0.5 Hz."""

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.errors import ScenarioError
+from undulog.capture.common.errors import ScenarioError
 from undulog.sim import Readings, load_scenario, parse_scenario
 from undulog.sim.control.build import build_gait
-from undulog.sim.control.parameters import (
+from undulog.sim.scenario.controllers import (
     Calibration,
     Controller,
     ControllerKind,

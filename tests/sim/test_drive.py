@@ -14,14 +14,14 @@ from mcap.reader import make_reader
 
 import undulog as front
 from undulog.capture import Session
-from undulog.capture.errors import DataError
-from undulog.capture.log.writer import SessionWriter
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import DataError
+from undulog.capture.log.write.writer import SessionWriter
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from undulog.sim.drive.command_session import CommandReplay, RecordedCommands
 from undulog.sim.drive.fading import FadingGait
-from undulog.sim.gait import GaitTick
-from undulog.sim.scenario_file import load_scenario, parse_scenario, scenario_names
+from undulog.sim.gait.contract import GaitTick
+from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 
 T0_NS = 10**18
 COLUMNS = (

@@ -15,10 +15,11 @@ import pytest
 import undulog as front
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.errors import LogWriteError, SourceError, UsageError
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import DIR_TX
-from undulog.capture.robot import Direction, OnFault, Quantity
+from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.messages.frames import DIR_TX
+from undulog.capture.robot.model import Direction, Quantity
+from undulog.capture.robot.safety import OnFault
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim import load_scenario
@@ -35,7 +36,7 @@ from undulog.sim.serve.bus import VirtualBus
 from undulog.sim.serve.pacing import Pacer
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
 from undulog.sim.serve.socketcand_server import SocketcandServer
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 STEP = np.radians(0.01)  # of a command on the bus of snake25
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.capture.errors import PlanError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import PlanError
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, load_scenario
 from undulog.sim.drive.plan import Plan, PlanGait, Segment
 from undulog.sim.drive.plan_file import is_plan, parse_plan

@@ -11,8 +11,8 @@ import pytest
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.bus.polling import poll_frames
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import DIR_RX, DIR_TX
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.capture.robot.description import load_robot
 from undulog.sim.drive.driven import find_driven
 from undulog.sim.drive.over_bus import bus_plan, drive_bus

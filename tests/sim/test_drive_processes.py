@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.log.frames import DIR_TX
+from undulog.capture.log.messages.frames import DIR_TX
 
 pytestmark = pytest.mark.slow
 

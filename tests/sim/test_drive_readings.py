@@ -7,8 +7,8 @@ import pytest
 
 from undulog.capture import load_robot
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.log.frames import DIR_TX, empty_frames
-from undulog.capture.robot import Direction, Quantity
+from undulog.capture.log.messages.frames import DIR_TX, empty_frames
+from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.drive.readings_from_bus import BusReadings
 
 

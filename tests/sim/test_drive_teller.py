@@ -7,10 +7,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from undulog.capture.daemon.control import ControlServer
-from undulog.capture.errors import ControlError
+from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder.control import ControlServer
 from undulog.sim.drive.gait_teller import GaitTeller
-from undulog.sim.gait import GaitTick
+from undulog.sim.gait.contract import GaitTick
 
 NAMES = tuple(f"horizontal.{key}" for key in ("A", "omega", "lag", "offset", "phase"))
 

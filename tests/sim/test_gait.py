@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
 from undulog.sim.gait.limits import smoothstep, within_limits
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from undulog.sim.gait import DelayBlockGait, DelayBlocks, DelayLine, Modulation
-from undulog.sim.gait.delay_blocks import DelayedPhase
+from undulog.sim.gait.contract import Modulation
+from undulog.sim.gait.delay_blocks import DelayBlockGait, DelayBlocks, DelayedPhase, DelayLine
 
 NOTHING = Readings(np.empty(0), np.empty(0))
 YAW = slice(0, 25, 2)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import Readings, load_scenario
-from undulog.sim.gait import generator
-from undulog.sim.recording import record
-from undulog.sim.twin import Twin
+from undulog.sim.gait.build import generator
+from undulog.sim.twin.recording import record
+from undulog.sim.twin.twin import Twin
 
 CYCLE = 200  # ticks
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from undulog.sim.gait import (
-    Modulation,
+from undulog.sim.gait.approach import Approach
+from undulog.sim.gait.contract import Modulation
+from undulog.sim.gait.oscillators import (
     OscillatorChain,
     OscillatorChains,
     OscillatorGait,
     OscillatorKind,
 )
-from undulog.sim.gait.approach import Approach
 
 OMEGA = math.pi
 PSI = math.pi / 6

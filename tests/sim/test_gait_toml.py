@@ -9,19 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undulog.capture import load_robot
-from undulog.capture.errors import ScenarioError
-from undulog.capture.robot import Plane
-from undulog.capture.strict_table import Faults, Table
+from undulog.capture.common.errors import ScenarioError
+from undulog.capture.common.strict_table import Faults, Table
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, Wave, parse_scenario
-from undulog.sim.gait import (
-    DelayBlocks,
-    DelayLine,
-    OscillatorChain,
-    OscillatorChains,
-    OscillatorKind,
-    generator,
-)
-from undulog.sim.gait.toml import gait_table, read_gait
+from undulog.sim.gait.build import generator
+from undulog.sim.gait.delay_blocks import DelayBlocks, DelayLine
+from undulog.sim.gait.oscillators import OscillatorChain, OscillatorChains, OscillatorKind
+from undulog.sim.scenario.gaits_toml import gait_table, read_gait
 
 ROBOT = load_robot("snake13")  # 6 joints in each plane
 

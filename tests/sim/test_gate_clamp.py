@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from undulog.capture import load_robot
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import OnFault
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.safety import OnFault
 from undulog.sim.drive.loop import CommandEncoder
 from undulog.sim.gate.clamp import Clamp
 from undulog.sim.gate.ending import Ending

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from undulog.capture import load_robot
-from undulog.capture.errors import SourceError, UsageError
-from undulog.capture.log.frames import DIR_TX, ERROR_FLAG, empty_frames
-from undulog.capture.robot import OnFault
+from undulog.capture.common.errors import SourceError, UsageError
+from undulog.capture.log.messages.frames import DIR_TX, ERROR_FLAG, empty_frames
+from undulog.capture.robot.safety import OnFault
 from undulog.capture.sources.bus_watch import BUS_OFF
-from undulog.sim.gait import GaitTick
+from undulog.sim.gait.contract import GaitTick
+from undulog.sim.gait.readings import Readings
 from undulog.sim.gate.faults import FaultKind, GateFault
 from undulog.sim.gate.gate import HOLD_S, POSE_S, Gate
 from undulog.sim.gate.lateness import jitter
@@ -19,7 +20,6 @@ from undulog.sim.gate.outcome import How
 from undulog.sim.gate.presence import Presence
 from undulog.sim.gate.status import JointStatus
 from undulog.sim.gate.tick import Heard, Phase
-from undulog.sim.readings import Readings
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from undulog.capture import load_robot
-from undulog.capture.errors import SourceError, UsageError
-from undulog.capture.robot import OnFault
+from undulog.capture.common.errors import SourceError, UsageError
+from undulog.capture.robot.safety import OnFault
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gait import GaitTick
+from undulog.sim.gait.contract import GaitTick
+from undulog.sim.gait.readings import Readings
 from undulog.sim.gate.faults import FaultKind, GateFault
 from undulog.sim.gate.gate import Gate
 from undulog.sim.gate.limits import gate_limits
 from undulog.sim.gate.status import JointStatus
 from undulog.sim.gate.tick import Heard, Phase
-from undulog.sim.readings import Readings
 
 ROBOT = load_robot("snake25")
 COUNT, RATE_HZ = len(ROBOT.joints), 100

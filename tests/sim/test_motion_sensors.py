@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from undulog.capture.robot import Sensor, SensorKind
+from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim.physics.steps import Steps
+from undulog.sim.scenario.sensors import AccelerometerModel, CompassModel
 from undulog.sim.sensing.accelerometer import Accelerometer
 from undulog.sim.sensing.compass import Compass
-from undulog.sim.sensing.model import AccelerometerModel, CompassModel
 from undulog.sim.sensing.mount import rotation_from_rpy
 
 DT, PERIOD, G = 1e-3, 10, 9.81

@@ -9,13 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from undulog.capture.errors import SimulationError, UsageError
-from undulog.capture.robot import Link, Plane
+from undulog.capture.common.errors import SimulationError, UsageError
+from undulog.capture.robot.model import Link, Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
-from undulog.sim.physics.engine import EngineKind, engine_type
+from undulog.sim.physics.engine import engine_type
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin import Twin
-from undulog.sim.world.obstacles import Box, Cylinder
+from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.obstacles import Box, Cylinder
+from undulog.sim.twin.twin import Twin
 
 pytest.importorskip("mujoco")
 
@@ -128,8 +129,8 @@ def test_two_processes_find_the_same_bits(tmp_path):
     code = """
 import dataclasses, hashlib
 from undulog.sim import load_scenario
-from undulog.sim.physics.engine import EngineKind
-from undulog.sim.twin import Twin
+from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.twin.twin import Twin
 scenario = load_scenario("flat").changed(duration_s=0.5)
 with Twin(dataclasses.replace(scenario, engine=EngineKind.MUJOCO)) as twin:
     rows = [b"".join(part.tobytes() for part in s.step.body) for s in twin.samples()]

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from undulog.sim.world.obstacle_contact import obstacle_law
-from undulog.sim.world.obstacles import Box, Cylinder, ObstacleMaterial, Wall
+from undulog.sim.physics.obstacle_contact import obstacle_law
+from undulog.sim.scenario.obstacles import Box, Cylinder, ObstacleMaterial, Wall
 
 LENGTH, RADIUS, MASS, INERTIA = 0.06, 0.025, 0.1, 5e-5
 STUFF = ObstacleMaterial(stiffness=5000.0, damping=20.0, mu=0.3, slip_speed=0.01)

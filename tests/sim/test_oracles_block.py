@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from undulog.sim import FrictionLaw, Ground, World
-from undulog.sim.physics.engine import EngineKind
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin import Twin
-from undulog.sim.world.model import tilted_gravity
+from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.world import tilted_gravity
+from undulog.sim.twin.twin import Twin
 
 G, MASS, RADIUS = 9.81, 0.1, 0.025
 STIFFNESS, SLIP_SPEED = Ground.stiffness, Ground.slip_speed

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from undulog.capture.robot import Link, Plane
+from undulog.capture.robot.model import Link, Plane
 from undulog.sim import PlaneGait, Serpentine, World, load_scenario
 from undulog.sim.physics.energy_flows import JOINT_TERMS
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 MASS, LENGTH, INERTIA = 0.5, 0.2, 2e-3
 COMMAND, SECONDS = 1.0, 0.6

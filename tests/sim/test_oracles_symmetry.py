@@ -10,9 +10,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import load_scenario
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 pytestmark = pytest.mark.slow
 

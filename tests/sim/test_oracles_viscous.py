@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from undulog.capture.robot import ClockDomain, Joint, Link, Plane, Robot, Servo
+from undulog.capture.robot.model import ClockDomain, Joint, Link, Plane, Robot, Servo
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Scenario, Serpentine, World
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 ANISOTROPY = 10.0  # K = c_n / c_t
 LENGTH, MASS = 0.06, 0.1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from undulog.sim.physics.steps import Steps
-from undulog.sim.sensing.model import Noise, ServoPolling
+from undulog.sim.scenario.sensors import Noise, ServoPolling
 from undulog.sim.sensing.polling import JointPolling
 
 DT, N, JOINTS = 1e-3, 10, 4

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from undulog.sim import World, parse_scenario
-from undulog.sim.physics.engine import EngineKind
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin import Twin
-from undulog.sim.world import Push
+from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.push import Push
+from undulog.sim.twin.twin import Twin
 
 FREE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 TEXT = """

@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.robot import Sensor, SensorKind
+from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim.physics.steps import Steps
+from undulog.sim.scenario.obstacles import Cylinder, Wall
+from undulog.sim.scenario.sensors import InfraredModel, SonarModel
 from undulog.sim.sensing.ir import Infrared, decoded, voltage
-from undulog.sim.sensing.model import InfraredModel, SonarModel
+from undulog.sim.sensing.rays import RayCaster
 from undulog.sim.sensing.sonar import Sonar, cone
-from undulog.sim.world import Cylinder, Wall
-from undulog.sim.world.rays import RayCaster
 
 DT, PERIOD = 1e-3, 10
 EXACT = InfraredModel(noise_v=0.0, adc_bits=24)

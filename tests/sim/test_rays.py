@@ -6,8 +6,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from undulog.sim.world.obstacles import Box, Cylinder, Wall
-from undulog.sim.world.rays import RayCaster
+from undulog.sim.scenario.obstacles import Box, Cylinder, Wall
+from undulog.sim.sensing.rays import RayCaster
 
 INF = math.inf
 

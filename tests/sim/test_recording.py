@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.errors import OutputExistsError
-from undulog.capture.interruption import StopRequest
+from undulog.capture.common.errors import OutputExistsError
+from undulog.capture.common.interruption import StopRequest
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim import (
     Ground,
@@ -28,10 +28,10 @@ from undulog.sim import (
 )
 from undulog.sim.physics.energy_flows import JOINT_TERMS
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.recording import record
 from undulog.sim.sensing.contract import JointSample
-from undulog.sim.twin import Twin
-from undulog.sim.urdf import urdf
+from undulog.sim.twin.recording import record
+from undulog.sim.twin.twin import Twin
+from undulog.sim.twin.urdf import urdf
 
 HUNDREDTH_NS = 10_000_000
 UNDULOG = (sys.executable, "-m", "undulog")

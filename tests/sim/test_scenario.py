@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from undulog.capture.errors import RobotFileError, ScenarioError, UsageError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import RobotFileError, ScenarioError, UsageError
+from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Wave, load_scenario, parse_scenario, scenario_names
 
 MINIMAL = """

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session
-from undulog.capture.errors import ScenarioError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import ScenarioError
+from undulog.capture.robot.model import Plane
 from undulog.sim import (
     Cylinder,
     Readings,
@@ -21,9 +21,9 @@ from undulog.sim import (
     load_scenario,
     parse_scenario,
 )
-from undulog.sim.recording import record
 from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
-from undulog.sim.twin import Twin
+from undulog.sim.twin.recording import record
+from undulog.sim.twin.twin import Twin
 
 SCENARIO = """
 description = "a test"

@@ -9,10 +9,10 @@ import pytest
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.errors import DataError
-from undulog.capture.log.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, empty_frames
-from undulog.capture.robot import Direction, Quantity
+from undulog.capture.common.errors import DataError
+from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, empty_frames
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
 from undulog.sim.serve.commands import CommandLatch
 from undulog.sim.serve.encode import ReplyEncoder

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from undulog.capture import Session, load_robot
-from undulog.capture.errors import ScenarioError, UsageError
+from undulog.capture.common.errors import ScenarioError, UsageError
 from undulog.sim import load_scenario, parse_scenario
-from undulog.sim.recording import record
-from undulog.sim.serve.faults import BusFault, FaultKind, parse_faults
+from undulog.sim.scenario.bus_faults import BusFault, FaultKind, parse_faults
+from undulog.sim.twin.recording import record
 
 ROBOT = load_robot("snake25")
 BASE = """

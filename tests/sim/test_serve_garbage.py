@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.log.frames import empty_frames
+from undulog.capture.log.messages.frames import empty_frames
 from undulog.sim.serve.socketcand_server import SocketcandServer
 from undulog.sim.serve.socketcand_text import ClientText
 

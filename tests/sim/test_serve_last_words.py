@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from undulog.capture.log.frames import empty_frames
+from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.link import find_virtual_robot

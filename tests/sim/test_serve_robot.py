@@ -12,22 +12,22 @@ import pytest
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.interruption import StopRequest
-from undulog.capture.log.frames import ERROR_FLAG, empty_frames
-from undulog.capture.robot import Direction, Quantity
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.description import parse_robot
-from undulog.sim.gait import GaitTick
-from undulog.sim.scenario import CONTROL_RATE_HZ
-from undulog.sim.sensing import Noise, SensorModels, ServoPolling
+from undulog.capture.robot.model import Direction, Quantity
+from undulog.sim.gait.contract import GaitTick
+from undulog.sim.scenario.bus_faults import parse_faults
+from undulog.sim.scenario.scenario import CONTROL_RATE_HZ
+from undulog.sim.scenario.sensors import Noise, SensorModels, ServoPolling
 from undulog.sim.sensing.contract import JointSample
 from undulog.sim.serve.bus import VirtualBus
 from undulog.sim.serve.encode import ReplyEncoder
 from undulog.sim.serve.fault_line import FaultLine
-from undulog.sim.serve.faults import parse_faults
 from undulog.sim.serve.pacing import PATIENCE_NS, Pacer
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
 from undulog.sim.serve.socketcand_server import SocketcandServer
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 JOINTS = 4
 STEP = math.radians(0.01)

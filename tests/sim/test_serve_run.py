@@ -19,13 +19,13 @@ import pytest
 
 import undulog as front
 from undulog.capture import Session, load_robot
-from undulog.capture.log.session_check import check_session
+from undulog.capture.log.health.session_check import check_session
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.driven import find_driven
 from undulog.sim.drive.link import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.readings import Readings
+from undulog.sim.gait.readings import Readings
 
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]

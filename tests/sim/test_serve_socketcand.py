@@ -16,8 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from undulog.capture import SessionWriter
-from undulog.capture.errors import UsageError
-from undulog.capture.log.frames import DIR_TX, ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, empty_frames
+from undulog.capture.common.errors import UsageError
+from undulog.capture.log.messages.frames import (
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    REMOTE_FLAG,
+    empty_frames,
+)
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceContext
 from undulog.capture.sources.events import Tally

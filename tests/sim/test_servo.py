@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.robot import Servo
+from undulog.capture.robot.model import Servo
 from undulog.sim.physics.servo import Rotors, Servos
 
 

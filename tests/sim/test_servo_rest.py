@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.errors import ScenarioError
-from undulog.capture.robot import Plane, Servo
+from undulog.capture.common.errors import ScenarioError
+from undulog.capture.robot.model import Plane, Servo
 from undulog.sim import PlaneGait, Serpentine, World
-from undulog.sim.physics.engine import EngineKind, Kernels
 from undulog.sim.physics.ledger import TERMS
 from undulog.sim.physics.servo import Rotors, Servos
-from undulog.sim.scenario_file import load_scenario, parse_scenario
-from undulog.sim.stability import stability
-from undulog.sim.twin import Twin
+from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario
+from undulog.sim.twin.stability import stability
+from undulog.sim.twin.twin import Twin
 
 DT = 1e-3
 

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.capture.errors import SimulationError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import SimulationError
+from undulog.capture.robot.model import Plane
 from undulog.sim import (
     FrictionLaw,
     Ground,
@@ -16,9 +16,9 @@ from undulog.sim import (
     load_scenario,
     scenario_names,
 )
-from undulog.sim.stability import likely_cause, stability, warnings
-from undulog.sim.twin import Twin
-from undulog.sim.world import Cylinder, ObstacleMaterial
+from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial
+from undulog.sim.twin.stability import likely_cause, stability, warnings
+from undulog.sim.twin.twin import Twin
 
 IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.errors import SimulationError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import SimulationError
+from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, Wave, World
 from undulog.sim.physics.ledger import TERMS
 from undulog.sim.sensing.contract import JointSample
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 G = 9.81
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Serpentine, World
-from undulog.sim.physics.engine import EngineKind
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin import Twin
-from undulog.sim.world import Cylinder, ObstacleMaterial, Wall
+from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial, Wall
+from undulog.sim.twin.twin import Twin
 
 MASS, V = 0.3, 0.4  # of three links; the speed at which they come
 WALL = Wall((0.1, -1.0), (0.1, 1.0))  # its face 0.9 - 0.03 - 0.025 m before the head's front

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.errors import ScenarioError, UsageError
+from undulog.capture.common.errors import ScenarioError, UsageError
 from undulog.sim import (
     Box,
     Cylinder,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from undulog.capture.following import JointMotion, joints_not_following
-from undulog.capture.following.motion import Samples
+from undulog.capture.following.find import joints_not_following
+from undulog.capture.following.motion import JointMotion, Samples
 
 from .outputs import Named, Statement
 from .robot import Log

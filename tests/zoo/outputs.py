@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
-from undulog.analysis.analyse import analyse_session
 from undulog.analysis.compare.compare import Choices, compare_sessions
-from undulog.analysis.report import render
+from undulog.analysis.present.page.page import render
 from undulog.analysis.results.answer import Answer
-from undulog.analysis.stretch import Options
+from undulog.analysis.session.analyse import analyse_session
+from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
-from undulog.capture.errors import UndulogError
-from undulog.capture.log.session_check import check_session
-from undulog.replay.content import Content
-from undulog.replay.facts import markdown
+from undulog.capture.common.errors import UndulogError
+from undulog.capture.log.health.session_check import check_session
+from undulog.replay.content.content import Content
+from undulog.replay.draw.facts import markdown
 
 from .robot import SECOND_TOPIC
 

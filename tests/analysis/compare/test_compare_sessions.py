@@ -10,7 +10,7 @@ import pytest
 import undulog
 from undulog.analysis import Choices, Options, compare_sessions
 from undulog.capture import Session
-from undulog.capture.errors import DataError
+from undulog.capture.common.errors import DataError
 
 SIGMA = 0.003
 

@@ -6,7 +6,7 @@ from scipy import stats
 
 from undulog.analysis.compare.decisions import Margins, decide, differ
 from undulog.analysis.compare.differences import Quantities, from_runs, holm, independent, paired
-from undulog.capture.errors import UsageError
+from undulog.capture.common.errors import UsageError
 
 SEEDS = 600
 JOINTS = 13

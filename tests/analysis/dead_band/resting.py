@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from undulog.analysis.dead_band import dead_bands
+from undulog.analysis.dead_band.find import dead_bands
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.fitting import fit_gait
-from undulog.analysis.reading import Columns
-from undulog.capture.log.signals import Signal
+from undulog.analysis.response.fitting import fit_gait
+from undulog.analysis.signals.reading import Columns
+from undulog.capture.log.read.signals import Signal
 
 STEP = 2 * np.pi / 4096
 FINE = 20

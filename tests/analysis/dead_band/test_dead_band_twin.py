@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from undulog.capture import load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Scenario, Serpentine, World
-from undulog.sim.twin import Twin
+from undulog.sim.twin.twin import Twin
 
 shared = runpy.run_path(str(Path(__file__).with_name("resting.py")))
 found_in, STEP = shared["found_in"], shared["STEP"]

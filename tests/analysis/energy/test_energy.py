@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 
 from undulog.analysis.energy.joint import add_up, integrate, power_of
-from undulog.analysis.estimators.series import (
-    Series,
-    clean,
-    coverage,
-    sample_weights,
-)
-from undulog.capture.log.signals import Signal
+from undulog.analysis.estimators.series import Series, clean, coverage, sample_weights
+from undulog.capture.log.read.signals import Signal
 
 SECOND = 10**9
 

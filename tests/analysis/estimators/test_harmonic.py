@@ -5,11 +5,13 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.signal import lfilter
 
-from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at, fit_shared
+from undulog.analysis.estimators.harmonic import fit_at, fit_shared
+from undulog.analysis.estimators.harmonic_moments import HarmonicModel
+from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series, clean
 from undulog.analysis.estimators.spectrum import Noise, omega_variance, residual_noise
-from undulog.analysis.response import gain_estimate, lag_estimate, respond, t_factor
-from undulog.capture.errors import DataError
+from undulog.analysis.response.response import gain_estimate, lag_estimate, respond
+from undulog.capture.common.errors import DataError
 
 
 def coloured(rng, count, correlation):

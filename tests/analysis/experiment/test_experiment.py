@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.experiment.runs import mirror_fault
-from undulog.analysis.experiment.table import render_experiment
+from undulog.analysis.present.text.experiment import render_experiment
+from undulog.analysis.session.runs import mirror_fault
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.errors import UsageError
-from undulog.capture.robot import Plane
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Plane
 
 experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 

@@ -9,7 +9,7 @@ import pytest
 
 import undulog
 from undulog.sim import load_scenario
-from undulog.sim.recording import record
+from undulog.sim.twin.recording import record
 
 pytestmark = pytest.mark.slow
 

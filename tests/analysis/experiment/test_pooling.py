@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from undulog.analysis.experiment.pooling import pool_runs
-from undulog.analysis.response import Response, gain_estimate, lag_estimate
-from undulog.capture.errors import UsageError
+from undulog.analysis.response.response import Response, gain_estimate, lag_estimate
+from undulog.capture.common.errors import UsageError
 
 LN_H = np.array([0.0, -0.1 - 0.2j, 0.05 - 3.1j, -0.3 + 0.1j])
 

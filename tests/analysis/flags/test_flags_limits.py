@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.analysis.reading import read_columns
+from undulog.analysis.signals.reading import read_columns
 from undulog.capture import Session
 from undulog.sim import load_scenario
-from undulog.sim.recording import record
+from undulog.sim.twin.recording import record
 
 here = Path(__file__).parent
 planted = runpy.run_path(str(here / "planted.py"))

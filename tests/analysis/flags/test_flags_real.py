@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.analysis.analyse import analyse_session
-from undulog.analysis.stretch import Options
+from undulog.analysis.session.analyse import analyse_session
+from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionWriter
 
 ARCSNAKE = Path(__file__).parents[3].parent / "shared" / "data" / "arcsnake"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.experiment.table import render_experiment
+from undulog.analysis.present.text.experiment import render_experiment
 from undulog.analysis.results.coupling import LocalCoupling
 from undulog.capture import SessionWriter
 

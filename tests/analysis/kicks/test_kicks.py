@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.kicks.local import (
+from undulog.analysis.experiment.kicks.local import (
     Answers,
     Measured,
     answers_of,
@@ -11,8 +11,8 @@ from undulog.analysis.kicks.local import (
     nonlinearity,
     row_sums,
 )
-from undulog.analysis.kicks.lti_reading import lti_reading
-from undulog.analysis.kicks.runs import (
+from undulog.analysis.experiment.kicks.lti_reading import lti_reading
+from undulog.analysis.experiment.kicks.runs import (
     Kick,
     Kind,
     deviation_of,
@@ -20,8 +20,8 @@ from undulog.analysis.kicks.runs import (
     missing_kicks,
     sort_kicks,
 )
-from undulog.analysis.kicks.validity import predict, valid_to
-from undulog.capture.errors import UsageError
+from undulog.analysis.experiment.kicks.validity import predict, valid_to
+from undulog.capture.common.errors import UsageError
 
 NAMES = ("head", "neck", "waist", "hip", "tail")
 M = len(NAMES)

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.analysis.kicks.answer import kick_answer
-from undulog.analysis.kicks.coupling import kick_coupling
-from undulog.analysis.kicks.experiment import KickExperiment
-from undulog.analysis.kicks.local import Answers
-from undulog.analysis.kicks.matrices import local_matrices
-from undulog.analysis.kicks.runs import Kick, Kind, sort_kicks
-from undulog.analysis.kicks.scatter import run_errors
+from undulog.analysis.experiment.kick_answer import kick_answer
+from undulog.analysis.experiment.kicks.coupling import kick_coupling
+from undulog.analysis.experiment.kicks.experiment import KickExperiment
+from undulog.analysis.experiment.kicks.local import Answers
+from undulog.analysis.experiment.kicks.matrices import local_matrices
+from undulog.analysis.experiment.kicks.runs import Kick, Kind, sort_kicks
+from undulog.analysis.experiment.kicks.scatter import run_errors
 
 tables = runpy.run_path(str(Path(__file__).parents[3] / "docs" / "kick_tables.py"))
 

@@ -9,17 +9,12 @@ import pandas as pd
 import pytest
 
 from undulog.analysis import Choices, Experiment, compare_sessions, load
-from undulog.analysis.oscillators.result import ChainCoupling, Link, Rate
-from undulog.analysis.results.analysis import Estimate
 from undulog.analysis.results.artefact import Artefact
-from undulog.analysis.results.sweep import (
-    ComplexMatrix,
-    LinearCoupling,
-    Route,
-    ToneCoupling,
-)
+from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
+from undulog.analysis.results.sweep import ComplexMatrix, LinearCoupling, Route, ToneCoupling
 from undulog.capture import Session
-from undulog.capture.errors import DataError, InputFileError, OutputExistsError, UsageError
+from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from undulog.analysis.null_model.deviation import null_test
-from undulog.analysis.response import Response
-from undulog.capture.errors import DataError
-from undulog.capture.null_model import NullModel, SharedParameter
+from undulog.analysis.experiment.null_model.deviation import null_test
+from undulog.analysis.response.response import Response
+from undulog.capture.common.errors import DataError
+from undulog.capture.robot.null_model import NullModel, SharedParameter
 
 JOINTS = 7
 NOISE = 0.002

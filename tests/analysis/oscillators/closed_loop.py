@@ -17,8 +17,8 @@ from undulog.analysis.oscillators.phase_log import read_phases
 from undulog.analysis.results.experiment import Experiment
 from undulog.capture import Session
 from undulog.sim import GaitTick, load_scenario
-from undulog.sim.physics.engine import Kernels
-from undulog.sim.recording import Driver, record
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.twin.recording import Driver, record
 
 shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 together = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]

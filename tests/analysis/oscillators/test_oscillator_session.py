@@ -9,9 +9,9 @@ import pytest
 
 import undulog
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import Readings
-from undulog.sim.gait import OscillatorChain, OscillatorChains, OscillatorGait
+from undulog.sim.gait.oscillators import OscillatorChain, OscillatorChains, OscillatorGait
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake13")

@@ -12,12 +12,12 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import undulog
-from undulog.analysis.kicks.coupling import kick_coupling
+from undulog.analysis.experiment.kicks.coupling import kick_coupling
+from undulog.analysis.experiment.kicks.prediction import closed_loop
 from undulog.analysis.oscillators.comparator import path_laplacian
 from undulog.analysis.oscillators.laplacian import of_deviations
-from undulog.analysis.oscillators.prediction import closed_loop
 from undulog.analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of
-from undulog.capture.errors import DataError, UsageError
+from undulog.capture.common.errors import DataError, UsageError
 
 HERE = Path(__file__).parent
 tables = runpy.run_path(str(HERE.parents[2] / "docs" / "kick_tables.py"))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.kicks.runs import Kind, missing_kicks, sort_kicks
+from undulog.analysis.experiment.kicks.runs import Kind, missing_kicks, sort_kicks
 from undulog.analysis.plan.designs import reversal
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]

@@ -10,7 +10,7 @@ import undulog
 from undulog.analysis.plan.body_modes import slowest_mode, transverse_mass
 from undulog.analysis.plan.sweep_designs import tones
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]

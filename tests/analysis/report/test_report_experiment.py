@@ -8,14 +8,15 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from undulog.analysis.report import render, typeset
-from undulog.analysis.report.artefacts import artefact_rows, told_times
-from undulog.analysis.report.entries import Entries, entries_of
-from undulog.analysis.report.matrix import matrix_picture
-from undulog.analysis.report.mirror import profiles
-from undulog.analysis.report.trials import experiment_trials, session_trials
+from undulog.analysis.present.page import typeset
+from undulog.analysis.present.page.artefacts import artefact_rows, told_times
+from undulog.analysis.present.page.entries import Entries, entries_of
+from undulog.analysis.present.page.matrix import matrix_picture
+from undulog.analysis.present.page.mirror import profiles
+from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page.trials import experiment_trials, session_trials
 from undulog.analysis.results.artefact import Artefact
-from undulog.analysis.text.formats import sentence
+from undulog.analysis.results.formats import sentence
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +135,7 @@ def test_what_was_not_recorded_is_named(both_ways):
 
 def test_a_page_that_grows_too_large_goes_without_every_run(both_ways, pages, monkeypatch):
     monkeypatch.setattr(
-        "undulog.analysis.report.page.LARGEST_BYTES", len(pages["both_ways"].encode()) - 1
+        "undulog.analysis.present.page.page.LARGEST_BYTES", len(pages["both_ways"].encode()) - 1
     )
     assert "Gain and lag of every run are left out" in render(both_ways)
 

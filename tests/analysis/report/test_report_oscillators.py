@@ -7,10 +7,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from undulog.analysis.oscillators.result import ChainCoupling, Link, Rate
-from undulog.analysis.report import render
-from undulog.analysis.report.oscillators import chain_views, entrainment_entries
-from undulog.analysis.results.analysis import Estimate
+from undulog.analysis.present.page.oscillators import chain_views, entrainment_entries
+from undulog.analysis.present.page.page import render
+from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
 LINKS = (
     Link("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6))),

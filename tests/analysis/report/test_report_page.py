@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import pytest
 
-from undulog.analysis.report import render
-from undulog.analysis.results.analysis import Coupling, Estimate
+from undulog.analysis.present.page.page import render
+from undulog.analysis.results.coupling import Coupling
+from undulog.analysis.results.estimate import Estimate
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 NAMES = ["snake", "still", "single", "hostile"]

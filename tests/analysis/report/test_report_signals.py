@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.analysis.report import render, signals
+from undulog.analysis.present.page import signals
+from undulog.analysis.present.page.page import render
 from undulog.capture import Session, SessionWriter
-from undulog.capture.errors import UsageError
+from undulog.capture.common.errors import UsageError
 
 RATE_HZ = 100
 EPOCH_NS = 1_767_225_600_000_000_000
@@ -54,11 +55,13 @@ def test_the_figure_is_on_the_page(snake, recorded):
 def test_a_page_that_grows_too_large_goes_without_signals_and_says_so(snake, recorded, monkeypatch):
     with Session.open(recorded) as session:
         full = render(snake, session)
-        monkeypatch.setattr("undulog.analysis.report.page.LARGEST_BYTES", len(full.encode()) - 1)
+        monkeypatch.setattr(
+            "undulog.analysis.present.page.page.LARGEST_BYTES", len(full.encode()) - 1
+        )
         lean = render(snake, session)
         assert "the cycles one by one, are not drawn" in lean
         assert "the cycles one by one, are not drawn" not in full
-        monkeypatch.setattr("undulog.analysis.report.page.LARGEST_BYTES", 1000)
+        monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", 1000)
         with pytest.raises(UsageError, match=r"page on one session would be 0\.157 MB"):
             render(snake, session)
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, nct, ttest_ind
 from scipy.stats import t as t_distribution
 
-from undulog.analysis.reversal.mirror import Strata, mirror_test
-from undulog.analysis.reversal.modules import ordered_pairs, reversal_of
-from undulog.analysis.reversal.shares import variance_shares
-from undulog.capture.errors import UsageError
+from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
+from undulog.analysis.experiment.reversal.modules import ordered_pairs, reversal_of
+from undulog.analysis.experiment.reversal.shares import variance_shares
+from undulog.capture.common.errors import UsageError
 
 DOCS = Path(__file__).parents[3] / "docs"
 TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "heterogeneity_tables.py")))

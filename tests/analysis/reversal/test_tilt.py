@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from undulog.analysis.reversal.mirror import Strata, mirror_test
-from undulog.analysis.reversal.modules import ordered_pairs, reversal_of
-from undulog.analysis.reversal.tilt import common_ratio, floor_lean, heading_strata, tilt_check
-from undulog.capture.errors import UsageError
+from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
+from undulog.analysis.experiment.reversal.modules import ordered_pairs, reversal_of
+from undulog.analysis.experiment.reversal.tilt import (
+    common_ratio,
+    floor_lean,
+    heading_strata,
+    tilt_check,
+)
+from undulog.capture.common.errors import UsageError
 
 M = 7
 PLACE = np.linspace(0.0, 1.0, M)

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.sweep.chain import (
+from undulog.analysis.experiment.sweep.chain import (
     Phasors,
     impedance,
     impedance_behind_servos,
     servo_side,
     transfer,
 )
-from undulog.analysis.sweep.runs import CommandTones, find_sweep
-from undulog.analysis.sweep.tone_finder import common_step, find_tones
-from undulog.analysis.sweep.tones import fit_tones
-from undulog.capture.robot import Servo
+from undulog.analysis.experiment.sweep.runs import CommandTones, find_sweep
+from undulog.analysis.experiment.sweep.tone_finder import common_step, find_tones
+from undulog.analysis.experiment.sweep.tones import fit_tones
+from undulog.capture.robot.model import Servo
 
 LINEAR = dataclasses.replace(Servo(), coulomb_friction=0.0)
 

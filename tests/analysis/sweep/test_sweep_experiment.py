@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.experiment.table import render_experiment
+from undulog.analysis.experiment.sweep.chain import servo_side
 from undulog.analysis.plan.sweep_designs import tones
+from undulog.analysis.present.text.experiment import render_experiment
 from undulog.analysis.results.sweep import LinearCoupling, Route
-from undulog.analysis.sweep.chain import servo_side
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 
 experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 

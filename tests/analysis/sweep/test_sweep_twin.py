@@ -10,11 +10,11 @@ from scipy.stats import binom, chi2, norm
 
 import undulog
 from undulog.capture import Session
-from undulog.capture.robot import Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import load_scenario
 from undulog.sim.drive.driven import find_driven
-from undulog.sim.physics.engine import Kernels
-from undulog.sim.recording import Driver, record
+from undulog.sim.scenario.engines import Kernels
+from undulog.sim.twin.recording import Driver, record
 
 shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.analysis.results.analysis import Estimate
-from undulog.analysis.text import formats
-from undulog.capture.console import plain
+from undulog.analysis.results import formats
+from undulog.analysis.results.estimate import Estimate
+from undulog.capture.common.console import plain
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from undulog.analysis.text.table import render
+from undulog.analysis.present.text.table import render
 
 
 def test_the_answer_stands_first_and_the_method_last(snake):

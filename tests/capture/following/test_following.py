@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from undulog.capture.following import KINDS, JointMotion, joints_not_following
-from undulog.capture.following.motion import Samples, cycle_s, windowed_response
+from undulog.capture.following.fault import KINDS
+from undulog.capture.following.find import joints_not_following
+from undulog.capture.following.motion import JointMotion, Samples, cycle_s, windowed_response
 
 RATE, LENGTH, OMEGA, GAIN, LAG, NOISE = 100.0, 15.0, 2 * np.pi * 0.83, 0.95, np.radians(10), 4e-3
 BROKEN = 3

@@ -1,0 +1,254 @@
+"""All artefacts of a session: every detector on every joint that it applies to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from undulog.capture import Session
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.threads import in_threads
+from undulog.capture.log.read.signals import Signal
+
+from ..estimators.series import LARGEST, Series, clean_together
+from ..response.gait import DRIVEN_SHARE
+from ..results.artefact import FALSIFYING, Artefact, Span
+from ..signals.reading import QUANTITIES, Columns
+from .holds import clipped, frozen, stale
+from .jumps import find_jumps
+from .limits import AT_LIMIT, AT_LIMIT_RAD, Limits, limits_of, saturated, stalled
+from .scales import (
+    SAME_RATE,
+    SAME_SCALE,
+    against_command,
+    against_witness,
+    compare,
+    integral,
+    turns,
+)
+from .spans import spans_of
+
+GAP_SHARE = 1e-3
+"""Less of a session without samples is no gap worth a word."""
+
+MOST_RATE = 50.0
+"""Rate that no joint of a robot without description exceeds [rad/s]."""
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """One joint's channels over the whole session, as recorded and cleaned."""
+
+    name: str
+    raw: Mapping[str, Signal]
+    series: Mapping[str, Series]
+    limits: Limits | None
+    driven: bool
+
+
+def find_artefacts(session: Session, columns: Columns) -> tuple[Artefact, ...]:
+    """Look at the whole session, joint by joint.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+
+    Returns:
+        What was found, in chain order.
+    """
+    limits = limits_of(session)
+    swing = {
+        name: float(np.nanmax(one.values) - np.nanmin(one.values))
+        for name, one in columns.command.items()
+        if np.isfinite(one.values).any()
+    }
+    lively = DRIVEN_SHARE * max(swing.values(), default=0.0)
+    origin_ns = session.start_ns
+
+    def of_joint(name: str) -> list[Artefact]:
+        raw = {
+            key: signals[name]
+            for key in QUANTITIES
+            if name in (signals := columns.of(key)) and signals[name].t_ns.size
+        }
+        series = {key: one for key, one in clean_together(raw, origin_ns).items() if one.count}
+        driven = swing.get(name, 0.0) > lively
+        joint = _Joint(name, raw, series, limits.get(name), driven)
+        return [
+            Artefact(name, columns.topics.get(quantity, ""), quantity, flag, spans, note)
+            for quantity, flag, spans, note in _of_joint(joint, origin_ns)
+        ]
+
+    samples = sum(one.t_ns.size for key in QUANTITIES for one in columns.of(key).values())
+    return tuple(chain.from_iterable(in_threads(of_joint, columns.names, samples, session.forget)))
+
+
+_Found = Iterator[tuple[str, str, tuple[Span, ...], str]]
+
+
+def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
+    """Quantity, flag, stretches and note of whatever one joint shows."""
+    found = [*_of_sensors(joint)]
+    yield from found
+    # What a sensor falsifies says nothing about a limit.
+    false = {quantity for quantity, flag, _, _ in found if flag in FALSIFYING}
+    yield from (one for one in _at_limits(joint) if one[0] not in false)
+    for quantity in ("command", "position"):
+        if quantity in joint.series:
+            yield from _of_record(quantity, joint, origin_ns)
+
+
+def _of_sensors(joint: _Joint) -> _Found:
+    levels = () if joint.limits is None else joint.limits.values
+    command = joint.series.get("command") if joint.driven else None
+    tops = {
+        key: clipped(one, levels, command if key == "position" else None)
+        for key, one in joint.series.items()
+        if key != "command"
+    }
+    if "position" not in joint.series:
+        yield "position", "not_recorded", (), ""
+    else:
+        yield from _of_position(joint, joint.series["position"], tops["position"])
+    for quantity, spans in tops.items():
+        if spans:
+            yield quantity, "clipped", spans, ""
+
+
+def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Found:
+    command, velocity = joint.series.get("command"), joint.series.get("velocity")
+    way = None if velocity is None or velocity.count < 2 else integral(velocity)
+    # Without a command the velocity says that a joint moves; one that is held still may stand.
+    motion = way if command is None else command if joint.driven else None
+    stopped = _stalled(joint)
+    if stopped:
+        yield "effort", "stalled", stopped, ""
+    held: tuple[Span, ...] = ()
+    if motion is not None:
+        held = _apart(frozen(position, motion, way), [*stopped, *tops])
+        if held:
+            yield "position", "frozen", held, ""
+        if old := stale(position):
+            yield "position", "stale", old, ""
+    rate = MOST_RATE if joint.limits is None else joint.limits.rate
+    jumps = find_jumps(position, rate, (*held, *stopped))
+    if jumps.wrapped:
+        yield "position", "wrapped", jumps.wrapped, f"turn of {jumps.turn_rad:.4g} rad"
+        return
+    scales = [*_of_scale(joint, position, command if joint.driven else None, way)]
+    yield from scales
+    # A sign or unit that changes makes a step, somewhere in the cycles around.
+    if jumps.jumped:
+        cycle = 0.0 if motion is None else _cycle_s(motion)
+        other = [
+            (a - cycle, b + cycle) for q, _, spans, _ in scales if q == "position" for a, b in spans
+        ]
+        if left := _apart(jumps.jumped, other):
+            yield "position", "jump", left, ""
+
+
+def _of_scale(
+    joint: _Joint, position: Series, command: Series | None, way: Series | None
+) -> _Found:
+    """Sign, unit and scale against the command, a second sensor and the velocity's integral."""
+    told: set[str] = set()
+    command, second, way = (
+        one if one is not None and np.ptp(one.values) > 0 else None
+        for one in (command, joint.series.get("reference"), way)
+    )
+    leader = command or second or way
+    if leader is None:
+        return
+    edges = turns(leader)
+    if command is not None:
+        for flag, spans in against_command(compare(position, command, edges)).items():
+            told.add(flag)
+            yield "position", flag, spans, ""
+    if second is not None:
+        by_second = compare(position, second, edges, noisy=True)
+        for flag, spans in against_witness(by_second, SAME_SCALE).items():
+            told.add(flag)
+            scale = float(np.nanmedian(by_second.ratio))
+            yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
+    if way is not None:
+        by_rate = against_witness(compare(position, way, edges, noisy=True), SAME_RATE)
+        # What the position is blamed for already is no fault of the velocity.
+        for flag, spans in by_rate.items():
+            if flag not in told:
+                yield "velocity", flag, spans, ""
+
+
+def _stalled(joint: _Joint) -> tuple[Span, ...]:
+    limits, position = joint.limits, joint.series["position"]
+    known = limits is not None and limits.known
+    for quantity, most in (
+        ("effort", limits.torque if limits is not None and known else None),
+        ("current", limits.current if limits is not None and known else None),
+    ):
+        if quantity in joint.series:
+            asked = joint.series.get("command", position)
+            return stalled(joint.series[quantity], position, most, asked)
+    return ()
+
+
+def _at_limits(joint: _Joint) -> _Found:
+    limits = joint.limits
+    if limits is None:
+        return
+    for quantity in ("command", "position"):
+        if quantity in joint.series:
+            one = joint.series[quantity]
+            if spans := saturated(one, limits.lower, limits.upper, AT_LIMIT_RAD):
+                yield quantity, "saturated", spans, "angle"
+    sizes = [("velocity", limits.rate, "rate")]
+    if limits.known:
+        sizes += [
+            ("effort", limits.torque, "torque"),
+            ("current", limits.current, "current"),
+            ("voltage", limits.voltage, "voltage"),
+        ]
+    for quantity, most, note in sizes:
+        if quantity in joint.series:
+            slack = (1 - AT_LIMIT) * most
+            if spans := saturated(joint.series[quantity], -most, most, slack):
+                yield quantity, "saturated", spans, note
+
+
+def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
+    raw, one = joint.raw[quantity], joint.series[quantity]
+    if one.dropped_nan:
+        yield (
+            quantity,
+            "nan",
+            spans_of(_seconds(raw, origin_ns), ~(np.abs(raw.values) <= LARGEST)),
+            "",
+        )
+    if one.dropped_duplicates:
+        seconds = _seconds(raw, origin_ns)
+        again = np.concatenate((np.diff(raw.t_ns) == 0, [False]))
+        yield quantity, "duplicate_stamps", tuple((t, t) for t in np.unique(seconds[again])), ""
+    if one.count < 2:
+        return
+    begin, end = one.t_s[one.gaps], one.t_s[one.gaps + 1]
+    if float(np.sum(end - begin)) > GAP_SHARE * (one.t_s[-1] - one.t_s[0]):
+        yield quantity, "gaps", tuple(zip(begin.tolist(), end.tolist(), strict=True)), ""
+
+
+def _seconds(raw: Signal, origin_ns: int) -> FloatArray:
+    return (raw.t_ns - origin_ns).astype(np.float64) * 1e-9
+
+
+def _apart(spans: Sequence[Span], others: Sequence[Span]) -> tuple[Span, ...]:
+    """The stretches that meet none of some others."""
+    return tuple(
+        s for s in spans if not any(s[0] < stop and s[1] > start for start, stop in others)
+    )
+
+
+def _cycle_s(motion: Series) -> float:
+    """Median length of the cycles of a motion [s]; 0 where it has none."""
+    edges = turns(motion)
+    return float(np.median(np.diff(edges))) if edges.size > 1 else 0.0

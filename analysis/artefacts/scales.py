@@ -1,0 +1,235 @@
+"""Wrong sign and wrong unit: what one channel says against another, cycle by cycle.
+
+A position that follows its command upside down at full size has the wrong sign; one that is
+180/pi times as large is in degrees. A velocity must be the derivative of the position, whatever
+the mechanics: where the two disagree in scale, a sensor is wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+
+from ..estimators.series import Series
+from ..results.artefact import Span
+
+DEGREE = float(np.degrees(1.0))
+UNIT_SLACK = 1.6
+"""Factor within which a ratio is taken for 180/pi: a weak servo's gain is in it, too."""
+
+OPPOSITE = -0.7
+"""Correlation of a response with its command at full size, below which its sign is wrong: 45
+degrees from opposite phase."""
+
+EITHER_WAY = 0.75
+"""Share of the cycles that must follow the command, upright or upside down, for a sign to be told:
+of a multisine near a resonance every cycle has another phase."""
+
+FULL_SIZE = (0.5, 2.0)
+TOGETHER = 0.98
+"""Correlation of a position with the integral of its velocity that lets scales be compared."""
+
+SAME_SCALE = 1.05
+"""Two sensors of one angle whose scales differ by less than this agree."""
+
+SAME_RATE = 1.25
+"""A velocity and its position that differ by less than this agree: sampled in step with a ripple of
+the control period, a sound velocity may be off by 14 % (twin)."""
+
+SURE = 4.0
+"""Standard errors by which a scale is off beyond what counts as agreement."""
+
+HOLE_SHARE = 0.02
+"""More of a cycle without samples says nothing."""
+
+_FEW = 3
+"""A cycle with so few samples says nothing."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Two channels side by side in each cycle.
+
+    Attributes:
+        start_s: Start of each cycle [s], shape (c,).
+        stop_s: Its end [s], shape (c,).
+        ratio: Standard deviation of the first over that of the second, shape (c,); NaN where
+            either stands still or has a gap.
+        correlation: Shape (c,).
+        error: Standard error that noise makes of the logarithm of the ratio, shape (c,).
+    """
+
+    start_s: FloatArray
+    stop_s: FloatArray
+    ratio: FloatArray
+    correlation: FloatArray
+    error: FloatArray
+
+    def spans(self, marked: BoolArray) -> tuple[Span, ...]:
+        """The marked cycles as stretches.
+
+        Args:
+            marked: Shape (c,).
+
+        Returns:
+            Neighbours joined.
+        """
+        found: list[Span] = []
+        for start, stop in zip(
+            self.start_s[marked].tolist(), self.stop_s[marked].tolist(), strict=True
+        ):
+            if found and found[-1][1] == start:
+                found[-1] = (found[-1][0], stop)
+            else:
+                found.append((start, stop))
+        return tuple(found)
+
+
+def turns(one: Series) -> FloatArray:
+    """Times at which a signal swings up through its middle.
+
+    Args:
+        one: The signal.
+
+    Returns:
+        Between them lies a cycle each [s]; with hysteresis, so that noise makes none.
+    """
+    middle, spread = float(np.median(one.values)), float(np.std(one.values))
+    far = np.abs(one.values - middle) > 0.25 * spread
+    if spread == 0 or not np.any(far):
+        return np.zeros(0)
+    at = np.flatnonzero(far)
+    high = one.values[at] > middle
+    return one.t_s[at[1:][high[1:] & ~high[:-1]]]
+
+
+def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool = False) -> Compared:
+    """Compare two channels over each cycle.
+
+    Args:
+        first: Its times are used.
+        second: Interpolated to them.
+        edges_s: Edges of the cycles [s], shape (c + 1,); the first and the last cycle reach to the
+            ends of ``first``; with fewer than two edges all of it is one.
+        noisy: Whether the error counts with the autocorrelation of what differs.
+
+    Returns:
+        The comparison.
+    """
+    inner = edges_s[1:-1] if edges_s.size > 2 else np.zeros(0)
+    starts: IntArray = np.concatenate(([0], np.searchsorted(first.t_s, inner)))
+    starts = np.unique(starts[starts < first.count])
+    stops = np.append(first.t_s[starts[1:]], first.t_s[-1])
+    x, y = first.values, second.at(first.t_s)
+    count = np.diff(np.append(starts, first.count))
+    x, y = (v - np.repeat(np.add.reduceat(v, starts) / count, count) for v in (x, y))
+    xx, yy, xy = (np.add.reduceat(v, starts) for v in (x * x, y * y, x * y))
+    usable = (xx > 0) & (yy > 0) & (count > _FEW)
+    for one in (first, second):
+        usable &= _hole(one, first.t_s[starts], stops) <= HOLE_SHARE * (stops - first.t_s[starts])
+    nothing = np.full(starts.size, np.nan)
+    ratio = np.sqrt(np.divide(xx, yy, out=nothing.copy(), where=usable))
+    correlation = np.divide(xy, np.sqrt(xx * yy), out=nothing, where=usable)
+    # Of two noisy copies of one signal (delta method): var(ln ratio) = (1 - r^2) / n, with as many
+    # independent samples as noise of that autocorrelation leaves.
+    error = np.sqrt(np.maximum(1 - correlation**2, 0.0) / np.maximum(count, 1))
+    if noisy:
+        power = float(yy.sum())
+        error *= _correlated(x - y * (float(xy.sum()) / power if power > 0 else 0.0))
+    return Compared(first.t_s[starts], stops, ratio, correlation, error)
+
+
+def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
+    """Wrong sign and unit of a position, from its command.
+
+    Args:
+        one: Position against command.
+
+    Returns:
+        ``wrong_sign`` and ``wrong_unit`` to stretches, those that were found.
+    """
+    degrees = _near(one.ratio, DEGREE) & (np.abs(one.correlation) > -OPPOSITE)
+    # A joint that hardly moves may be stuck: only one that follows closely is in another unit.
+    radians = _near(one.ratio, 1 / DEGREE) & (one.correlation > TOGETHER)
+    full = (one.ratio > FULL_SIZE[0]) & (one.ratio < FULL_SIZE[1])
+    opposite = (one.correlation < OPPOSITE) & (full | degrees)
+    # A sign changes no more than the sign: near a resonance the phase is anything, cycle by cycle.
+    usable = np.isfinite(one.correlation)
+    along = np.abs(one.correlation[usable]) > -OPPOSITE
+    opposite &= np.count_nonzero(along) >= EITHER_WAY * along.size
+    return _found(one, {"wrong_sign": opposite, "wrong_unit": degrees | radians})
+
+
+def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
+    """Sign, unit and scale of a position against another measure of the same angle.
+
+    Args:
+        one: Position against a second sensor, or against the integral of the velocity.
+        same: Factor within which scales agree.
+
+    Returns:
+        ``wrong_sign``, ``wrong_unit`` and ``scale_mismatch`` to stretches, those that were found.
+    """
+    told = np.abs(one.correlation) > TOGETHER
+    ratio = np.where(told, one.ratio, np.nan)
+    known = np.flatnonzero(told)
+    if known.size:
+        ratio[known] = _smoothed(ratio[known])
+    unit = _near(ratio, DEGREE) | _near(ratio, 1 / DEGREE)
+    off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
+    return _found(
+        one,
+        {
+            "wrong_sign": told & (one.correlation < 0),
+            "wrong_unit": unit,
+            "scale_mismatch": told & off & ~unit,
+        },
+    )
+
+
+def integral(velocity: Series) -> Series:
+    """A velocity integrated over time, by the trapezoidal rule.
+
+    Args:
+        velocity: [rad/s].
+
+    Returns:
+        The way gone since its first sample [rad], on its times.
+    """
+    part = (velocity.values[1:] + velocity.values[:-1]) / 2 * np.diff(velocity.t_s)
+    return Series(velocity.name, velocity.t_s, np.concatenate(([0.0], np.cumsum(part))))
+
+
+def _hole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
+    """Time in each cycle that lies in a channel's gaps [s]."""
+    if not one.gaps.size:
+        return np.zeros(start_s.size)
+    step = np.zeros(one.count)
+    step[one.gaps + 1] = one.t_s[one.gaps + 1] - one.t_s[one.gaps]
+    lost = np.cumsum(step)
+    return np.interp(stop_s, one.t_s, lost) - np.interp(start_s, one.t_s, lost)
+
+
+def _correlated(residual: FloatArray) -> float:
+    """By how much autocorrelated noise widens the error of a mean, from its first lag (AR(1))."""
+    power = float(residual @ residual)
+    first = float(residual[1:] @ residual[:-1]) / power if power > 0 else 0.0
+    first = min(max(first, 0.0), 0.99)
+    return float(((1 + first) / (1 - first)) ** 0.5)
+
+
+def _smoothed(ratio: FloatArray) -> FloatArray:
+    """Median of each value and its two neighbours; the ends count twice."""
+    padded = np.pad(ratio, 1, mode="edge")
+    return np.median(np.stack([padded[:-2], ratio, padded[2:]]), axis=0)
+
+
+def _near(ratio: FloatArray, factor: float) -> BoolArray:
+    return np.abs(np.log(ratio / factor)) < np.log(UNIT_SLACK)
+
+
+def _found(one: Compared, marked: dict[str, BoolArray]) -> dict[str, tuple[Span, ...]]:
+    return {name: one.spans(mask) for name, mask in marked.items() if np.any(mask)}

@@ -1,0 +1,1 @@
+"""The commands that analyse, compare, plan, predict and report."""

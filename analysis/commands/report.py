@@ -1,0 +1,107 @@
+"""The verb ``report``: sessions in, one HTML page out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from undulog.capture.common.console import emit_json, progress, say
+from undulog.capture.common.errors import UsageError
+from undulog.capture.common.part_file import check_output, write_text
+
+from .options import PAGES, chosen
+
+if TYPE_CHECKING:
+    from ..results.analysis import Analysis
+    from ..signals.stretch import Options
+
+
+def report(
+    *files: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    start: float | None = None,
+    stop: float | None = None,
+    command_topic: str = "/joint_commands",
+    response_topic: str = "/joint_states",
+    force: bool = False,
+    json: bool = False,
+) -> None:
+    """Write the offline report: one HTML page that needs no network and no script.
+
+    Several sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
+    tell boundary from module, kicks of single joints tell the coupling.
+
+    Example: `undulog report run.mcap -o run.html`
+
+    Args:
+        files: Sessions (MCAP); several are runs of one experiment.
+        output: The page, a name that ends in .html.
+        start: Start of what is analysed, from the session's start [s]; chosen if not given.
+        stop: Its end [s].
+        command_topic: JointState topic of the commands.
+        response_topic: JointState topic of the responses.
+        force: Replace the page if it exists.
+        json: Print one JSON object: the page, the answer, and the answer to each session.
+    """
+    if not files:
+        raise UsageError(
+            "report needs at least one session, e.g. undulog report run.mcap -o x.html"
+        )
+    options = chosen(start, stop, command_topic, response_topic)
+    why = "the report is an HTML page; end its name in .html"
+    check_output(output, PAGES, why, force=force)
+    page, told, warnings = _one(files[0], options) if len(files) == 1 else _several(files, options)
+    write_text(output, page)
+    size = output.stat().st_size
+    if json:
+        emit_json({"page": str(output), "bytes": size, **told})
+        return
+    say(told["answer"])
+    said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
+    say(f"{output}: {size / 1e3:.0f} kB{said}")
+
+
+def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
+    """The page on one session, its answer, and how many warnings are in it."""
+    from undulog.capture import Session
+
+    from ..present.page.page import render
+    from ..session.analyse import measure_session
+    from ..session.cycles import cycle_maps
+
+    with progress("report", total=2) as bar:
+        bar.update(0, note=file.name)
+        with Session.open(file) as session:
+            measured = measure_session(session, options)
+            analysis = measured.analysis
+            bar.update(1, note="page")
+            page = render(analysis, session, cycle_maps(measured))
+    told = _told(analysis)
+    return page, {"answer": told["sentence"], "answers": [told]}, len(analysis.warnings)
+
+
+def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:
+    """The page on an experiment, its answer and each session's, and how many warnings are in it."""
+    from ..present.page.page import render
+    from .analyse import experiment_of
+
+    experiment = experiment_of(files, options, "report")
+    page = render(experiment)
+    told = {
+        "answer": f"{len(files)} sessions: {experiment.answer}.",
+        "answers": [_told(one) for one in experiment.sessions],
+    }
+    return page, told, len(experiment.warnings)
+
+
+def _told(analysis: Analysis) -> dict[str, Any]:
+    told = analysis.answer
+    return {
+        "session": analysis.session.id,
+        "path": analysis.session.path,
+        "verdict": told.verdict,
+        "sentence": told.sentence,
+    }

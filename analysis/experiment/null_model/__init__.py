@@ -1,0 +1,1 @@
+"""A session of one direction against a model of identical modules."""

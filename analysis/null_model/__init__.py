@@ -1,1 +1,0 @@
-"""One direction recorded, held to a model of identical modules."""

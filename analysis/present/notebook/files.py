@@ -1,0 +1,179 @@
+"""Results to files and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
+
+from undulog.capture.common.console import refuse_existing
+from undulog.capture.common.errors import DataError, MissingExtraError
+from undulog.capture.common.input_file import read_input
+from undulog.capture.common.part_file import check_output, part_file, write_text
+
+from ...results import energy as result_energy
+from ...results import oscillators
+from ...results import over_time as result_over_time
+from ...results import sweep as result_sweep
+from ...results.analysis import Analysis, interval_key
+from ...results.comparison import Comparison
+from ...results.coupling import Coupling, LocalCoupling
+from ...results.estimate import Estimate
+from ...results.experiment import Experiment, Reversal
+
+if TYPE_CHECKING:
+    from ...results.shown import Shown
+
+
+_NAMES = {**vars(oscillators), **vars(result_energy), **vars(result_over_time)}
+"""Types that :mod:`.analysis.results.analysis` names for type checkers only."""
+
+_KINDS: tuple[type[Shown], ...] = (
+    Analysis,
+    Experiment,
+    Comparison,
+    Reversal,
+    LocalCoupling,
+    result_sweep.LinearCoupling,
+    Coupling,
+)
+
+
+def save(result: Shown, path: Path, *, force: bool) -> Path:
+    """Write a result as JSON; see :meth:`.analysis.results.shown.Shown.save`.
+
+    Args:
+        result: The result.
+        path: A name that ends in .json.
+        force: Replace the file if it exists.
+
+    Returns:
+        The path.
+
+    Raises:
+        UsageError: If the name ends in anything else.
+        OutputExistsError: If it is there and ``force`` is not given.
+        LogWriteError: If it can't be written.
+    """
+    check_output(path, (".json",), "the result file is JSON; end its name in .json", force=force)
+    write_text(path, json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
+    return path
+
+
+def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
+    """Write the tables as Parquet; see :meth:`.analysis.results.shown.Shown.to_parquet`.
+
+    Args:
+        result: The result.
+        folder: Made if it isn't there.
+        force: Replace files that exist.
+
+    Returns:
+        The files.
+
+    Raises:
+        OutputExistsError: If one is there and ``force`` is not given.
+        MissingExtraError: If pyarrow is not installed.
+        LogWriteError: If one can't be written.
+    """
+    frames = result.frames()
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {folder / f"{name}.parquet": frame for name, frame in frames.items()}
+    for path in paths:
+        refuse_existing(path, force=force)
+    for path, frame in paths.items():
+        with part_file(path) as part:
+            try:
+                frame.to_parquet(part, index=False, engine="pyarrow")
+            except ImportError as error:
+                raise MissingExtraError("to_parquet()", "parquet", "pyarrow") from error
+    return list(paths)
+
+
+def load(path: Path | str) -> Shown:
+    """Read a result that ``save`` wrote, or ``undulog analyse`` and ``compare`` with ``-o``.
+
+    Args:
+        path: The JSON file.
+
+    Returns:
+        The result, equal to the one that was written.
+
+    Raises:
+        InputFileError: If it isn't there or can't be read.
+        DataError: If it holds no result.
+    """
+    path = Path(path)
+    try:
+        data: Any = json.loads(read_input(path).decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not JSON: {error}") from error
+    for kind in _KINDS:
+        if isinstance(data, dict) and _required(kind) <= set(cast("dict[str, Any]", data)):
+            try:
+                return cast("Shown", _build(kind, data))
+            except (KeyError, OverflowError, TypeError, ValueError) as error:
+                raise DataError(f"{path}: a damaged {kind.__name__}: {error!r}") from error
+    known = ", ".join(kind.__name__ for kind in _KINDS)
+    raise DataError(f"{path}: holds no result; known are {known}")
+
+
+def _required(kind: type[Any]) -> set[str]:
+    return {
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+    }
+
+
+def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a line
+    """A value of an annotated type from plain JSON values."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if value is None:
+        if types.NoneType not in arguments:
+            raise TypeError(f"null where {kind} is expected")
+        return None
+    if origin in (Union, types.UnionType):
+        return _build(next(one for one in arguments if one is not type(None)), value)
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return tuple(_build(arguments[0], one) for one in value)
+        return tuple(_build(one, part) for one, part in zip(arguments, value, strict=True))
+    if origin is dict:
+        return {key: _build(arguments[1], one) for key, one in value.items()}
+    return _dataclass(kind, value) if dataclasses.is_dataclass(kind) else _plain(kind, value)
+
+
+def _plain(kind: type[Any], value: Any) -> Any:
+    if issubclass(kind, Enum):
+        return kind(value)
+    wanted = (int, float) if kind is float else kind
+    wrong = isinstance(value, bool) and kind is not bool
+    if wrong or not isinstance(value, wanted) or (kind is float and not math.isfinite(value)):
+        raise TypeError(f"{value!r:.40} where {kind.__name__} is expected")
+    return float(value) if kind is float else value
+
+
+def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
+    """Of the kinds that fit, the one that says most."""
+    fitting = [one for one in (kind, *kind.__subclasses__()) if _required(one) <= set(data)]
+    chosen = max(fitting, key=lambda one: len(dataclasses.fields(one)), default=kind)
+    hints = get_type_hints(chosen, localns=_NAMES)
+    built: dict[str, Any] = {}
+    for field in dataclasses.fields(chosen):
+        name = field.name
+        if name not in data:
+            continue
+        if hints[name] is Estimate and not isinstance(data[name], dict):
+            hint = get_type_hints(Estimate)
+            value = _build(hint["value"], data[name])
+            built[name] = Estimate(value, _build(hint["ci95"], data[interval_key(name)]))
+        else:
+            built[name] = _build(hints[name], data[name])
+    return chosen(**built)

@@ -1,0 +1,192 @@
+"""Results as pandas tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import singledispatch
+
+import numpy as np
+import pandas as pd
+
+from ...results.analysis import Analysis, BodyPoint, Index, JointResult
+from ...results.artefact import Artefact, Span
+from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
+from ...results.coupling import Coupling, HeldOut, LocalCoupling, Matrix, RowCheck
+from ...results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
+from ...results.oscillators import ChainCoupling, Link, Mode, Rate
+from ...results.sweep import LinearCoupling, ToneCoupling
+from .rows import named, row_of, table
+
+Frames = dict[str, pd.DataFrame]
+
+
+@singledispatch
+def frames_of(result: object) -> Frames:
+    """The tables of a result; see :meth:`.analysis.results.shown.Shown.frames`.
+
+    Args:
+        result: A result of this package.
+
+    Returns:
+        Name to table.
+
+    Raises:
+        TypeError: If it is no result.
+    """
+    raise TypeError(f"{type(result).__name__} is no result of analysis")
+
+
+@frames_of.register
+def _(result: Analysis) -> Frames:
+    frames = {
+        "joints": table(JointResult, result.joints),
+        "heterogeneity": named(Index, result.heterogeneity),
+    }
+    frames["gait"] = pd.DataFrame([row_of(result.gait)])
+    if result.body is not None:
+        models = {"measured": result.body.observed} | result.body.null
+        points = [(model, point) for model, points in models.items() for point in points]
+        frames["body"] = table(
+            BodyPoint, [point for _, point in points], model=[model for model, _ in points]
+        )
+    frames["artefacts"] = _artefacts(result.artefacts)
+    return frames | _oscillators(result.oscillators)
+
+
+@frames_of.register
+def _(result: Experiment) -> Frames:
+    sessions = result.sessions
+    joints = [joint for one in sessions for joint in one.joints]
+    whose = [one.session.path for one in sessions for _ in one.joints]
+    frames = {
+        "runs": table(Run, result.runs),
+        "joints": table(JointResult, joints, session=whose),
+        "heterogeneity": named(Index, result.heterogeneity),
+    }
+    if result.reversal is not None:
+        frames = frames_of(result.reversal) | frames
+    found = [(one.session.path, each) for one in sessions for each in one.artefacts]
+    frames["artefacts"] = _artefacts([each for _, each in found], [path for path, _ in found])
+    if result.oscillators is not None:
+        frames["modes"] = table(Mode, result.oscillators.modes)
+    return frames | frames_of(result.coupling)
+
+
+@frames_of.register
+def _(result: Reversal) -> Frames:
+    return {"mirror": table(MirrorJoint, result.joints), "pairs": table(OrderedPair, result.pairs)}
+
+
+@frames_of.register
+def _(result: Coupling) -> Frames:
+    if result.matrix is None:
+        return {"coupling": pd.DataFrame([row_of(result)])}
+    names = [str(k + 1) for k in range(len(result.matrix))]
+    return {"coupling": pd.DataFrame(_pairs(names) | _entries("coupling", result.matrix))}
+
+
+@frames_of.register
+def _(result: LocalCoupling) -> Frames:
+    columns: dict[str, Sequence[str] | Sequence[float]] = dict(_pairs(result.joints))
+    for symbol in ("P", "R", "G", "S"):
+        matrix: Matrix | None = getattr(result, symbol)
+        if matrix is not None:
+            unit = {"R": "_per_rad", "S": "_rad"}.get(symbol, "")
+            columns |= _entries(f"{symbol}{unit}", matrix.value)
+            columns |= _entries(f"{symbol}_half{unit}", matrix.ci95_half)
+    return {
+        "coupling": pd.DataFrame(columns),
+        "phase_rows": table(RowCheck, result.phase_rows),
+        "gain_rows": table(RowCheck, result.gain_rows),
+        "held_out": table(HeldOut, result.held_out),
+    }
+
+
+@frames_of.register
+def _(result: LinearCoupling) -> Frames:
+    parts: list[pd.DataFrame] = []
+    for tone in result.tones:
+        columns: dict[str, Sequence[str] | Sequence[float]] = dict(_pairs(result.joints))
+        columns["frequency_hz"] = [tone.frequency_hz] * len(columns["joint"])
+        for symbol, unit, matrix in (("H", "", tone.H), ("Z", "_n_m_per_rad", tone.Z)):
+            if matrix is not None:
+                columns |= _entries(f"{symbol}_real{unit}", matrix.real)
+                columns |= _entries(f"{symbol}_imag{unit}", matrix.imag)
+                columns |= _entries(f"{symbol}_half{unit}", matrix.ci95_half)
+        parts.append(pd.DataFrame(columns))
+    return {
+        "coupling": pd.concat(parts, ignore_index=True),
+        "tones": table(ToneCoupling, result.tones),
+    }
+
+
+@frames_of.register
+def _(result: Comparison) -> Frames:
+    waves = [
+        pd.DataFrame(
+            {
+                "name": one.name,
+                "phase_rad": result.phase_rad,
+                "a_rad": one.a_rad,
+                "b_rad": one.b_rad,
+                "difference_rad": one.difference_rad,
+                "half_rad": one.half_rad,
+            }
+        )
+        for one in result.waveforms
+    ]
+    return {
+        "differences": table(Difference, result.differences),
+        "named": table(NamedJoint, result.named),
+        "equivalence": table(Equivalence, result.equivalence),
+        "changed": table(Change, result.changed),
+        "waveforms": pd.concat(waves, ignore_index=True) if waves else pd.DataFrame(),
+    }
+
+
+def _artefacts(artefacts: Sequence[Artefact], whose: Sequence[str] | None = None) -> pd.DataFrame:
+    """One row a stretch; NaN as times of what holds throughout."""
+    nowhere: tuple[Span, ...] = ((float("nan"), float("nan")),)
+    rows = [(k, span) for k, one in enumerate(artefacts) for span in one.spans_s or nowhere]
+    frame = table(
+        Artefact,
+        [artefacts[k] for k, _ in rows],
+        **({} if whose is None else {"session": [whose[k] for k, _ in rows]}),
+    )
+    times = {
+        "start_s": [start for _, (start, _) in rows],
+        "stop_s": [stop for _, (_, stop) in rows],
+    }
+    return frame.assign(**times)
+
+
+def _oscillators(chains: Sequence[ChainCoupling]) -> Frames:
+    """Couplings and rates of all chains; none where no phases were logged."""
+    if not chains:
+        return {}
+    links = [(chain.plane, link) for chain in chains for link in chain.links]
+    rates = [(chain.plane, rate) for chain in chains for rate in chain.oscillators]
+    found = {
+        "oscillators": table(Link, [link for _, link in links], plane=[of for of, _ in links]),
+        "oscillator_rates": table(Rate, [rate for _, rate in rates], plane=[of for of, _ in rates]),
+        "chains": table(ChainCoupling, chains),
+    }
+    return {name: frame.rename(columns=_with_unit) for name, frame in found.items()}
+
+
+def _with_unit(column: str) -> str:
+    units = {"K": "per_s", "feedback": "per_s", "omega": "rad_s", "noise": "rad_per_sqrt_s"}
+    unit = units.get(column.removesuffix("_low").removesuffix("_high"))
+    return column if unit is None else f"{column}_{unit}"
+
+
+def _pairs(names: Sequence[str]) -> dict[str, list[str]]:
+    """Who answers whom, row by row of a matrix."""
+    return {
+        "joint": [name for name in names for _ in names],
+        "commanded": [other for _ in names for other in names],
+    }
+
+
+def _entries(name: str, rows: Sequence[Sequence[float]]) -> dict[str, list[float]]:
+    return {name: np.asarray(rows, dtype=np.float64).ravel().tolist()}

@@ -1,0 +1,266 @@
+"""What the page shows of a comparison."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from undulog.capture.common.palette import joint_hex
+
+from ...compare.answer import WORDS, in_people_units, signed
+from ...compare.decisions import SIGNIFICANT
+from ...results import formats
+from ...results.analysis import SessionFacts
+from ...results.comparison import BODY, Comparison, Difference, Waveform
+from ...results.estimate import Estimate
+from ...results.formats import degrees, scaled
+from ..text.comparison import cells, margin_told, method
+from .differences import Panel, differences_drawing
+from .drawn import Drawing
+from .tables import Fact
+from .trials import Trial
+from .waveforms import waveforms_drawing
+
+_VERDICTS = {
+    "different": "different",
+    "small": "different, but within the margins",
+    "same": "the same within the margins",
+    "open": "open",
+}
+
+
+@dataclass(frozen=True)
+class DifferenceRow:
+    """One quantity of one joint, or of the body, in the units people read.
+
+    Attributes:
+        place: Joint name, or ``the body``.
+        quantity: In words.
+        a: On side A, with its unit.
+        b: On side B.
+        difference: B minus A.
+        unit: Of ``difference``, with its own space.
+        decimals: Digits after the point of ``difference``.
+        p: Holm's, for the whole family.
+        size: In margins.
+        sure: Whether it is beyond doubt.
+    """
+
+    place: str
+    quantity: str
+    a: str
+    b: str
+    difference: Estimate
+    unit: str
+    decimals: int
+    p: float
+    size: float
+    sure: bool
+
+
+@dataclass(frozen=True)
+class NamedRow:
+    """A joint that answers differently, ranked.
+
+    Attributes:
+        name: The joint.
+        color: Of the joint.
+        size: Of gain and lag together, in margins.
+        p: Holm's.
+        rows: What differs, gain and lag.
+    """
+
+    name: str
+    color: str
+    size: float
+    p: float
+    rows: tuple[DifferenceRow, ...]
+
+
+@dataclass(frozen=True)
+class WaveformRow:
+    """How far two mean cycles are apart.
+
+    Attributes:
+        name: The joint.
+        rms_deg: Root mean square [deg].
+        largest: The largest difference [deg].
+        at_deg: Its phase [deg].
+    """
+
+    name: str
+    rms_deg: float
+    largest: Estimate
+    at_deg: float
+
+
+@dataclass(frozen=True)
+class ComparisonView:
+    """All that the template shows of a comparison.
+
+    Attributes:
+        comparison: The numbers.
+        sentence: The answer.
+        sides: Letter and session, A first.
+        facts: Key figures.
+        named: Joints that answer differently, the largest difference first.
+        differences: Of every joint, as a picture; None where there are none.
+        waveforms: Mean cycles, or None.
+        cycles: How far they are apart, head to tail.
+        trials: What is shown to be the same.
+        rows: Every quantity, those beyond doubt first.
+        method: How it was made.
+    """
+
+    comparison: Comparison
+    sentence: str
+    sides: tuple[tuple[str, SessionFacts], ...]
+    facts: tuple[Fact, ...]
+    named: tuple[NamedRow, ...]
+    differences: Drawing | None
+    waveforms: Drawing | None
+    cycles: tuple[WaveformRow, ...]
+    trials: tuple[Trial, ...]
+    rows: tuple[DifferenceRow, ...]
+    method: str
+
+
+def comparison_view(comparison: Comparison) -> ComparisonView:
+    """Prepare what the template shows of a comparison.
+
+    Args:
+        comparison: The numbers.
+
+    Returns:
+        The view.
+    """
+    rows = tuple(_row(one) for one in comparison.differences)
+    sides = (("A", comparison.a), ("B", comparison.b))
+    return ComparisonView(
+        comparison=comparison,
+        sentence=comparison.answer,
+        sides=tuple((letter, one) for letter, sessions in sides for one in sessions),
+        facts=tuple(_facts(comparison)),
+        named=_named(comparison, rows),
+        differences=differences_of(comparison, "differences") if joints_of(comparison) else None,
+        waveforms=waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
+        cycles=tuple(_cycle(one) for one in comparison.waveforms),
+        trials=_trials(comparison),
+        rows=rows,
+        method=method(comparison),
+    )
+
+
+def joints_of(comparison: Comparison) -> list[str]:
+    """The joints that are compared.
+
+    Args:
+        comparison: The numbers.
+
+    Returns:
+        Names, head to tail where mean cycles say so, else by name.
+    """
+    return [one.name for one in comparison.waveforms] or sorted(
+        {one.place for one in comparison.differences if one.quantity == "gain"}
+    )
+
+
+def differences_of(comparison: Comparison, prefix: str) -> Drawing:
+    """Draw the differences of every joint.
+
+    Args:
+        comparison: With at least one joint.
+        prefix: For identifiers, unique in the page.
+
+    Returns:
+        Gain, lag and energy, one panel each.
+    """
+    names = joints_of(comparison)
+    known = {(one.quantity, one.place): one.difference for one in comparison.differences}
+    margins = {one.quantity: one.margin for one in comparison.equivalence}
+    panels: list[Panel] = []
+    for quantity, label, factor in (
+        ("gain", "gain [%]", 100.0),
+        ("lag", "lag [°]", math.degrees(1)),
+        ("energy_abs", "E_abs [mJ a cycle]", 1000.0),
+    ):
+        if quantity in margins:
+            values = [scaled(known.get((quantity, name), Estimate()), factor) for name in names]
+            panels.append(Panel(label, values, factor * margins[quantity]))
+    return differences_drawing(names, panels, title="B minus A of every joint", prefix=prefix)
+
+
+def _row(one: Difference) -> DifferenceRow:
+    a, b, *_ = cells(one)
+    quantity, unit = in_people_units(one)
+    return DifferenceRow(
+        place="the body" if one.place == BODY else one.place,
+        quantity=WORDS[one.quantity],
+        a=a,
+        b=b,
+        difference=quantity,
+        unit=unit,
+        decimals=formats.decimals_for([quantity], most=2),
+        p=one.p_holm,
+        size=one.size,
+        sure=one.p_holm < SIGNIFICANT,
+    )
+
+
+def _named(comparison: Comparison, rows: tuple[DifferenceRow, ...]) -> tuple[NamedRow, ...]:
+    names = joints_of(comparison)
+    colors = dict(zip(names, joint_hex(len(names)), strict=True)) if names else {}
+    return tuple(
+        NamedRow(
+            one.name,
+            colors[one.name],
+            one.size,
+            one.p_holm,
+            tuple(
+                row
+                for word in (WORDS["gain"], WORDS["lag"])
+                for row in rows
+                if row.place == one.name and row.quantity == word
+            ),
+        )
+        for one in comparison.named
+    )
+
+
+def _cycle(one: Waveform) -> WaveformRow:
+    return WaveformRow(
+        one.name, math.degrees(one.rms_rad), degrees(one.largest), math.degrees(one.largest_at_rad)
+    )
+
+
+def _trials(comparison: Comparison) -> tuple[Trial, ...]:
+    return tuple(
+        Trial(
+            f"Is the {WORDS[one.quantity]} the same on both sides, within {margin_told(one)}?",
+            f"largest difference {margin_told(one, one.largest)}",
+            one.p,
+            "yes, shown to be the same" if one.p < SIGNIFICANT else "not shown",
+        )
+        for one in comparison.equivalence
+    )
+
+
+def _facts(comparison: Comparison) -> list[Fact]:
+    a, b = len(comparison.a), len(comparison.b)
+    joints = len(joints_of(comparison))
+    facts = [
+        Fact("Verdict", _VERDICTS[comparison.verdict], "all quantities together, Holm at 5 %"),
+        Fact("Sessions", f"{a} and {b}", "on side A and B"),
+        Fact("Joints that differ", f"{len(comparison.named)} of {joints}", "in gain or lag"),
+    ]
+    for quantity in ("gain", "lag"):
+        of = [one for one in comparison.differences if one.quantity == quantity]
+        if of:
+            worst = max(of, key=lambda one: one.size)
+            told = signed(*in_people_units(worst))
+            facts.append(Fact(f"Largest in {quantity}", told, f"B minus A, {worst.place}"))
+    for one in comparison.differences:
+        if one.place == BODY:
+            told = signed(*in_people_units(one))
+            facts.append(Fact(WORDS[one.quantity].capitalize(), told, "B minus A"))
+    return facts

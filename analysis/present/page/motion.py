@@ -1,0 +1,96 @@
+"""Head, middle and tail over one gait cycle, beside the perfect-tracking nulls."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.palette import joint_hex
+
+from ...results.analysis import BodyPoint, BodyResult
+from ...results.formats import degrees, estimate, scaled, short
+from .drawn import WIDTH_IN, Drawing, key, legend
+from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
+
+_NULL_STYLES = ((0, (5, 3)), (0, (1.5, 2)), (0, (7, 2, 1.5, 2)))
+
+
+def body_motion(body: BodyResult, prefix: str) -> Drawing:
+    """Head, middle and tail over one gait cycle, with the perfect-tracking nulls dashed.
+
+    The curve of a place is A cos(Phi + phase), A and phase with respect to the head link; the
+    band is what amplitude and phase may do within their intervals.
+
+    Args:
+        body: With one or more observed points.
+        prefix: For identifiers, unique in the page.
+
+    Returns:
+        The figure.
+    """
+    points = body.observed
+    colors = joint_hex(len(points))
+    cycle = np.linspace(0.0, 2.0 * np.pi, 121)
+    with drawing():
+        figure = new_figure(WIDTH_IN, 2.7)
+        grid = figure.subplots(1, len(points), sharex=True, sharey=True, squeeze=False)
+        for k, point in enumerate(points):
+            axes: Axes = grid[0, k]
+            for style, points_of_null in zip(_NULL_STYLES, body.null.values(), strict=False):
+                for null in points_of_null:
+                    if null.place == point.place:
+                        _harmonic(axes, null, cycle, REFERENCE, style)
+            _harmonic(axes, point, cycle, colors[k], "-")
+            axes.set_title(short(f"{point.place} ({point.link})", 28))
+            axes.set_xticks([0.0, 90.0, 180.0, 270.0, 360.0])
+        sideways = body.plane != "vertical"
+        grid[0, 0].set_ylabel("left of the heading [mm]" if sideways else "up [mm]")
+        figure.supxlabel("phase of the gait [°], zero at the head link's peak", fontsize=8.0)
+        measured = key([], [], color=colors[len(colors) // 2], label="measured, 95 %")
+        nulls = [
+            key([], [], color=REFERENCE, linestyle=style, label=short(f"perfect tracking, {name}"))
+            for style, name in zip(_NULL_STYLES, body.null, strict=False)
+        ]
+        legend(figure, [measured, *nulls])
+        svg = inline_svg(
+            figure,
+            prefix=prefix,
+            title=f"Motion of {', '.join(p.place for p in points)} over one gait cycle",
+            description="; ".join(_point_in_words(p) for p in points)
+            + ". Dashed grey: the same body with every joint exactly on its command.",
+        )
+    caption = (
+        "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
+        "perfect-tracking null: the same body with every joint exactly on its command. Head, "
+        "middle and tail differ there already, by kinematics alone, so only what departs from the "
+        "dashed line speaks of the joints."
+    )
+    return Drawing(svg, caption)
+
+
+def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style: object) -> None:
+    amplitude = scaled(point.amplitude_m, 1000.0)
+    if amplitude.value is None or point.phase_rad.value is None:
+        return
+    x = np.degrees(cycle)
+    if style == "-":
+        low_a, high_a = amplitude.ci95 or (amplitude.value, amplitude.value)
+        low_p, high_p = point.phase_rad.ci95 or (point.phase_rad.value, point.phase_rad.value)
+        family = np.stack(
+            [a * np.cos(cycle + p) for a in (low_a, high_a) for p in np.linspace(low_p, high_p, 9)]
+        )
+        axes.fill_between(x, family.min(0), family.max(0), color=color, alpha=0.3, linewidth=0)
+    axes.plot(
+        x,
+        amplitude.value * np.cos(cycle + point.phase_rad.value),
+        color=color,
+        linestyle=style,
+        linewidth=2.0 if style == "-" else 1.4,
+        zorder=3 if style == "-" else 2,
+    )
+
+
+def _point_in_words(point: BodyPoint) -> str:
+    amplitude = estimate(scaled(point.amplitude_m, 1000.0), " mm")
+    phase = estimate(degrees(point.phase_rad), "°")
+    return f"{point.place}: amplitude {amplitude}, phase {phase}"

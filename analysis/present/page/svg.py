@@ -1,0 +1,250 @@
+"""A matplotlib figure as clean SVG for inside a page.
+
+Colours that must follow the reader's light or dark scheme are drawn in sentinel colours and
+become CSS variables here. Text stays text, in the page's own font. Nothing in the result depends
+on the time, the machine or other figures on the page: identifiers carry the figure's own prefix.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from typing import Any, TypeAlias
+from xml.etree import ElementTree as ET
+
+import matplotlib as mpl
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure as _Figure
+
+from undulog.capture.common.console import plain
+
+Figure: TypeAlias = Any
+Axes: TypeAlias = Any
+Handle: TypeAlias = Any
+"""Matplotlib's own annotations leave keyword arguments unknown, so its objects are untyped."""
+
+_mpl: Any = mpl
+
+INK = "#010101"
+"""Sentinel: text and outlines."""
+MUTED = "#020202"
+"""Sentinel: axes, ticks, secondary text."""
+GRID = "#030303"
+"""Sentinel: grid lines."""
+REFERENCE = "#040404"
+"""Sentinel: commands, nulls and references."""
+PAPER = "#050505"
+"""Sentinel: the page's background, for hollow markers."""
+
+CSS_VARIABLES: dict[str, str] = {
+    INK: "var(--ink)",
+    MUTED: "var(--muted)",
+    GRID: "var(--grid)",
+    REFERENCE: "var(--reference)",
+    PAPER: "var(--paper)",
+}
+
+STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "undulog",
+    "text.parse_math": False,  # a "$" in a joint's name is a "$"
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],  # ships with matplotlib: same layout on every machine
+    "font.size": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.labelsize": 8.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "axes.formatter.useoffset": False,
+    "figure.facecolor": "none",
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.labelcolor": INK,
+    "lines.linewidth": 1.4,
+    "lines.solid_capstyle": "round",
+    "path.simplify": True,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "xtick.major.width": 0.6,
+    "ytick.color": MUTED,
+    "ytick.labelcolor": INK,
+    "ytick.major.width": 0.6,
+}
+"""What a figure is drawn with; see :func:`drawing`."""
+
+_SVG = "http://www.w3.org/2000/svg"
+_XLINK = "{http://www.w3.org/1999/xlink}href"
+_NUMBER = re.compile(r"-?\d+\.\d+")
+_URL = re.compile(r"url\(#([^)]+)\)")
+_FONT_SIZE = re.compile(r"font-size: ([\d.]+)px")
+_FONT_WEIGHT = re.compile(r"font(?:-weight)?: (bold|[6-9]00)\b")
+_ANCHOR = re.compile(r"text-anchor: (\w+)")
+_FILL = re.compile(r"(?:^|; ?)fill: ([^;]+)")
+
+
+@contextmanager
+def drawing() -> Generator[None]:
+    """The look of all figures of the report; they are built, laid out and written inside it.
+
+    Yields:
+        Nothing. The reader's own matplotlib settings are out of force until the block ends.
+    """
+    with _mpl.rc_context():
+        _mpl.rcdefaults()
+        _mpl.rcParams.update(STYLE)
+        yield
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure whose panels make room for their labels.
+
+    Args:
+        width_in: [inch].
+        height_in: [inch].
+
+    Returns:
+        A matplotlib figure that no window knows of.
+    """
+    return _Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def inline_svg(
+    figure: Figure,
+    *,
+    prefix: str,
+    title: str,
+    description: str,
+    tooltips: Mapping[str, str] | None = None,
+) -> str:
+    """Write a figure as an ``<svg>`` element that can stand in any HTML page.
+
+    Args:
+        figure: Drawn with the sentinel colours of this module.
+        prefix: Unique in the page; every identifier begins with it.
+        title: Its accessible name (WAI-ARIA ``img``; W3C SVG Accessibility API Mappings).
+        description: What a reader who cannot see it should know.
+        tooltips: Group identifier (``gid`` of an artist) to the text shown when hovered.
+
+    Returns:
+        The element, without XML declaration, document type, metadata, date or outside reference.
+    """
+    root = _drawn(figure)
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"):
+                parent.remove(child)
+    _add_tooltips(root, tooltips or {})
+    _rename_identifiers(root, prefix)
+    for element in root.iter():
+        _tidy(element)
+    _name_it(root, prefix, title, description)
+    # Inline in HTML the default namespace is implied, and the parser wants plain tags.
+    for element in root.iter():
+        element.tag = element.tag.removeprefix(f"{{{_SVG}}}")
+    return ET.tostring(root, encoding="unicode")
+
+
+def _drawn(figure: Figure) -> ET.Element:
+    """The figure as matplotlib writes it, parsed."""
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        # Text is set in the reader's fonts, so a glyph that our layout font lacks is no loss.
+        warnings.filterwarnings("ignore", message=".*[Gg]lyph.*missing from", category=UserWarning)
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(buffer, metadata=nothing)
+    return ET.fromstring(buffer.getvalue())  # noqa: S314  our own output of a moment ago
+
+
+def _add_tooltips(root: ET.Element, tooltips: Mapping[str, str]) -> None:
+    for group in root.iter(f"{{{_SVG}}}g"):
+        text = tooltips.get(group.get("id", ""))
+        if text is not None:
+            note = ET.Element(f"{{{_SVG}}}title")
+            note.text = plain(text)
+            group.insert(0, note)
+
+
+def _rename_identifiers(root: ET.Element, prefix: str) -> None:
+    """Prefix the identifiers that are referred to, in order of appearance; drop the others."""
+    used: dict[str, str] = {}
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            found = _URL.findall(value)
+            if key == _XLINK:
+                found = [value.removeprefix("#")]
+            for name in found:
+                used.setdefault(name, f"{prefix}-{len(used)}")
+    for element in root.iter():
+        name = element.attrib.pop("id", None)
+        if name in used:
+            element.set("id", used[name])
+        target = element.attrib.pop(_XLINK, None)
+        if target is not None:
+            element.set("href", "#" + used[target.removeprefix("#")])
+        for key, value in element.attrib.items():
+            element.set(key, _URL.sub(lambda m: f"url(#{used[m[1]]})", value))
+
+
+def _tidy(element: ET.Element) -> None:
+    """Sentinels to variables, two decimals, no fonts of our own, no white space."""
+    if element.tag == f"{{{_SVG}}}text":
+        _plain_text_style(element)
+    if element.text is not None and not element.text.strip():
+        element.text = None
+    element.tail = None
+    for key, value in element.attrib.items():
+        new = value
+        if key in ("d", "x", "y", "width", "height", "transform", "points"):
+            new = _NUMBER.sub(lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), new)
+            new = " ".join(new.split())
+        elif key == "style":
+            for sentinel, variable in CSS_VARIABLES.items():
+                new = new.replace(sentinel, variable)
+        element.set(key, new)
+
+
+def _plain_text_style(text: ET.Element) -> None:
+    """Keep size, weight, anchor and colour of a text; its family is the page's business."""
+    style = text.attrib.pop("style", "")
+    for attribute, pattern in (
+        ("font-size", _FONT_SIZE),
+        ("font-weight", _FONT_WEIGHT),
+        ("text-anchor", _ANCHOR),
+    ):
+        found = pattern.search(style)
+        if found is not None:
+            text.set(attribute, found[1])
+    fill = _FILL.search(style)
+    text.set("style", f"fill: {fill[1] if fill is not None else INK}")
+    transform = text.get("transform", "")
+    if transform.startswith("rotate(-0 "):
+        del text.attrib["transform"]
+
+
+def _name_it(root: ET.Element, prefix: str, title: str, description: str) -> None:
+    name = ET.Element(f"{{{_SVG}}}title", {"id": f"{prefix}-title"})
+    name.text = plain(title)
+    note = ET.Element(f"{{{_SVG}}}desc", {"id": f"{prefix}-desc"})
+    note.text = plain(description)
+    root.insert(0, name)
+    root.insert(1, note)
+    root.set("role", "img")
+    root.set("aria-labelledby", f"{prefix}-title")
+    root.set("aria-describedby", f"{prefix}-desc")
+    root.set("class", "figure")

@@ -1,0 +1,202 @@
+"""The tests of a result as questions with their answers in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from undulog.capture.common.console import plain
+
+from ...experiment.reversal.modules import SIGNIFICANT
+from ...results import formats
+from ...results.analysis import Index
+from ...results.coupling import Coupling, LocalCoupling, RowCheck
+from ...results.estimate import Estimate
+from ...results.experiment import Experiment, Reversal
+from ...segments.answer import find
+
+LEVEL_NOTE = (
+    f"Each test stands by itself at a level of {100 * SIGNIFICANT:g} %; those that look at several "
+    "joints at once are family-wise over them. A question that could not be answered is open, not "
+    "answered with no."
+)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One question put to the data.
+
+    Attributes:
+        question: In words.
+        statistic: What was computed, with unit and interval.
+        p: Of the null hypothesis; None where the answer rests on an interval or a bound.
+        verdict: In words.
+    """
+
+    question: str
+    statistic: str
+    p: float | None
+    verdict: str
+
+
+def session_trials(indices: Mapping[str, Index]) -> tuple[Trial, ...]:
+    """The tests of one session.
+
+    Args:
+        indices: Its heterogeneity indices.
+
+    Returns:
+        Trials, plane by plane; empty where nothing was tested.
+    """
+    found: list[Trial] = []
+    for plane, index in find(dict(indices), "common_response").items():
+        found.append(_common(index, _of(plane)))
+    for quantity in ("gain", "lag"):
+        for plane, index in find(dict(indices), f"boundary_contrast_{quantity}").items():
+            found.append(_contrast(index, quantity, _of(plane)))
+    for quantity in ("gain", "lag"):
+        for plane, index in find(dict(indices), f"equivalence_{quantity}").items():
+            margin = "2 %" if quantity == "gain" else "1°"
+            asked = f"Is every {quantity} within {margin} of the mean of {_of(plane)}?"
+            found.append(_equivalence(index, quantity, asked))
+    return tuple(found)
+
+
+def experiment_trials(experiment: Experiment) -> tuple[Trial, ...]:
+    """The tests of several sessions together.
+
+    Args:
+        experiment: Its numbers.
+
+    Returns:
+        Trials; empty where nothing was tested.
+    """
+    found: list[Trial] = []
+    indices = experiment.heterogeneity
+    common = indices.get("common_response")
+    if common is not None and common.value is not None:
+        found.append(_common(common, "the driven joints"))
+    if experiment.reversal is not None:
+        found += _reversal(experiment.reversal, indices)
+    found += coupling_trials(experiment.coupling)
+    return tuple(found)
+
+
+def coupling_trials(coupling: Coupling) -> list[Trial]:
+    """The checks of a coupling.
+
+    Args:
+        coupling: Identified or not.
+
+    Returns:
+        Trials; empty where there is nothing to check.
+    """
+    if not isinstance(coupling, LocalCoupling):
+        return []
+    sums = "as any settled gait's do" if coupling.checks_pass else "not in all rows: settle longer"
+    found = [
+        Trial(
+            f"Do rows of {symbol} sum to {rows[0].expected:g}, as shifting time demands?",
+            f"largest deviation {_worst(rows)}",
+            None,
+            sums,
+        )
+        for symbol, rows in (("P", coupling.phase_rows), ("R", coupling.gain_rows))
+    ]
+    index = coupling.nonlinearity
+    if index.value is not None and index.ci95 is not None:
+        linear = index.ci95[0] <= 0.0
+        found.append(
+            Trial(
+                "Is the chain linear and time-invariant around this gait?",
+                f"nonlinearity {formats.percent(index)}",
+                None,
+                "a deviation could not be shown" if linear else "no: what H says is a reading only",
+            )
+        )
+    if coupling.held_out:
+        good = sum(2 * one.error <= one.error_kept for one in coupling.held_out)
+        reach = coupling.valid_to
+        found.append(
+            Trial(
+                "Do the matrices predict gaits that were not used?",
+                f"{good} of {len(coupling.held_out)} at least twice as well as 'each joint keeps "
+                "its response'",
+                None,
+                "not even the smallest" if reach is None else f"yes, up to {reach:.3f} rad",
+            )
+        )
+    return found
+
+
+def _of(end: str) -> str:
+    plane, _, group = end.partition("group")
+    words = {"horizontal": "the yaw joints", "vertical": "the pitch joints"}
+    word = words.get(plane.rstrip("_"), "the driven joints")
+    return f"{word} of group {group}" if group else word
+
+
+def _common(index: Index, whose: str) -> Trial:
+    different = index.p is not None and index.p < SIGNIFICANT
+    return Trial(
+        f"Do {whose} all have the same gain and lag? (H0)",
+        f"F = {formats.number(index.value, 1)}",
+        index.p,
+        "no, they differ" if different else "open: no difference could be shown",
+    )
+
+
+def _contrast(index: Index, quantity: str, whose: str) -> Trial:
+    value = Estimate(index.value, index.ci95)
+    told = formats.estimate(formats.degrees(value), "°") if quantity == "lag" else None
+    low, high = index.ci95 or (-math.inf, math.inf)
+    larger = {"gain": "gain is larger", "lag": "lag is larger"}[quantity]
+    verdict = "open: no difference could be shown"
+    if low > 0:
+        verdict = f"yes, {larger} at the ends"
+    elif high < 0:
+        verdict = f"yes, {larger} in the middle"
+    return Trial(
+        f"Does {quantity} differ between ends and middle of {whose}?",
+        f"ends minus middle {told or formats.estimate(value, most=5)}",
+        index.p,
+        verdict,
+    )
+
+
+def _equivalence(index: Index, quantity: str, question: str) -> Trial:
+    alike = index.p is not None and index.p < SIGNIFICANT
+    scale, unit = (100.0, " %") if quantity == "gain" else (180.0 / math.pi, "°")
+    return Trial(
+        question,
+        f"largest deviation {formats.number(scale * (index.value or 0.0), 2)}{unit}",
+        index.p,
+        "yes, shown to be alike" if alike else "not shown",
+    )
+
+
+def _reversal(reversal: Reversal, indices: Mapping[str, Index]) -> Iterable[Trial]:
+    different = reversal.p < SIGNIFICANT
+    no = "no, but not as a module would make it"
+    if reversal.pairs:
+        no = f"no, modules differ{'' if reversal.tilt.excluded else ' or the floor is tilted'}"
+    yield Trial(
+        "Do the modules mirror, as identical ones do? (H1, reversal)",
+        f"T = {formats.number(reversal.statistic, 2)}",
+        reversal.p,
+        no if different else "open: no difference could be shown",
+    )
+    for quantity in ("gain", "lag"):
+        index = indices.get(f"equivalence_mirror_{quantity}")
+        if index is not None and index.value is not None:
+            margin = "2 %" if quantity == "gain" else "1°"
+            asked = f"Is every joint's {quantity} within {margin} of its mirror's?"
+            yield _equivalence(index, quantity, asked)
+
+
+def _worst(rows: tuple[RowCheck, ...]) -> str:
+    worst = max(rows, key=lambda row: abs((row.total.value or 0.0) - row.expected))
+    off = abs((worst.total.value or 0.0) - worst.expected)
+    digits = formats.decimals_for_values([off], 2)
+    return f"{formats.number(off, digits)} ({plain(worst.name)})"

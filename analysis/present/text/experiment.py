@@ -1,0 +1,266 @@
+"""An experiment as text for a terminal: the answer first, then mirror pairs and runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from undulog.capture.common.console import UNLIMITED, plain
+
+from ...experiment.kick_answer import kick_detail
+from ...experiment.reversal.modules import SIGNIFICANT
+from ...experiment.sweep_answer import sweep_detail, sweep_method
+from ...results import formats
+from ...results.coupling import LocalCoupling
+from ...results.estimate import Estimate
+from ...results.experiment import Experiment, FloorTilt, Headings, Reversal
+from ...results.sweep import LinearCoupling
+from .oscillators import body_detail
+from .table import put, sheet
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+_MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
+"""How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
+
+
+def render_experiment(
+    experiment: Experiment, *, width: int = UNLIMITED, color: bool = False
+) -> str:
+    """Set an experiment as text.
+
+    Args:
+        experiment: The result.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        Several lines, the last one ended.
+    """
+    text, prose, wide = sheet(width, color=color)
+    count = len(experiment.sessions)
+    prose.print(
+        f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.",
+        style="bold",
+        markup=False,
+    )
+    reversal = experiment.reversal
+    if reversal is not None:
+        for line in reversal_detail(reversal):
+            prose.print(line, markup=False)
+        prose.print()
+        put(prose, wide, _joint_table(reversal), [("its mirror",)])
+    if isinstance(experiment.coupling, LocalCoupling):
+        for line in kick_detail(experiment.coupling):
+            prose.print(line, markup=False)
+    if experiment.oscillators is not None:
+        for line in body_detail(experiment.oscillators):
+            prose.print(line, markup=False)
+    if isinstance(experiment.coupling, LinearCoupling):
+        for line in sweep_detail(experiment.coupling):
+            prose.print(line, markup=False)
+    prose.print()
+    put(prose, wide, _run_table(experiment), [("wave",), ("Hz",)])
+    prose.print()
+    own = [f"{warning} ({names})" for warning, names in by_warning(experiment)]
+    for warning in (*experiment.warnings, *own):
+        prose.print(f"Warning: {warning}", markup=False)
+    coupling = experiment.coupling
+    if not coupling.identifiable:
+        record = f" To identify it, record {coupling.record}." if coupling.record else ""
+        prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
+    prose.print(f"Method: {method(experiment)}", style="dim", markup=False)
+    for note, names in by_note(experiment):
+        prose.print(f"Note: {note} ({names})", style="dim", markup=False)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+
+
+def reversal_detail(reversal: Reversal) -> Iterable[str]:
+    """What stands below the answer.
+
+    Args:
+        reversal: The test.
+
+    Yields:
+        Sentences.
+    """
+    for pair in reversal.pairs:
+        yield (
+            f"{pair.name} against its mirror {pair.mirror}, over both directions: "
+            f"{_gain(pair.log_gain_contrast)} in gain, {_lag(pair.lag_contrast_rad)} in lag "
+            f"({formats.told_p(pair.p)}, ordered by {pair.by})."
+        )
+    if reversal.pairs:
+        first = reversal.pairs[0]
+        yield (
+            f"Which of the two differs, the contrast can't decide: swap {first.name} for another "
+            "module and record again, or compare one direction with a model (--null)."
+        )
+    if reversal.p < SIGNIFICANT:
+        yield _tilt(reversal.tilt, reversal.middle)
+    shares = (reversal.module_share, reversal.boundary_share)
+    if shares[0].value is not None:
+        yield (
+            f"Spread over the joints: modules {formats.percent(shares[0])}, "
+            f"boundary {formats.percent(shares[1])}."
+        )
+    if max(reversal.equivalence_gain_p, reversal.equivalence_lag_p) < SIGNIFICANT:
+        yield "Shown to be alike: every mirror pair within 2 % and 1°."
+    yield f"The test is {reversal.blind}."
+
+
+def _tilt(tilt: FloorTilt, middle: str | None) -> str:
+    """What speaks for and against a tilted floor."""
+    lean = ""
+    if tilt.gravity_rad.value is not None:
+        fall = formats.estimate(formats.degrees(tilt.gravity_rad), "°", most=2)
+        lean = f" Recorded gravity: the floor falls by {fall} along the body."
+    if tilt.headings is Headings.BALANCED:
+        return f"A tilted floor cancels: {tilt.strata} sets of mirror-image runs.{lean}"
+    checks = f"the common part is {formats.estimate(tilt.ratio, most=2)} of the contrast"
+    if tilt.middle is not None:
+        middle_size = formats.number(tilt.middle, 2) if math.isfinite(tilt.middle) else "any size"
+        checks += f", the middle joint {middle} at most {middle_size} of the largest contrast"
+    verdict = "excluded" if tilt.excluded else "not excluded"
+    return f"A tilted floor is {verdict}: {checks} (a tilt makes both large).{lean}"
+
+
+def _gain(log_gain: Estimate) -> str:
+    return formats.estimate(formats.relative(log_gain), " %", most=2)
+
+
+def _lag(lag_rad: Estimate) -> str:
+    return formats.estimate(formats.degrees(lag_rad), "°", most=2)
+
+
+def _joint_table(reversal: Reversal) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("joint", "its mirror"):
+        table.add_column(name, no_wrap=True)
+    for name in ("gain % (95 %)", "lag° (95 %)", "p"):
+        table.add_column(name, justify="right", no_wrap=True)
+    gains = [formats.relative(one.log_gain_difference) for one in reversal.joints]
+    lags = [formats.degrees(one.lag_difference_rad) for one in reversal.joints]
+    digits = [formats.decimals_for(column, most=3) for column in (gains, lags)]
+    for one, *pair in zip(reversal.joints, gains, lags, strict=True):
+        cells = [
+            f"{formats.number(q.value, d)} {formats.interval(q.ci95, d)}".rstrip()
+            for q, d in zip(pair, digits, strict=True)
+        ]
+        table.add_row(escape(one.name), escape(one.mirror), *cells, formats.p_value(one.p))
+    return table
+
+
+def _run_table(experiment: Experiment) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("session", "wave"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("Hz", justify="right", no_wrap=True)
+    table.add_column("role", no_wrap=True)
+    for run, session in zip(experiment.runs, experiment.sessions, strict=True):
+        table.add_row(
+            escape(plain(Path(run.path).name)),
+            run.wave or formats.MISSING,
+            formats.number(session.gait.frequency_hz.value, 3),
+            run.role or "left out",
+        )
+    return table
+
+
+def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
+    """Return the sessions' own warnings, each once, without what the experiment itself answers.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Warning, and the names of the files that have it, or ``all sessions``.
+    """
+    return _by_sentence(experiment, [one.warnings for one in experiment.sessions])
+
+
+def by_note(experiment: Experiment) -> list[tuple[str, str]]:
+    """Return the sessions' own notes, each once, without what the experiment itself answers.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Note, and the names of the files that have it, or ``all sessions``.
+    """
+    return _by_sentence(experiment, [one.notes for one in experiment.sessions])
+
+
+def _by_sentence(
+    experiment: Experiment, sentences: Sequence[Sequence[str]]
+) -> list[tuple[str, str]]:
+    expected = ["boundary or module:"]
+    if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
+        expected += _MANY_TONES
+    files: dict[str, list[str]] = {}
+    for session, own in zip(experiment.sessions, sentences, strict=True):
+        for sentence in own:
+            if not sentence.startswith(tuple(expected)):
+                files.setdefault(sentence, []).append(Path(session.session.path).name)
+    everyone = len(experiment.sessions)
+    return [
+        (sentence, "all sessions" if len(names) == everyone else ", ".join(names))
+        for sentence, names in files.items()
+    ]
+
+
+def method(experiment: Experiment) -> str:
+    """How the numbers of an experiment were made.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        One sentence, beginning in lower case.
+    """
+    coupling = experiment.coupling
+    if isinstance(coupling, LocalCoupling):
+        return _kick_method(coupling)
+    if isinstance(coupling, LinearCoupling):
+        return sweep_method(coupling)
+    return _reversal_method(experiment.reversal)
+
+
+def _kick_method(coupling: LocalCoupling) -> str:
+    return (
+        f"local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
+        "kick: central differences of each joint's phase and log amplitude, intervals at 95 % from "
+        "the noise within runs and the scatter between them (Student's t), that of the largest "
+        "coupling of all together, those of indices at least 95 %; all four matrices with --json."
+    )
+
+
+def _reversal_method(reversal: Reversal | None) -> str:
+    if reversal is None:
+        return "each session by itself as undulog analyse gives it; nothing is pooled."
+    tried = (
+        f"all {reversal.labellings}"
+        if reversal.labellings_tried == reversal.labellings
+        else f"{reversal.labellings_tried} random ones of {reversal.labellings}"
+    )
+    within = " within each set of mirror-image runs" if reversal.tilt.strata > 1 else ""
+    return (
+        f"reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
+        "with the wave from head to tail minus its mirror joint with the wave from tail to head; "
+        "largest studentised contrast or common part of a pair T = "
+        f"{formats.number(reversal.statistic, 2)}, its null by "
+        f"dealing out the runs' labels anew{within} ({tried}; p can't go below "
+        f"{formats.number(reversal.p_floor, 4)}), family-wise over pairs, gain and lag, so that "
+        "5 % is the level of the whole answer; intervals hold together at 95 %, those of shares by "
+        "bootstrap over runs."
+    )

@@ -1,0 +1,1 @@
+"""Frequency, gain and lag of a gait, fitted to commands and positions."""

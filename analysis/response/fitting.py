@@ -1,0 +1,360 @@
+"""From the commands and responses of a stretch to one fitted gait."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from undulog.capture.common.console import Warn
+
+from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
+from ..estimators.series import Series
+from ..estimators.settling import worst_drift
+from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
+from ..results.deciding import distinct, percent
+from ..results.remarks import Lacking, Note
+from .gait import (
+    HARMONICS,
+    MIN_CYCLES,
+    MIN_EXPLAINED,
+    MIN_SAMPLES,
+    NYQUIST_SHARE,
+    Rhythm,
+    allowed_model,
+    driven,
+    find_rhythm,
+)
+from .groups import Groups, find_groups
+from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
+from .response import Response, respond
+
+_CLEAR = 0.95
+"""Commands explained to less than this are not one steady rhythm, if still a gait."""
+
+_ROUNDS = 10
+"""Of fitting several groups in turn; exact commands need one, noisy ones two or three."""
+
+
+@dataclass(frozen=True)
+class GaitFit:
+    """One gait, fitted to all its channels with a shared frequency.
+
+    Where joints have several frequencies, it is the largest group's, and holds the others.
+
+    Attributes:
+        fit: Commands of the ``driven`` joints, then responses of the ``answered`` ones.
+        omega_error: Standard error of the shared frequency [rad/s].
+        omega_dof: Its degrees of freedom.
+        driven: Names of the joints that the gait drives, head to tail.
+        answered: Those of them with a usable response.
+        response: Of the ``answered`` joints.
+        command_amplitudes: By joint name, also of joints that are not driven and of the other
+            groups [rad].
+        others: Fits of the other groups, the larger first; they hold none themselves.
+    """
+
+    fit: HarmonicFit
+    omega_error: float
+    omega_dof: float
+    driven: tuple[str, ...]
+    answered: tuple[str, ...]
+    response: Response | None
+    command_amplitudes: Mapping[str, float]
+    others: tuple[GaitFit, ...] = ()
+
+    @property
+    def groups(self) -> tuple[GaitFit, ...]:
+        """The fits of all groups, the largest first."""
+        return (replace(self, others=()), *self.others)
+
+    @property
+    def all_answered(self) -> tuple[str, ...]:
+        """Names of the driven joints of all groups with a usable response, group by group."""
+        return tuple(name for group in (self, *self.others) for name in group.answered)
+
+    def group_of(self, joint: str) -> int | None:
+        """Find the group that a joint is in.
+
+        Args:
+            joint: Its name.
+
+        Returns:
+            The group's index in ``groups``; None where the gait does not drive the joint.
+        """
+        for index, group in enumerate((self, *self.others)):
+            if joint in group.driven:
+                return index
+        return None
+
+    def command_of(self, joint: str) -> int:
+        """Index of a driven joint's command in the fit.
+
+        Args:
+            joint: Its name.
+
+        Returns:
+            The index.
+        """
+        return self.driven.index(joint)
+
+
+@dataclass(frozen=True)
+class _Channels:
+    """The channels of one group: commands of the driven joints, responses of the answered ones."""
+
+    driven: tuple[str, ...]
+    answered: tuple[str, ...]
+    series: list[Series]
+
+
+def fit_gait(
+    commands: Mapping[str, Series], responses: Mapping[str, Series], duration_s: float, warn: Warn
+) -> GaitFit | None:
+    """Fit the gait of a stretch.
+
+    Args:
+        commands: By joint name, in chain order.
+        responses: By joint name.
+        duration_s: Length of the stretch [s].
+        warn: Takes one sentence for each thing that is missing or doubtful.
+
+    Returns:
+        The fit, or None, with a warning that says why, where there is no gait.
+    """
+    known = list((commands or responses).values())
+    kind = "commands" if commands else "responses"
+    found = find_groups(known, duration_s) if commands else _common_rhythm(known, duration_s)
+    if found is None or found.explained < MIN_EXPLAINED:
+        warn(Lacking(_no_gait(known, found, kind, duration_s)))
+        return None
+    if not commands:
+        return _responses_only(responses, found.rhythms[0])
+    channels, amplitudes = _select(commands, responses, found, warn)
+    rhythms = [one for one, group in zip(found.rhythms, channels, strict=True) if group.driven]
+    channels = [group for group in channels if group.driven]
+    if not channels:
+        warn(Lacking("no gait: no joint has enough commands at the frequency that they share"))
+        return None
+    fits = _fit_groups(channels, [one.omega for one in rhythms], duration_s)
+    _warn_groups(found, fits, duration_s, warn)
+    groups = [
+        _group_fit(group, fit, amplitudes, warn) for group, fit in zip(channels, fits, strict=True)
+    ]
+    return replace(groups[0], others=tuple(groups[1:]))
+
+
+def _common_rhythm(series: Sequence[Series], duration_s: float) -> Groups | None:
+    """One rhythm of all responses: through the body each has the tones of all groups."""
+    rhythm = find_rhythm(series, duration_s)
+    return None if rhythm is None else Groups((rhythm,), rhythm.explained)
+
+
+def _select(
+    commands: Mapping[str, Series], responses: Mapping[str, Series], found: Groups, warn: Warn
+) -> tuple[list[_Channels], dict[str, float]]:
+    """Channels of each group's driven joints, and the amplitudes of all commands."""
+    several = len(found.rhythms) > 1
+    least = max(MIN_SAMPLES, 2 * HARMONICS * len(found.rhythms) + 2 if several else 0)
+    group_of = {name: k for k, one in enumerate(found.rhythms) for name in one.names}
+
+    def enough(name: str, one: Series) -> bool:
+        return _usable(one, found.rhythms[group_of.get(name, 0)].omega, least)
+
+    usable = {name: one for name, one in commands.items() if enough(name, one)}
+    amplitudes = dict.fromkeys(usable, 0.0)
+    strays = set(found.astray)
+    followers: set[str] = set()
+    silent: list[str] = []
+    channels: list[_Channels] = []
+    for rhythm in found.rhythms:
+        moving = [one for name, one in usable.items() if name in rhythm.names]
+        if not moving:
+            channels.append(_Channels((), (), []))
+            continue
+        first = rhythm.fit
+        if len(moving) < len(rhythm.names):
+            model = replace(allowed_model(moving, rhythm.omega), lines=first.model.lines)
+            first = fit_at(moving, rhythm.omega, model)
+        follows, astray = driven(first)
+        sizes = np.abs(first.fundamental).tolist()
+        amplitudes |= zip((one.name for one in moving), sizes, strict=True)
+        chosen = [one for one, follow in zip(moving, follows, strict=True) if follow]
+        strays |= {one.name for one, stray in zip(moving, astray, strict=True) if stray}
+        moved = tuple(one.name for one in chosen)
+        followers |= set(moved)
+        answered = tuple(n for n in moved if n in responses and enough(n, responses[n]))
+        silent += [name for name in moved if name in responses and name not in answered]
+        channels.append(_Channels(moved, answered, chosen + [responses[n] for n in answered]))
+    unresolved = {name for close in found.unresolved for name in close.left}
+    _warn_undriven(
+        held=[name for name in usable if name not in strays | followers | unresolved],
+        astray=[name for name in usable if name in strays],
+        unusable=[name for name in commands if name not in usable],
+        warn=warn,
+    )
+    if silent:
+        warn(f"too few response samples for {', '.join(silent)}: gain and lag are null")
+    return channels, amplitudes
+
+
+def _fit_groups(
+    channels: Sequence[_Channels], omegas: Sequence[float], duration_s: float
+) -> list[HarmonicFit]:
+    """Fit each group with the tones of all; several in turn until no frequency moves.
+
+    The parameters of all groups are then at the common least-squares optimum, since each group's
+    normal equations, given the others' frequencies, contain the others' amplitudes.
+    """
+    omegas = list(omegas)
+    fits: list[HarmonicFit] = []
+    mixed: list[tuple[float, ...]] = []
+    for k, group in enumerate(channels):
+        model = group_model(group.series, omegas, k, duration_s)
+        responses = group.series[len(group.driven) :]
+        if len(channels) > 1 and responses:
+            wider = with_mixed_lines(responses, omegas, k, model, duration_s)
+            mixed.append(wider.lines[len(model.lines) :])
+        else:
+            mixed.append(())
+    for _ in range(_ROUNDS):
+        fits = []
+        for k, group in enumerate(channels):
+            model = group_model(group.series, omegas, k, duration_s)
+            model = replace(model, lines=(*model.lines, *mixed[k]))
+            fits.append(fit_shared(group.series, omegas[k], model))
+        moved = [abs(fit.omega - omega) for fit, omega in zip(fits, omegas, strict=True)]
+        omegas = [fit.omega for fit in fits]
+        if len(channels) == 1 or max(moved) * duration_s < LINEAR:
+            break
+    return fits
+
+
+def _group_fit(
+    group: _Channels, fit: HarmonicFit, amplitudes: Mapping[str, float], warn: Warn
+) -> GaitFit:
+    """Response of a group's joints, with its noise."""
+    moved, answered, channels = group.driven, group.answered, group.series
+    noise, bins = residual_spectrum(channels, fit)
+    variance, dof = omega_variance(fit, noise)
+    commanded = np.array([moved.index(name) for name in answered], dtype=np.int64)
+    responded = np.arange(len(moved), len(channels))
+    explained = 1 - float(fit.rss[: len(moved)].sum() / fit.total[: len(moved)].sum())
+    if explained < _CLEAR:
+        share = percent(explained, _CLEAR)
+        warn(
+            f"one steady rhythm explains {share} of the commands' variance: gain "
+            "and lag are averages over what changes"
+        )
+    response = None
+    if answered:
+        response = respond(
+            fit.fundamental[commanded],
+            _pick(noise, commanded),
+            fit.fundamental[responded],
+            _pick(noise, responded),
+            omega_variance=variance,
+            delay_between_s=fit.mean_time_s[responded] - fit.mean_time_s[commanded],
+            bins=(bins.select(commanded), bins.select(responded)),
+        )
+        drift = worst_drift(channels[len(moved) :], fit, responded.tolist())
+        if drift is not None:
+            warn(
+                f"not settled: the response of {drift.name} drifts by "
+                f"{100 * drift.log_gain:+.2g} % in gain and "
+                f"{np.degrees(-drift.phase_rad):+.2g} degrees of lag per cycle, more than any "
+                "other; start later (--start)"
+            )
+    return GaitFit(fit, variance**0.5, dof, moved, answered, response, amplitudes)
+
+
+def _responses_only(responses: Mapping[str, Series], rhythm: Rhythm) -> GaitFit:
+    usable = [one for one in responses.values() if _usable(one, rhythm.omega)]
+    moving = [one for one in usable if np.ptp(one.values) > 0]
+    fit = fit_shared(moving, rhythm.omega, allowed_model(moving, rhythm.omega))
+    variance, dof = omega_variance(fit, residual_noise(moving, fit))
+    return GaitFit(fit, variance**0.5, dof, (), (), None, {})
+
+
+def _usable(one: Series, omega: float, least: int = MIN_SAMPLES) -> bool:
+    """Enough samples, often enough, for long enough."""
+    if one.count <= least:
+        return False
+    cycles = omega * float(one.t_s[-1] - one.t_s[0] + one.period_s) / (2 * np.pi)
+    return one.period_s * omega / (2 * np.pi) < NYQUIST_SHARE and cycles >= MIN_CYCLES - 0.01
+
+
+def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Noise:
+    return Noise(noise.level[index], noise.dof[index], noise.covariance[index])
+
+
+def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], warn: Warn) -> None:
+    """Say once why joints have no gain and lag."""
+    reasons = (
+        (held, "held still by the command"),
+        (astray, "commanded something else than the common rhythm"),
+        (unusable, "commanded too seldom or too briefly"),
+    )
+    for joints, why in reasons:
+        if joints:
+            count = f"{len(joints)} joints are" if len(joints) > 1 else "1 joint is"
+            told = f"{count} {why}, gain and lag are null: {', '.join(joints)}"
+            warn(Note(told) if joints is held else told)
+
+
+def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, warn: Warn) -> None:
+    """Report what limits an analysis by groups."""
+    for close in found.unresolved:
+        low, high = distinct(close.low_hz, close.high_hz)
+        need_s = RESOLUTION / (close.high_hz - close.low_hz)
+        nulls = (
+            f"gain and lag of {', '.join(close.left)} are null"
+            if close.left
+            else "they are analysed as one group"
+        )
+        warn(
+            f"one group or two can't be decided: {len(close.kept) + len(close.left)} joints are "
+            f"commanded at {low} to {high} Hz, closer than {RESOLUTION:g}/T in {duration_s:.3g} s; "
+            f"{nulls} (record {need_s:.3g} s or more)"
+        )
+    if len(fits) < 2:
+        return
+    names = [f"{fit.frequency_hz:.4g} Hz" for fit in fits]
+    tones = mixed_tones([fit.omega for fit in fits], duration_s)
+    if tones:
+        falls = "; ".join(_mixed(tone, names) for tone in tones)
+        warn(
+            f"frequencies of the groups are commensurate within {RESOLUTION:g}/T: {falls}; what a "
+            "nonlinear body makes there is part of these joints' gain and lag, which hold for this "
+            "operating point of all groups together"
+        )
+
+
+def _mixed(tone: MixedTone, names: Sequence[str]) -> str:
+    """Name a mixed tone by its frequencies, e.g. ``3 x 0.954 Hz - 1.432 Hz``."""
+    text = ""
+    for group, factor in sorted(tone.factors.items(), key=lambda item: -item[1]):
+        size = names[group] if abs(factor) == 1 else f"{abs(factor)} x {names[group]}"
+        sign = (" - " if factor < 0 else " + ") if text else ""
+        text += f"{sign}{size}"
+    return f"{text} falls on {names[tone.group]}"
+
+
+def _no_gait(known: list[Series], found: Groups | None, kind: str, duration_s: float) -> str:
+    nulls = "gain, lag and frequency are null"
+    if not known or all(one.count < 2 or np.ptp(one.values) == 0 for one in known):
+        return f"no gait: the {kind} never move; {nulls}"
+    if found is None:
+        return (
+            f"no gait: no rhythm of at least {MIN_CYCLES:g} cycles can be told from the {kind} in "
+            f"{duration_s:.3g} s; {nulls}"
+        )
+    frequencies = ", ".join(f"{one.omega / (2 * np.pi):.3g} Hz" for one in found.rhythms)
+    one = len(found.rhythms) == 1
+    return (
+        f"no gait: the best rhythm{'' if one else 's'} ({frequencies}) explain{'s' if one else ''} "
+        f"{percent(max(found.explained, 0.0), MIN_EXPLAINED)} of the {kind}' variance, a "
+        f"gait at least {100 * MIN_EXPLAINED:.0f} %; {nulls} (if only part of the session is a "
+        "gait, choose it with --start and --stop)"
+    )

@@ -1,0 +1,177 @@
+"""What a comparison says: frozen values.
+
+``Comparison.to_dict`` is the object that ``undulog compare A B --json`` prints. Differences are B
+minus A. What could not be computed is None (null), and ``warnings`` says why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .analysis import SessionFacts
+from .estimate import Estimate, Provenance
+from .shown import Shown
+
+BODY = "body"
+"""Where a difference is that belongs to no joint."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that the sessions say of themselves, and say otherwise.
+
+    Attributes:
+        name: For example ``scenario.toml: servo_of.joint03.stall_torque``.
+        a: On side A, or None where it is not there.
+        b: On side B.
+    """
+
+    name: str
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One quantity of one joint, or of the body, on both sides.
+
+    Attributes:
+        quantity: ``gain``, ``lag``, ``energy_abs``, ``speed`` or ``cost_of_transport``.
+        place: Joint name, or ``body``.
+        unit: Of ``a``, ``b`` and ``difference``; gains differ by their ratio less one, in ``1``.
+        a: On side A.
+        b: On side B.
+        difference: B minus A (of gains B/A - 1), its interval holding together with all the
+            others of the comparison at 95 %.
+        p: Of no difference, this one by itself.
+        p_holm: The same for the whole family (Holm).
+        size: abs(difference) in margins.
+    """
+
+    quantity: str
+    place: str
+    unit: str
+    a: float
+    b: float
+    difference: Estimate
+    p: float
+    p_holm: float
+    size: float
+
+
+@dataclass(frozen=True)
+class NamedJoint:
+    """A joint that answers its command differently on the two sides.
+
+    Attributes:
+        name: The joint.
+        size: abs of the difference of ln(response/command), gain and lag in margins together.
+        p_holm: Of its clearer part, for the whole family.
+    """
+
+    name: str
+    size: float
+    p_holm: float
+
+
+@dataclass(frozen=True)
+class BrokenJoint:
+    """A joint that does not follow its command, or stands off it, on one side only.
+
+    Attributes:
+        name: The joint.
+        side: ``A`` or ``B``.
+        kinds: Kinds of fault that fit; empty for a joint that stands off its command.
+        text: What it does, as a clause.
+    """
+
+    name: str
+    side: str
+    kinds: tuple[str, ...]
+    text: str
+
+
+@dataclass(frozen=True)
+class Equivalence:
+    """Two one-sided tests that all of one quantity are the same within a margin.
+
+    Attributes:
+        quantity: As in :class:`Difference`.
+        margin: In ``unit``.
+        unit: ``1``, ``rad``, ``J`` or ``m/s``.
+        largest: The largest difference without its sign; of ln gain for gains.
+        p: Of 'some difference is as large as the margin'.
+    """
+
+    quantity: str
+    margin: float
+    unit: str
+    largest: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """Mean cycle of a joint's response by gait phase.
+
+    Attributes:
+        name: The joint.
+        a_rad: On side A at each phase [rad].
+        b_rad: On side B [rad].
+        difference_rad: B minus A [rad].
+        half_rad: Half widths of its 95 % intervals, each phase by itself [rad].
+        rms_rad: Root mean square of the difference [rad].
+        largest: The largest difference, with its sign [rad]; its interval does not count that it
+            was chosen.
+        largest_at_rad: The phase where it is [rad].
+    """
+
+    name: str
+    a_rad: tuple[float, ...]
+    b_rad: tuple[float, ...]
+    difference_rad: tuple[float, ...]
+    half_rad: tuple[float, ...]
+    rms_rad: float
+    largest: Estimate
+    largest_at_rad: float
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
+    """Two sessions, or two groups of them, side by side.
+
+    Attributes:
+        answer: One sentence.
+        verdict: ``different``, ``same`` (within the margins), ``small`` (different, by less than
+            the margins) or ``open``.
+        design: ``sessions`` (one a side, errors from each session's own noise), ``groups``
+            (independent runs, Welch) or ``pairs`` (run by run).
+        a: Sessions of side A.
+        b: Sessions of side B.
+        partial: What the comparison leaves out or takes in its stride; None for nothing.
+        changed: What the sessions themselves say was changed.
+        broken: Joints that do not follow their command on one side only: the first differences.
+        named: Joints that answer differently, the largest difference first.
+        differences: All decisions: those beyond doubt first, by size, then the others by p.
+        equivalence: Of gain, lag, energy and motion, each over all joints.
+        phase_rad: Gait phases of the waveforms [rad].
+        waveforms: Mean cycles, head to tail.
+        warnings: One sentence each.
+        provenance: How it was made.
+    """
+
+    answer: str
+    verdict: str
+    design: str
+    a: tuple[SessionFacts, ...]
+    b: tuple[SessionFacts, ...]
+    partial: str | None
+    changed: tuple[Change, ...]
+    named: tuple[NamedJoint, ...]
+    differences: tuple[Difference, ...]
+    equivalence: tuple[Equivalence, ...]
+    phase_rad: tuple[float, ...]
+    waveforms: tuple[Waveform, ...]
+    warnings: tuple[str, ...]
+    provenance: Provenance
+    broken: tuple[BrokenJoint, ...] = ()

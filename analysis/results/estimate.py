@@ -1,0 +1,56 @@
+"""What an analysis says: frozen values at the border between estimators and readers of results.
+
+``Analysis.to_dict`` is the object that ``undulog analyse --json`` prints and that a result file
+holds. A value that could not be computed is None (null), and ``Analysis.warnings`` or
+``Analysis.notes`` says why.
+Angles are in rad, energies in J over the analysed windows, times in s from the session's start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+Interval = tuple[float, float]
+
+
+def leaves_out_zero(ci95: Interval | None) -> bool:
+    """Whether a value differs from zero beyond doubt.
+
+    Args:
+        ci95: Its 95 % interval, or None.
+
+    Returns:
+        False where there is no interval.
+    """
+    return ci95 is not None and (ci95[0] > 0 or ci95[1] < 0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % interval.
+
+    Attributes:
+        value: The estimate, or None where it could not be computed.
+        ci95: Low and high end of the 95 % interval, or None.
+    """
+
+    value: float | None = None
+    ci95: Interval | None = None
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """How the result was made, so that it can be made again.
+
+    Attributes:
+        command: The command line that makes it.
+        versions: Package name to version.
+        inputs: Input file to SHA-256.
+        options: Option name to value.
+    """
+
+    command: str
+    versions: dict[str, str]
+    inputs: dict[str, str]
+    options: dict[str, Any]

@@ -1,0 +1,340 @@
+"""Numbers as people read them: degrees, decimals that fit the interval, a true minus sign.
+
+A value keeps its full precision in the page (``<data value=...>``); what is printed here is
+rounded by its interval, as the Particle Data Group does (Review of Particle Physics,
+Introduction, section 5.3): two digits of the half width if they are 35 or less, else one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from datetime import UTC, datetime
+
+from undulog.capture.common.console import plain
+
+from .analysis import GaitFacts
+from .estimate import Estimate, Interval
+
+MISSING = "\N{EN DASH}"
+"""Printed where a value could not be computed."""
+
+MINUS = "\N{MINUS SIGN}"
+
+LEVEL = 0.05
+"""Below it a p-value decides; what is printed stays on the side where the p-value is."""
+
+_MORE_DIGITS = 6
+"""Digits that a sentence may add so that what decides is seen."""
+
+_LONG = 1e9
+"""From here on numbers have an exponent: a damaged sample can be of any size."""
+
+
+def number(value: float | None, decimals: int) -> str:
+    """A number with fixed decimals, or an en dash.
+
+    Args:
+        value: Any unit; None or not finite prints as an en dash.
+        decimals: Digits after the point, at least 0.
+
+    Returns:
+        For example ``−0.016``.
+    """
+    if value is None or not math.isfinite(value):
+        return MISSING
+    text = f"{value:.{decimals}f}" if abs(value) < _LONG else f"{value:.3g}"
+    if float(text) == 0.0:
+        text = text.lstrip("-")
+    return text.replace("-", MINUS)
+
+
+def interval(ci95: Interval | None, decimals: int) -> str:
+    """A 95 % interval in square brackets, or an empty string.
+
+    Args:
+        ci95: Low and high end, or None.
+        decimals: Digits after the point.
+
+    Returns:
+        For example ``[5.9, 6.5]``.
+    """
+    if ci95 is None:
+        return ""
+    low, high = ci95
+    return f"[{number(low, decimals)}, {number(high, decimals)}]"
+
+
+def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
+    """A value with its unit and its interval, for a sentence.
+
+    Args:
+        quantity: The estimate, already in ``unit``.
+        unit: Written behind the value, with its own space where it wants one, e.g. ``" Hz"``.
+        most: Digits after the point at most; as many as the interval deserves.
+
+    Returns:
+        For example ``6.2° [5.9, 6.5]``; an en dash where the value is missing. An interval that
+        excludes zero is never printed with an end at zero: it has as many digits as that takes.
+    """
+    if quantity.value is None:
+        return MISSING
+    digits = decimals_for([quantity], most=most)
+    if quantity.ci95 is not None:
+        digits = _beside_zero(quantity.ci95, digits)
+    text = number(quantity.value, digits) + unit
+    return text if quantity.ci95 is None else f"{text} {interval(quantity.ci95, digits)}"
+
+
+def gait_frequency(gait: GaitFacts) -> str:
+    """The gait's frequency, or the frequency of each group of joints.
+
+    Args:
+        gait: The gait.
+
+    Returns:
+        For example ``0.97 Hz [0.969, 0.971]`` or ``1.432 Hz (8 joints) and 0.954 Hz (8 joints)``,
+        each with its interval.
+    """
+    if len(gait.groups) < 2:
+        return estimate(gait.frequency_hz, " Hz", most=4)
+    parts = [
+        f"{estimate(group.frequency_hz, ' Hz', most=4)} ({len(group.joints)} "
+        f"joint{'' if len(group.joints) == 1 else 's'})"
+        for group in gait.groups
+    ]
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def _beside_zero(ci95: Interval, digits: int) -> int:
+    """Digits that show that an interval excludes zero; those given where it doesn't."""
+    low, high = ci95
+    end = min(abs(low), abs(high))
+    if not (low * high > 0 and math.isfinite(end)):
+        return digits
+    needed = math.floor(-math.log10(2 * end)) + 1  # beyond half a unit of the last digit
+    return max(digits, min(needed, digits + _MORE_DIGITS))
+
+
+def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) -> int:
+    """Decimals that show one or two digits of the typical half width of the intervals.
+
+    Args:
+        quantities: Estimates of one table column, in the unit they are printed in.
+        least: Never fewer.
+        most: Never more.
+
+    Returns:
+        Digits after the point, the same for the whole column so that it lines up. Without any
+        interval, four digits of the largest value.
+    """
+    known = list(quantities)
+    half = sorted(
+        0.5 * (q.ci95[1] - q.ci95[0]) for q in known if q.ci95 is not None and q.ci95[1] > q.ci95[0]
+    )
+    if half:
+        wanted = _decimals_of(half[len(half) // 2])
+    else:
+        wanted = decimals_for_values((q.value for q in known), 4)
+    return min(max(wanted, least), most)
+
+
+def _decimals_of(half_width: float) -> int:
+    """Particle Data Group: 0.0354 shows 0.035, 0.0355 shows 0.04."""
+    if not math.isfinite(half_width):
+        return 0
+    power = math.floor(math.log10(half_width))
+    return (1 if half_width / 10.0**power <= 3.54 else 0) - power
+
+
+def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
+    """Decimals that show so many significant digits of the largest value.
+
+    Args:
+        values: One table column; None is skipped.
+        digits: Significant digits of the largest.
+
+    Returns:
+        Digits after the point, 0 to 6.
+    """
+    finite = [abs(v) for v in values if v is not None and math.isfinite(v)]
+    largest = max(finite, default=0.0)
+    if largest == 0.0:
+        return 0
+    return min(max(digits - 1 - math.floor(math.log10(largest)), 0), 6)
+
+
+def degrees(quantity: Estimate) -> Estimate:
+    """The same estimate in degrees.
+
+    Args:
+        quantity: In rad.
+
+    Returns:
+        In degrees.
+    """
+    return scaled(quantity, 180.0 / math.pi)
+
+
+def scaled(quantity: Estimate, factor: float) -> Estimate:
+    """The same estimate in another unit.
+
+    Args:
+        quantity: The estimate.
+        factor: New units in one old unit, positive.
+
+    Returns:
+        Value and interval times ``factor``.
+    """
+    value, ci95 = quantity.value, quantity.ci95
+    return Estimate(
+        None if value is None else value * factor,
+        None if ci95 is None else (ci95[0] * factor, ci95[1] * factor),
+    )
+
+
+def percent(share: Estimate) -> str:
+    """A share with its interval.
+
+    Args:
+        share: 0 to 1.
+
+    Returns:
+        For example ``97 % [91, 99]``; an en dash where it is missing.
+    """
+    return estimate(scaled(share, 100.0), " %", most=1)
+
+
+def coverage(share: float) -> str:
+    """Return a covered share of time, rounded down: only what is whole is ``100 %``.
+
+    Args:
+        share: 0 to 1.
+
+    Returns:
+        For example ``98 %`` or ``99.9 %``.
+    """
+    percents = 100.0 * share
+    if percents > 99.0:
+        return f"{math.floor(10 * percents + 1e-6) / 10:g} %"
+    return f"{math.floor(percents + 1e-6):d} %"
+
+
+def relative(log_gain: Estimate) -> Estimate:
+    """A ratio of gains, less one, in percent.
+
+    Args:
+        log_gain: Logarithm of the ratio.
+
+    Returns:
+        In percent.
+    """
+    value, ci95 = log_gain.value, log_gain.ci95
+    return Estimate(
+        None if value is None else 100 * math.expm1(value),
+        None if ci95 is None else (100 * math.expm1(ci95[0]), 100 * math.expm1(ci95[1])),
+    )
+
+
+def p_value(p: float | None) -> str:
+    """Return a p-value: three decimals, never a bare zero, on its own side of 5 %.
+
+    Args:
+        p: 0 to 1, or None.
+
+    Returns:
+        For example ``0.013`` or ``< 0.001``; more decimals where three would move it to the other
+        side of :data:`LEVEL`, e.g. ``0.0498``.
+    """
+    if p is None or not math.isfinite(p):
+        return MISSING
+    if p < 0.001:
+        return "< 0.001"
+    digits = 3
+    while (round(p, digits) < LEVEL) != (p < LEVEL):
+        digits += 1
+    return f"{p:.{digits}f}"
+
+
+def told_p(p: float | None) -> str:
+    """A p-value with its name.
+
+    Args:
+        p: 0 to 1, or None.
+
+    Returns:
+        For example ``p = 0.013`` or ``p < 0.001``.
+    """
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def utc(time_ns: int) -> str:
+    """A Unix time as date and time of day in UTC.
+
+    Args:
+        time_ns: Unix time [ns].
+
+    Returns:
+        For example ``2026-03-01 09:30:00 UTC``; the bare number where no calendar reaches it.
+    """
+    try:
+        moment = datetime.fromtimestamp(time_ns // 1_000_000_000, tz=UTC)
+    except (OverflowError, OSError, ValueError):
+        return f"{time_ns} ns"
+    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def short(text: str, most: int = 40) -> str:
+    """Text that has to fit into a figure.
+
+    Args:
+        text: From a log.
+        most: Characters kept at most; the middle gives way, since names differ at their ends.
+
+    Returns:
+        Plain text.
+    """
+    known = plain(text)
+    if len(known) <= most:
+        return known
+    return known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
+
+
+def filename(path: str) -> str:
+    """Last part of a path of any system.
+
+    Args:
+        path: As the user named it.
+
+    Returns:
+        Plain text.
+    """
+    return plain(path.replace("\\", "/").rstrip("/").rpartition("/")[2] or path)
+
+
+def sentence(text: str) -> str:
+    """Text with a capital at its beginning and one stop at its end.
+
+    Args:
+        text: From a log or a result; a name at its beginning keeps its own letters.
+
+    Returns:
+        Plain text.
+    """
+    return capital(plain(text).strip().rstrip(".")) + "."
+
+
+def capital(text: str) -> str:
+    """Text with a capital at its beginning; a name keeps its own letters.
+
+    Args:
+        text: Plain text.
+
+    Returns:
+        The text.
+    """
+    first = text.partition(" ")[0]
+    if first.endswith(":") or any(c in "._/\\" or c.isdigit() for c in first):
+        return text
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,248 @@
+"""What is said of oscillators: frozen values, parts of an analysis and of an experiment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .coupling import Rows
+from .estimate import Estimate
+
+
+@dataclass(frozen=True)
+class Link:
+    """What one oscillator does to another.
+
+    Attributes:
+        source: Whose phase acts.
+        target: Whose phase it turns.
+        K: Strength of the coupling [1/s], 0 or more.
+        lag_rad: psi, the lead of the source over the target at which it does nothing [rad].
+    """
+
+    source: str
+    target: str
+    K: Estimate
+    lag_rad: Estimate
+
+
+@dataclass(frozen=True)
+class Rate:
+    """What one oscillator does by itself.
+
+    Attributes:
+        name: Its joint.
+        omega: Its own rate [rad/s].
+        feedback: eps_i, what it takes from its own servo's angle [1/s]; empty where no angle was
+            logged.
+        noise: Of its phase [rad/sqrt(s)].
+    """
+
+    name: str
+    omega: Estimate
+    feedback: Estimate
+    noise: float
+
+
+@dataclass(frozen=True)
+class ChainCoupling:
+    """The couplings of one chain of oscillators, or why they can't be told.
+
+    Attributes:
+        plane: Of its joints.
+        identifiable: Whether the phases tell the couplings.
+        why: Why not, or how.
+        record: What to record so that they do; None if they do.
+        condition_number: Of the regression of the worst oscillator; None where it is infinite.
+        kicks: Instants at which a phase jumps.
+        duration_s: Of the phases used.
+        reach: abs(i - j) up to which couplings are looked for.
+        links: Empty if not identifiable.
+        oscillators: Empty if not identifiable.
+    """
+
+    plane: str
+    identifiable: bool
+    why: str
+    record: str | None
+    condition_number: float | None
+    kicks: int
+    duration_s: float
+    reach: int
+    links: tuple[Link, ...] = ()
+    oscillators: tuple[Rate, ...] = ()
+
+
+ENTRAINMENT_LABEL = (
+    "P read as entrainment, P = (Gamma + L)^-1 Gamma: Gamma^-1 L = P^-1 - I, coupling relative to "
+    "the entrainment by the command; absolute rates need the way back from kicks"
+)
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One mode of I - P.
+
+    Attributes:
+        real: Rate at which it relaxes; negative = it grows [eps].
+        imag: Rate at which it turns meanwhile [eps].
+        sensitivity: How much more its rate may move than P: 1 in a normal matrix.
+        pattern_abs: Share of each joint, of a vector of length 1, shape (m,).
+        pattern_rad: Phase of each joint in it [rad], shape (m,).
+    """
+
+    real: Estimate
+    imag: Estimate
+    sensitivity: float
+    pattern_abs: tuple[float, ...]
+    pattern_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Comparator:
+    """A homogeneous chain with the same ||I - P||: Toeplitz, with rows scaled to sum to 1.
+
+    Attributes:
+        slowest: Its slowest rate [eps].
+        strong: Its strong modes.
+        real: Its rates' real parts, the slowest first [eps].
+    """
+
+    slowest: float
+    strong: int
+    real: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Pseudospectrum of I - P: how large an error of P makes z an eigenvalue.
+
+    Attributes:
+        real: Of z [eps], shape (r,).
+        imag: Of z [eps], shape (c,).
+        level: Smallest singular value of z I - (I - P) on deviations from the mean phase,
+            shape (r, c).
+        noise: Spectral norm that the error of that matrix stays below (95 %).
+    """
+
+    real: tuple[float, ...]
+    imag: tuple[float, ...]
+    level: Rows
+    noise: float
+
+
+@dataclass(frozen=True)
+class RelativeCoupling:
+    """The entrainment reading.
+
+    Attributes:
+        label: Says what it is.
+        value: P^-1 - I, row = joint that follows; None where P is singular.
+        ci95_half: Half widths of the 95 % intervals, one by one.
+        condition_number: Of P; None where it is infinite.
+    """
+
+    label: str
+    value: Rows | None
+    ci95_half: Rows | None
+    condition_number: float | None
+
+
+@dataclass(frozen=True)
+class BodyOscillators:
+    """How oscillators that feel their own servos would synchronise through the body.
+
+    Attributes:
+        answer: One sentence.
+        joints: Names, head to tail, m.
+        slowest: Real part of the slowest rate but that of all phases together [eps].
+        strong: Modes with a rate above 0.1.
+        strong_above: That bound [eps].
+        growth: Fastest growth of a deviation for a while [eps]; negative = all shrink at once.
+        modes: The slowest first, m - 1.
+        comparator: A homogeneous chain as strong.
+        explicit_coupling: Coupling of next neighbours, both ways, which lifts every mode to
+            ``strong_above`` [eps]; its value is None where none does.
+        pseudospectrum: Levels around the rates.
+        entrainment: The other reading of P.
+    """
+
+    answer: str
+    joints: tuple[str, ...]
+    slowest: Estimate
+    strong: Estimate
+    strong_above: float
+    growth: Estimate
+    modes: tuple[Mode, ...]
+    comparator: Comparator
+    explicit_coupling: Estimate
+    pseudospectrum: Levels
+    entrainment: RelativeCoupling
+
+
+@dataclass(frozen=True)
+class LoopMode:
+    """One pattern of the phases of a closed loop.
+
+    Attributes:
+        rate: At which it relaxes [1/s]; negative = it grows.
+        turning: At which it turns meanwhile [rad/s].
+        pattern_abs: Share of each joint, of a vector of length 1, shape (m,).
+        pattern_rad: Phase of each joint in it [rad], shape (m,).
+    """
+
+    rate: Estimate
+    turning: Estimate
+    pattern_abs: tuple[float, ...]
+    pattern_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """What is left of a kick, at k times.
+
+    Attributes:
+        times_s: After the kick [s], k.
+        phase_rad: Deviations [rad], shape (k, m).
+        low_rad: Low ends of their 95 % intervals [rad], shape (k, m).
+        high_rad: High ends [rad], shape (k, m).
+    """
+
+    times_s: tuple[float, ...]
+    phase_rad: Rows
+    low_rad: Rows
+    high_rad: Rows
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """How oscillators that feel their servos relax: d phi' = J d phi, predicted from kicks.
+
+    Attributes:
+        answer: One sentence.
+        joints: Names, head to tail, m.
+        eps: Of the feedback [1/s].
+        age_s: How old an angle is on average when it is used [s].
+        frequency_hz: Of the gait that was kicked.
+        bias: b = g sin Delta, which takes the steady part of the feedback away, m.
+        J: Rates [1/s], row = oscillator that is turned, shape (m, m).
+        J_standard_error: Same shape.
+        modes: The slowest first, m - 1; all phases together neither relax nor grow.
+        relaxation: What is left of a kick, if one was asked for.
+        valid_to: Largest deviation that held-out runs support [rad]; None where there are none.
+        fastest: Largest rate of a deviation [1/s].
+        limits: What the prediction holds for, what speaks against it first.
+    """
+
+    answer: str
+    joints: tuple[str, ...]
+    eps: float
+    age_s: float
+    frequency_hz: float
+    bias: tuple[float, ...]
+    J: Rows
+    J_standard_error: Rows
+    modes: tuple[LoopMode, ...]
+    relaxation: Relaxation | None
+    valid_to: float | None
+    fastest: float
+    limits: tuple[str, ...]

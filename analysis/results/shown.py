@@ -1,0 +1,171 @@
+"""What every result can do besides holding numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class ShownPicture(Protocol):
+    """A figure, as :class:`.analysis.Picture`."""
+
+    @property
+    def svg(self) -> str:
+        """The ``<svg>`` element."""
+        ...
+
+    @property
+    def caption(self) -> str:
+        """One or two sentences, plain text."""
+        ...
+
+    def to_svg(self) -> str:
+        """Return the figure as the text of a file."""
+        ...
+
+    def save(self, path: Path | str, *, force: bool = False) -> Path:
+        """Write the figure to a file."""
+        ...
+
+
+class Presentation(Protocol):
+    """The implementation of the methods of :class:`Shown`, which is above all results."""
+
+    def text(self, result: Shown) -> str:
+        """Return the text of a result."""
+        ...
+
+    def headline(self, result: Shown) -> str:
+        """Return the answer in one line."""
+        ...
+
+    def html(self, result: Shown) -> str:
+        """Return what a notebook shows."""
+        ...
+
+    def frames(self, result: Shown) -> dict[str, pd.DataFrame]:
+        """Return the tables."""
+        ...
+
+    def picture(self, result: Shown, what: str | None) -> ShownPicture:
+        """Draw a picture."""
+        ...
+
+    def save(self, result: Shown, path: Path, *, force: bool) -> Path:
+        """Write the JSON file."""
+        ...
+
+    def save_tables(self, result: Shown, folder: Path, *, force: bool) -> list[Path]:
+        """Write the Parquet files."""
+        ...
+
+
+_make: list[Callable[[], Presentation]] = []
+
+
+def present_with(make: Callable[[], Presentation]) -> None:
+    """Set what presents results.
+
+    Args:
+        make: Called when a result is first printed, drawn or saved.
+    """
+    _make[:] = [make]
+
+
+def _presentation() -> Presentation:
+    return _make[0]()
+
+
+class Shown:
+    """A result that prints, plots, becomes tables, and goes to files and back.
+
+    The first line printed is the answer. ``frames`` gives the numbers as pandas tables whose
+    columns carry their units; ``undulog.analysis.load`` reads what ``save`` wrote.
+    """
+
+    def __str__(self) -> str:
+        """The result as text, the answer first."""
+        return _presentation().text(self).rstrip("\n")
+
+    def __repr__(self) -> str:
+        """The answer in one line."""
+        from undulog.capture.common.console import plain
+
+        return f"<{type(self).__name__}: {plain(_presentation().headline(self))}>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the answer, and the first table."""
+        return _presentation().html(self)
+
+    def frames(self) -> dict[str, pd.DataFrame]:
+        """The numbers as tables.
+
+        Returns:
+            Name to table, the most telling first. Columns end in their unit (``lag_rad``), the ends
+            of a 95 % interval are ``lag_low_rad`` and ``lag_high_rad``; what could not be computed
+            is NaN.
+        """
+        return _presentation().frames(self)
+
+    def plot(self, what: str | None = None) -> ShownPicture:
+        """The result as a picture, as the report draws it; needs the extra ``report``.
+
+        Args:
+            what: Which picture, where there are several; the first by default.
+
+        Returns:
+            A picture that a notebook shows and that ``save`` writes.
+
+        Raises:
+            UsageError: If there is no such picture; the message lists those that are.
+            MissingExtraError: If matplotlib is not installed.
+        """
+        return _presentation().picture(self, what)
+
+    def save(self, path: Path | str, *, force: bool = False) -> Path:
+        """Write the result to a JSON file, the same object that ``--json`` prints.
+
+        Args:
+            path: A name that ends in .json.
+            force: Replace the file if it exists.
+
+        Returns:
+            The path.
+
+        Raises:
+            UsageError: If the name ends in anything else, or its folder doesn't exist.
+            OutputExistsError: If it is there and ``force`` is not given.
+            LogWriteError: If it can't be written.
+        """
+        return _presentation().save(self, Path(path), force=force)
+
+    def to_parquet(self, folder: Path | str, *, force: bool = False) -> list[Path]:
+        """Write every table to a Parquet file of its own; needs the extra ``parquet``.
+
+        Args:
+            folder: Made if it isn't there.
+            force: Replace files that exist.
+
+        Returns:
+            The files, named after the tables.
+
+        Raises:
+            OutputExistsError: If one is there and ``force`` is not given.
+            MissingExtraError: If pyarrow is not installed.
+            LogWriteError: If one can't be written.
+        """
+        return _presentation().save_tables(self, Path(folder), force=force)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain JSON values.
+
+        Returns:
+            A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
+        """
+        import dataclasses
+
+        return dataclasses.asdict(self)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,382 @@
+"""The answer in words: who does not follow, who stands out, and how the rest differs.
+
+The order is that of what a reader must act on: joints that do not follow their command, joints
+that respond differently from the others, then the shape of the rest. Each number is one whose
+simultaneous interval excludes zero; only equivalence tests of every commanded joint say "alike".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from undulog.capture.common.console import plain
+from undulog.capture.following.fault import KINDS as FAULT_KINDS
+
+from ..results import formats
+from ..results.analysis import GaitFacts, Index, JointResult
+from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
+from ..results.estimate import Estimate
+from .examine import Findings
+
+NAMED = 4
+"""Joints that a sentence names at most; the others are counted."""
+
+_FLAGGED = 6
+_NEGLIGIBLE = {"gain": 5e-4, "lag": math.radians(0.05)}
+"""Shapes smaller than this are left to the tables."""
+
+_KIND_WORDS = {
+    "dead": "dead",
+    "jammed": "jammed",
+    "stalled": "stalled",
+    "inverted": "inverted",
+    "intermittent": "intermittent",
+    "at_limit": "at a limit",
+    "slipped": "slipped",
+    "swapped": "swapped with another joint",
+    "frozen_sensor": "a frozen sensor",
+    "inverted_sensor": "an inverted sensor",
+    "stale_sensor": "a sensor with old values",
+    "scaled_sensor": "a sensor of wrong scale or unit",
+    "slipped_sensor": "a sensor whose zero moved",
+    "noisy_sensor": "a noisy sensor",
+    "wrapped_sensor": "a sensor that wrapped around",
+    "drifting_sensor": "a drifting sensor",
+    "clipped_sensor": "a clipped sensor",
+    "lost_samples": "lost samples",
+}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What an answer is composed of.
+
+    Attributes:
+        gait: The rhythm.
+        joints: The joints' results.
+        commanded: Names of the joints whose command moves.
+        not_following: Joints that do not follow, in chain order.
+        findings: Joints that stand out, and the shape of the rest.
+        warnings: Of the analysis: they hold the reason where there is no answer.
+        left_out: What of a session with a break is analysed; empty without a break.
+    """
+
+    gait: GaitFacts
+    joints: tuple[JointResult, ...]
+    commanded: tuple[str, ...]
+    not_following: tuple[NotFollowing, ...]
+    findings: Findings
+    warnings: tuple[str, ...]
+    left_out: str = ""
+
+
+def compose(facts: Facts) -> Answer:
+    """Compose the answer of one session.
+
+    Args:
+        facts: What is known.
+
+    Returns:
+        The answer.
+    """
+    known = [joint for joint in facts.joints if joint.gain.value is not None]
+    first = _named(facts)
+    broken = f"{facts.left_out[:1].upper()}{facts.left_out[1:]}." if facts.left_out else ""
+    verdict, rest, detail = _rest(facts, known)
+    if first:
+        verdict = Verdict.UNLIKE
+        detail = _responding(facts, known) + _caveat(facts.joints)
+    findings = facts.findings
+    compared = set(findings.compared)
+    everyone = bool(facts.commanded) and set(facts.commanded) <= compared
+    alike: bool | None = None
+    if first or findings.shape or findings.undecided:
+        alike = False
+    if verdict is Verdict.ALIKE and everyone:
+        alike = True
+    return Answer(
+        verdict=verdict,
+        sentence=" ".join(part for part in (first, rest, _left_out(facts), broken) if part),
+        detail=detail,
+        not_following=facts.not_following,
+        stand_out=findings.stand_out,
+        undecided=_undecided(findings, facts) or None,
+        shape=findings.shape,
+        alike=alike,
+        compared=len(compared),
+        commanded=len(facts.commanded),
+    )
+
+
+def find(indices: Mapping[str, Index], stem: str) -> dict[str, Index]:
+    """The indices of one kind that have a value, by plane and group.
+
+    Args:
+        indices: Name to index; where both planes are driven, names end in the plane, where joints
+            of one plane have several frequencies, in the group.
+        stem: Name without the plane, e.g. ``gain_cv``.
+
+    Returns:
+        End of the name, e.g. ``horizontal``, ``vertical_group1`` or an empty string, to the index.
+    """
+    pattern = re.compile(rf"{re.escape(stem)}_?((?:horizontal|vertical)?(?:_?group\d+)?)")
+    found = {name: pattern.fullmatch(name) for name in indices}
+    return {
+        match[1]: indices[name]
+        for name, match in found.items()
+        if match is not None and indices[name].value is not None
+    }
+
+
+def kinds_in_words(kinds: Sequence[str]) -> str:
+    """Kinds of fault that fit, as a reader takes them.
+
+    Args:
+        kinds: Keys of :data:`.capture.following.fault.KINDS`.
+
+    Returns:
+        For example ``jammed, dead or a frozen sensor``.
+    """
+    words = [_KIND_WORDS.get(kind, FAULT_KINDS.get(kind, ("", kind))[1]) for kind in kinds]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def fault_in_words(fault: NotFollowing) -> str:
+    """One joint that does not follow, as a clause.
+
+    Args:
+        fault: The joint.
+
+    Returns:
+        For example ``joint04 does not follow its command from 7.4 s on: jammed or dead``.
+    """
+    if fault.kinds == ("lost_samples",):
+        return f"{plain(fault.joint)} {fault.evidence}"
+    when = ""
+    if fault.since_s is not None and fault.until_s is None:
+        when = f" from {fault.since_s:.1f} s on"
+    elif fault.since_s is None and fault.until_s is not None:
+        when = f" until {fault.until_s:.1f} s"
+    elif fault.since_s is not None and fault.until_s is not None:
+        share = max(1.0, 100 * fault.share)
+        when = f" for {share:.0f} % of the time from {fault.since_s:.1f} to {fault.until_s:.1f} s"
+    return f"{plain(fault.joint)} does not follow its command{when}: {kinds_in_words(fault.kinds)}"
+
+
+def _named(facts: Facts) -> str:
+    """The joints that do not follow, then those that stand out; empty for none."""
+    clauses = [fault_in_words(each) for each in facts.not_following[:NAMED]]
+    if len(facts.not_following) > NAMED:
+        names = [plain(each.joint) for each in facts.not_following[NAMED:]]
+        clauses.append(f"{', '.join(names)} do not follow either")
+    by_joint: dict[str, list[StandOut]] = {}
+    for each in facts.findings.stand_out:
+        by_joint.setdefault(each.joint, []).append(each)
+    for joint, several in list(by_joint.items())[:NAMED]:
+        sizes = " and ".join(deviation_in_words(each) for each in several)
+        clauses.append(f"{plain(joint)} responds differently from the others, {sizes}")
+    if len(by_joint) > NAMED:
+        names = [plain(joint) for joint in list(by_joint)[NAMED:]]
+        clauses.append(f"{', '.join(names)} respond differently, too")
+    undecided = _undecided(facts.findings, facts)
+    if undecided:
+        clauses.append(undecided)
+    # A joint's name keeps its letters at the beginning, too: a reader searches for it.
+    return f"{'; '.join(clauses)}." if clauses else ""
+
+
+def _left_out(facts: Facts) -> str:
+    """Driven joints that are neither compared nor named; empty where nothing was compared."""
+    known = {*facts.findings.compared, *(each.joint for each in facts.not_following)}
+    names = [plain(name) for name in facts.commanded if name not in known]
+    if not names or not facts.findings.compared:
+        return ""
+    listed = ", ".join(names[:NAMED])
+    listed += f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"Not compared: {listed}."
+
+
+def _undecided(findings: Findings, facts: Facts) -> str:
+    if not findings.undecided:
+        return ""
+    word = _joints_word(facts, *findings.undecided[0])
+    return f"the {word} differ, but with fewer than 4 sound ones it can't be decided which one"
+
+
+def deviation_in_words(each: StandOut) -> str:
+    """One deviation with its interval; the word carries the sign.
+
+    Args:
+        each: The deviation.
+
+    Returns:
+        For example ``gain 20.1 % [18.9, 21.2] less``.
+    """
+    sign = -1.0 if each.deviation < 0 else 1.0
+    low, high = sorted(sign * end for end in each.ci95)
+    size = Estimate(sign * each.deviation, (low, high))
+    if each.quantity == "gain":
+        text = formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+        return f"gain {text} {'less' if sign < 0 else 'more'}"
+    text = formats.estimate(formats.degrees(size), "°", most=2)
+    if each.quantity == "offset":
+        return f"its mean {text} {'below' if sign < 0 else 'above'} its command's"
+    return f"lag {text} {'less' if sign < 0 else 'more'}"
+
+
+def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str]:
+    """Verdict, sentence and detail on the joints that are not named."""
+    named = bool(facts.not_following or facts.findings.stand_out or facts.findings.undecided)
+    if facts.gait.frequency_hz.value is None:
+        lead = "No gait was found in this session, so there is no gain and no lag to compare."
+        return Verdict.NOTHING, lead, _why_not(facts, "no gait")
+    if not known:
+        lead = "No joint could be compared with its command."
+        return Verdict.NOTHING, lead, _why_not(facts, "gain and lag are null")
+    if len(known) == 1:
+        return _single(facts, known[0], named=named)
+    detail = _responding(facts, known) + _caveat(facts.joints)
+    return *_compared(facts, named=named), detail
+
+
+def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, str, str]:
+    lag = formats.estimate(formats.degrees(joint.lag_rad), "°", most=2)
+    lead = f"{'One other' if named else 'One'} joint was driven: its gain is "
+    lead += f"{formats.estimate(joint.gain)}, its lag {lag} behind the command."
+    return (
+        Verdict.SINGLE,
+        lead,
+        "There is no second joint to compare it with." + _caveat(facts.joints),
+    )
+
+
+def _compared(facts: Facts, *, named: bool) -> tuple[Verdict, str]:
+    """Verdict and sentence on the joints that were compared and are not named."""
+    findings = facts.findings
+    if findings.undecided:
+        return Verdict.UNLIKE, ""
+    shapes = _shapes(facts)
+    if findings.alike and (named or _everyone(facts)):
+        left = len(findings.compared) - len({each.joint for each in findings.stand_out})
+        others = f"The other {left} joints" if named else f"The segments move alike: all {left}"
+        rest = "move alike, within" if named else "joints are within"
+        return Verdict.ALIKE, f"{others} {rest} 2 % of gain and 1 degree of lag."
+    if shapes:
+        lead = "The others differ" if named else "The segments do not move alike"
+        return Verdict.UNLIKE, f"{lead}: {shapes}."
+    subject = "the others" if named else "the segments"
+    return Verdict.OPEN, f"No difference between {subject} could be shown."
+
+
+def _everyone(facts: Facts) -> bool:
+    return set(facts.commanded) <= set(facts.findings.compared)
+
+
+def _shapes(facts: Facts) -> str:
+    """The largest shape of lag and of gain of each plane."""
+    clauses: list[str] = []
+    chains = dict.fromkeys((each.plane, each.group) for each in facts.findings.shape)
+    for plane, group in sorted(chains):
+        word = _joints_word(facts, plane, group)
+        for quantity in ("lag", "gain"):
+            own = [
+                each
+                for each in facts.findings.shape
+                if (each.plane, each.group, each.quantity) == (plane, group, quantity)
+                and abs(each.value) >= _NEGLIGIBLE[quantity]
+            ]
+            shaped = [each for each in own if each.kind != "each"]
+            ends = [each for each in shaped if each.kind == "ends"]
+            clauses += [_shape(each, word) for each in (ends or shaped or own)[:1]]
+    return "; ".join(clauses)
+
+
+def _shape(shape: Shape, joints: str) -> str:
+    """One shape with its simultaneous interval."""
+    sign = -1.0 if shape.value < 0 else 1.0
+    low, high = sorted(sign * end for end in shape.ci95)
+    size = Estimate(sign * shape.value, (low, high))
+    lag = shape.quantity == "lag"
+    text = (
+        formats.estimate(formats.degrees(size), "°", most=2)
+        if lag
+        else formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+    )
+    if shape.kind == "ends":
+        late = f"the middle {joints}" if sign < 0 else f"the {joints} at the ends"
+        other = "the ends" if sign < 0 else "the middle"
+        return (
+            f"{late} lag {text} more than {other}"
+            if lag
+            else (
+                f"the gain of {late} is {text} {'more' if sign > 0 else 'less'}"
+                if sign > 0
+                else f"the gain at the ends is {text} less than in the middle"
+            )
+        )
+    if shape.kind == "trend":
+        grows = "grows" if sign > 0 else "falls"
+        return f"the {shape.quantity} of the {joints} {grows} by {text} from head to tail"
+    if shape.kind == "mirror":
+        more = "more" if sign > 0 else "less"
+        verb = "lag" if lag else "have"
+        tail = f"{text} {more}" if lag else f"{text} {more} gain"
+        return f"the outer {joints} {verb} {tail} than the inner ones, alike on both sides"
+    # Which one it is most stands in the table: one of many sound joints always is.
+    return (
+        f"each of the {joints} has a {shape.quantity} of its own, up to {text} "
+        f"{'more' if sign > 0 else 'less'} than the others"
+    )
+
+
+def _joints_word(facts: Facts, plane: str, group: int) -> str:
+    """What to call the joints of a plane and rhythm group."""
+    word = {"horizontal": "yaw joints", "vertical": "pitch joints"}.get(plane, "joints")
+    if len(facts.gait.groups) < 2:
+        return word
+    frequency = facts.gait.groups[group].frequency_hz
+    return f"{word} at {formats.number(frequency.value, 3)} Hz"
+
+
+def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
+    """How many joints respond, to which gait, and the range of their lags."""
+    if facts.gait.frequency_hz.value is None:
+        return _why_not(facts, "no gait")
+    frequency = formats.gait_frequency(facts.gait)
+    silent = {each.joint for each in facts.not_following}
+    responding = [joint for joint in known if joint.name not in silent]
+    text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"
+    lags = [joint for joint in responding if joint.lag_rad.value is not None]
+    if lags:
+        first = min(lags, key=lambda joint: joint.lag_rad.value or 0.0)
+        last = max(lags, key=lambda joint: joint.lag_rad.value or 0.0)
+        text += "; lag runs from " + " to ".join(
+            f"{formats.number(math.degrees(j.lag_rad.value or 0.0), 1)}° ({plain(j.name)})"
+            for j in (first, last)
+        )
+    evidence = [
+        f" {plain(each.joint)} {each.evidence}."
+        for each in facts.not_following[:NAMED]
+        if each.kinds != ("lost_samples",)
+    ]
+    return text + "." + "".join(evidence)
+
+
+def _caveat(joints: Sequence[JointResult]) -> str:
+    named = [f"{plain(j.name)} ({', '.join(j.flags)})" for j in joints if j.flags]
+    if not named:
+        return ""
+    more = f" and {len(named) - _FLAGGED} more" if len(named) > _FLAGGED else ""
+    return f" Flagged, see the table of joints: {', '.join(named[:_FLAGGED])}{more}."
+
+
+def _why_not(facts: Facts, lacking: str) -> str:
+    """The warning that says what is lacking, or else speaks of a gait, or the first."""
+    if not facts.warnings:
+        return "The result gives no reason."
+    verdict = [one for one in facts.warnings if lacking in one and "held still" not in one]
+    about = [warning for warning in facts.warnings if "gait" in warning.lower()]
+    return formats.sentence((verdict or about or facts.warnings)[0])

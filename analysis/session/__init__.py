@@ -1,0 +1,1 @@
+"""One session: its numbers, put together."""

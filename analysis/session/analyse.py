@@ -1,0 +1,328 @@
+"""A session in, all its numbers out: pure orchestration of the estimators."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from undulog.capture import Session
+from undulog.capture.commands.info import base_versions
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.console import Warn
+from undulog.capture.log.read.signals import Signal
+
+from ..artefacts.find import find_artefacts
+from ..body.motion import body_motion
+from ..dead_band.find import dead_bands
+from ..energy.cycles import energy_result
+from ..energy.joint import Energies
+from ..energy.ledger import check_ledger
+from ..energy.transport import transport
+from ..estimators.intervals import CONFIDENCE
+from ..estimators.series import Series, clean_together
+from ..estimators.spectrum import BINS_PER_SIDE
+from ..oscillators.session import session_couplings
+from ..response.fitting import GaitFit, fit_gait
+from ..response.gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
+from ..results.analysis import Analysis, GaitFacts, SessionFacts, Window
+from ..results.artefact import flags_by_joint
+from ..results.dead_band import DeadBand
+from ..results.estimate import Estimate, Provenance
+from ..results.remarks import Note, Remarks
+from ..segments.answer import Facts, compose
+from ..segments.session import (
+    commanded_joints,
+    compare_joints,
+    following,
+    not_following,
+    stopped,
+    unrefuted,
+)
+from ..signals.reading import drag_ratio, read_columns, settle_time_s
+from ..signals.stretch import Options, choose_stretch, recorded, without_breaks
+from ..signals.windows import Span, Stretch, whole_cycles
+from .artefact_warnings import warn_flags, within
+from .coupling_of_one_gait import one_gait_coupling
+from .demodulation_session import response_over_time
+from .group_facts import group_facts
+from .indices import heterogeneity_indices
+from .joints import joint_energies, joint_results
+
+_NS = 1e9
+_FEW = 1e-3
+"""Up to one sample in a thousand left out is a note: no loss for a fit."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """One session's numbers, and the fit that an experiment of several sessions builds on.
+
+    Attributes:
+        analysis: The numbers.
+        gait: The fitted gait, or None.
+    """
+
+    analysis: Analysis
+    gait: GaitFit | None
+
+
+@dataclass(frozen=True)
+class Measured(Examined):
+    """One session's numbers with what they were computed from; heavy, so not to be kept.
+
+    Attributes:
+        responses: Measured joint angles by name, on the analysed stretch.
+        energies: By joint name.
+        span: Whole cycles over which energies are taken.
+        offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
+    """
+
+    responses: Mapping[str, Series]
+    energies: Mapping[str, Energies]
+    span: Span
+    offsets: Mapping[str, FloatArray]
+
+
+def analyse_session(session: Session, options: Options | None = None) -> Analysis:
+    """Compute everything that one session can tell.
+
+    Args:
+        session: An open session.
+        options: What the user chose; the defaults choose by themselves.
+
+    Returns:
+        The result. What can't be computed is None, and a warning says why.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
+    return examine_session(session, options).analysis
+
+
+def examine_session(
+    session: Session, options: Options | None = None, *, with_dead_bands: bool = True
+) -> Examined:
+    """Compute what one session tells, and keep the fit.
+
+    Args:
+        session: An open session.
+        options: What the user chose; the defaults choose by themselves.
+        with_dead_bands: See :func:`measure_session`.
+
+    Returns:
+        The result and the fitted gait.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
+    measured = measure_session(session, options, with_dead_bands=with_dead_bands)
+    return Examined(measured.analysis, measured.gait)
+
+
+def measure_session(
+    session: Session, options: Options | None = None, *, with_dead_bands: bool = True
+) -> Measured:
+    """Compute what one session tells, and keep what it was computed from.
+
+    Args:
+        session: An open session.
+        options: What the user chose; the defaults choose by themselves.
+        with_dead_bands: Whether to fit them, which takes a third of the time of a short session
+            and changes nothing else.
+
+    Returns:
+        The result, the fitted gait, the responses and the energies.
+
+    Raises:
+        MissingChannelError: If the session has neither commands nor responses.
+        DataError: If they hold no samples.
+        UsageError: If the options leave nothing of the session.
+    """
+    options = options or Options()
+    warn = Remarks()
+    columns = read_columns(
+        session,
+        options.command_topic,
+        options.response_topic,
+        warn,
+        reference_topic=options.reference_topic,
+    )
+    columns, left_out = without_breaks(session, columns, options, warn)
+    session.forget()  # what each step has looked at need not stay in memory beside the next one's
+    artefacts = find_artefacts(session, columns)
+    stretch = choose_stretch(session, columns, options, warn)
+    whole = recorded(session, columns, options)
+    origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
+    commands = _series(columns.names, columns.command, stretch, origin_ns)
+    session.forget()
+    responses = _series(columns.names, columns.position, stretch, origin_ns)
+    _warn_dropped(commands, responses, warn)
+    session.forget()
+    follows = following(session, columns, whole)
+    held = unrefuted(within(artefacts, session, stretch), follows)
+    session.forget()
+    falsified = {one.joint for one in held if one.falsifies("position")}
+    sound = {name: one for name, one in responses.items() if name not in falsified}
+    gait = fit_gait(commands, sound, stretch.duration_s, warn)
+    span = _span(stretch, origin_ns, gait)
+    faulty = not_following(follows, held, columns.names, whole.duration_s)
+    broken = stopped(faulty)  # whose plateaus are no dead bands
+    moving = {name: one for name, one in sound.items() if name not in broken}
+    dead: dict[str, DeadBand] = {}
+    if with_dead_bands:
+        dead = dead_bands(columns, commands, moving, gait, origin_ns)
+    del commands
+    session.forget()
+    energies = joint_energies(session, columns, held, span, warn)
+    closure = check_ledger(session, energies.values(), span, warn)
+    joints = joint_results(
+        session.robot,
+        columns,
+        responses=responses,
+        gait=gait,
+        energies=energies,
+        flags=flags_by_joint(held),
+        dead=dead,
+        span=span,
+    )
+    warn_flags(held, joints, gait, warn)
+    cost = transport(session, sound, energies, span, warn)
+    session.forget()
+    energy = energy_result(
+        session, columns, energies, span, transport=cost, closure=closure, warn=warn
+    )
+    session.forget()
+    over_time = response_over_time(session, columns, artefacts, warn)
+    body = body_motion(session, sound, gait, span, warn)
+    heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
+    commanded = commanded_joints(columns)
+    findings = compare_joints(
+        session.robot,
+        gait,
+        joints,
+        faulty=faulty,
+        commanded=commanded,
+        offsets=follows.offsets,
+    )
+    analysis = Analysis(
+        session=SessionFacts(
+            id=session.session_id,
+            path=str(session.path),
+            robot=session.robot.name if session.robot is not None else None,
+            start_ns=session.start_ns,
+            duration_s=session.duration_s,
+            verdict=session.verdict,
+        ),
+        gait=_gait_facts(session, gait, span, stretch),
+        joints=joints,
+        body=body,
+        heterogeneity=heterogeneity,
+        coupling=one_gait_coupling(0 if gait is None else len(gait.all_answered)),
+        warnings=warn.warnings(session.warnings),
+        provenance=_provenance(session, options),
+        artefacts=artefacts,
+        over_time=over_time,
+        energy=energy,
+        oscillators=session_couplings(session, options.start_s, options.stop_s),
+        notes=warn.notes,
+    )
+    facts = Facts(
+        analysis.gait, joints, commanded, faulty, findings, analysis.warnings, left_out=left_out
+    )
+    answer = compose(facts)
+    analysis = dataclasses.replace(analysis, answer=answer)
+    return Measured(analysis, gait, sound, energies, span, follows.offsets)
+
+
+def _series(
+    names: tuple[str, ...], signals: Mapping[str, Signal], stretch: Stretch, origin_ns: int
+) -> dict[str, Series]:
+    """The signals of a stretch as series, in chain order."""
+    part: dict[str, Signal] = {}
+    times: dict[int, tuple[slice, IntArray]] = {}
+    for one in (signals[name] for name in names if name in signals):
+        if id(one.t_ns) not in times:
+            limits = (stretch.start_ns, stretch.stop_ns)
+            inside = slice(*np.searchsorted(one.t_ns, limits, side="left").tolist())
+            times[id(one.t_ns)] = inside, one.t_ns[inside]
+        inside, t_ns = times[id(one.t_ns)]
+        part[one.name] = Signal(one.name, one.unit, t_ns, one.values[inside])
+    return clean_together(part, origin_ns)
+
+
+def _warn_dropped(
+    commands: Mapping[str, Series], responses: Mapping[str, Series], warn: Warn
+) -> None:
+    for kind, series in (("command", commands), ("response", responses)):
+        lost = [one for one in series.values() if one.dropped_nan or one.dropped_duplicates]
+        if lost:
+            nan = sum(one.dropped_nan for one in lost)
+            double = sum(one.dropped_duplicates for one in lost)
+            told = (
+                f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
+                f"time that was there already ({', '.join(one.name for one in lost)})"
+            )
+            few = nan + double <= _FEW * sum(one.count for one in series.values())
+            warn(Note(told) if few else told)
+
+
+def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
+    start_s = (stretch.start_ns - origin_ns) / _NS
+    stop_s = (stretch.stop_ns - origin_ns) / _NS
+    if gait is None:
+        return Span(origin_ns, start_s, stop_s, 0)
+    first_s, stop_s, cycles = whole_cycles(start_s, stop_s, gait.fit.frequency_hz)
+    return Span(origin_ns, first_s, stop_s, cycles)
+
+
+def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Stretch) -> GaitFacts:
+    shift_s = (span.origin_ns - session.start_ns) / _NS
+    window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
+    if gait is None:
+        return GaitFacts(Estimate(), (window,))
+    groups = group_facts(session.robot, gait, span, stretch, session.start_ns)
+    return GaitFacts(
+        frequency_hz=groups[0].frequency_hz,
+        windows=(window,),
+        wave=groups[0].wave,
+        lag_per_joint_rad=groups[0].lag_per_joint_rad,
+        fitted=Window(
+            (stretch.start_ns - session.start_ns) / _NS,
+            (stretch.stop_ns - session.start_ns) / _NS,
+            stretch.duration_s * gait.fit.frequency_hz,
+        ),
+        groups=groups,
+    )
+
+
+def _provenance(session: Session, options: Options) -> Provenance:
+    """What makes the same numbers again."""
+    digest = hashlib.sha256()
+    for path in session.files:  # one, or the parts of a split session
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return Provenance(
+        command=shlex.join(["undulog", "analyse", str(session.path), *options.arguments()]),
+        versions=base_versions(),
+        inputs={str(session.path): digest.hexdigest()},
+        options={
+            **asdict(options),
+            "confidence": CONFIDENCE,
+            "harmonics": HARMONICS,
+            "min_cycles": MIN_CYCLES,
+            "min_explained": MIN_EXPLAINED,
+            "bins_per_side": BINS_PER_SIDE,
+            "settle_s": settle_time_s(session),
+            "drag_ratio": drag_ratio(session),
+        },
+    )

@@ -1,0 +1,137 @@
+"""Gain, lag and power of every joint, cycle by cycle of a steady gait.
+
+Each cycle's samples are fitted alone, by least squares on their own times::
+
+    q(t) = b + Re a exp(j omega t),    omega of the whole stretch
+
+so a is noisier than the fit over all cycles, and is a description of how the response went on, not
+a better estimate. What stands against it is the command's amplitude over the whole stretch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
+
+from ..estimators.cycle_sums import cycle_sums, weigh
+from ..estimators.rotation import cos_sin
+from ..estimators.series import Series
+from .analyse import Measured
+
+LEAST_COVERED = 0.9
+"""A cycle with samples over less of its length is missing."""
+
+_LEAST_SAMPLES = 6
+
+
+@dataclass(frozen=True)
+class CycleMaps:
+    """Joints against cycles; NaN where a cycle is missing. Arrays are read-only.
+
+    Attributes:
+        start_s: Start of each of c cycles, from the session's start [s], shape (c,).
+        period_s: Length of a cycle [s].
+        driven: Names of the driven joints, head to tail, m.
+        gain: Shape (m, c).
+        lag_rad: Within pi of the joint's mean, positive = late, shape (m, c).
+        powered: Names of the joints with a mechanical energy, head to tail, k.
+        power_w: Mean mechanical power, negative = driven by the rest of the body, shape (k, c).
+    """
+
+    start_s: FloatArray
+    period_s: float
+    driven: tuple[str, ...]
+    gain: FloatArray
+    lag_rad: FloatArray
+    powered: tuple[str, ...]
+    power_w: FloatArray
+
+
+def cycle_maps(measured: Measured) -> CycleMaps | None:
+    """Follow a steady gait cycle by cycle.
+
+    Args:
+        measured: A session's numbers with what they were computed from.
+
+    Returns:
+        The maps, or None where there is no gait or not one whole cycle of it.
+    """
+    gait, span = measured.gait, measured.span
+    if gait is None or span.cycles < 1:
+        return None
+    parts = {
+        name: measured.responses[name].between(span.start_s, span.stop_s)
+        for name in dict.fromkeys((*gait.driven, *measured.energies))
+        if name in measured.responses
+    }
+    whole: dict[str, BoolArray] = {}
+    starts: dict[str, IntArray] = {}
+    for name, one in parts.items():
+        weighed = weigh(one.t_s, span.start_s, span.stop_s, span.cycles)
+        whole[name], starts[name] = weighed.covered >= LEAST_COVERED, weighed.starts
+    nothing = np.full(span.cycles, np.nan, dtype=np.complex128)
+    ratio: list[ComplexArray] = []
+    for name in gait.driven:
+        command = gait.fit.fundamental[gait.command_of(name)]
+        if name in whole and name in gait.answered and abs(command) > 0:
+            amplitude = amplitudes(parts[name], starts[name], gait.fit.omega)
+            ratio.append(np.where(whole[name], amplitude / command, nothing))
+        else:
+            ratio.append(nothing)
+    power = {
+        name: np.where(whole[name], one.mechanical.net_j, np.nan)
+        for name, one in measured.energies.items()
+        if one.mechanical is not None and name in whole
+    }
+    period = (span.stop_s - span.start_s) / span.cycles
+    edges = np.linspace(span.start_s, span.stop_s, span.cycles + 1)
+    shift_s = (span.origin_ns - measured.analysis.session.start_ns) * 1e-9
+    response = _stacked(ratio, span.cycles)
+    return CycleMaps(
+        start_s=frozen(edges[:-1] + shift_s),
+        period_s=period,
+        driven=gait.driven,
+        gain=frozen(np.abs(response)),
+        lag_rad=frozen(_lag(response)),
+        powered=tuple(power),
+        power_w=frozen(np.array(list(power.values())).reshape(-1, span.cycles) / period),
+    )
+
+
+def amplitudes(series: Series, starts: IntArray, omega: float) -> ComplexArray:
+    """Complex amplitude of each cycle, from its samples alone.
+
+    Args:
+        series: Samples.
+        starts: Where c cycles begin among them and the last one ends, shape (c + 1,).
+        omega: Angular frequency [rad/s].
+
+    Returns:
+        Amplitudes at t = 0, shape (c,); NaN where a cycle has too few samples.
+    """
+    cosine, sine = cos_sin(omega * series.t_s)
+    basis = np.stack([np.ones(series.count), cosine, -sine])
+    gram = np.stack([cycle_sums(basis * row, starts) for row in basis])
+    right = cycle_sums(basis * series.values, starts)
+    known: BoolArray = np.diff(starts) >= _LEAST_SAMPLES
+    result = np.full(known.size, np.nan, dtype=np.complex128)
+    solved = np.linalg.solve(gram.T[known], right.T[known, :, None])[..., 0]
+    result[known] = solved[:, 1] + 1j * solved[:, 2]
+    return result
+
+
+def _lag(response: ComplexArray) -> FloatArray:
+    """Lag within pi of each joint's mean [rad], shape (m, c)."""
+    size = np.abs(response)
+    unit = np.divide(response, size, out=np.zeros_like(response), where=size > 0)
+    mean = np.angle(unit.sum(axis=1, keepdims=True))
+    lag: FloatArray = -(mean + np.angle(response * np.exp(-1j * mean)))
+    return lag
+
+
+def _stacked(rows: Sequence[ComplexArray], count: int) -> ComplexArray:
+    return np.array(rows, dtype=np.complex128).reshape(-1, count)

@@ -1,0 +1,179 @@
+"""One line of the result for each joint: response, four energies, coverage, flags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from undulog.capture import Session
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import Warn
+from undulog.capture.common.threads import in_threads
+from undulog.capture.log.messages.power_topics import PowerTopic
+from undulog.capture.robot.model import Robot
+
+from ..energy.joint import Energies, Energy, add_up, integrate, power_of
+from ..estimators.series import Series, clean, coverage
+from ..response.fitting import GaitFit
+from ..response.response import gain_estimate, lag_estimate
+from ..results.analysis import JointResult
+from ..results.artefact import Artefact
+from ..results.dead_band import DeadBand
+from ..results.estimate import Estimate
+from ..signals.reading import Columns, planes_of
+from ..signals.windows import Span
+
+GAP_SHARE = 0.01
+"""More of the window without samples is worth a flag, or of power a warning."""
+
+
+def joint_energies(
+    session: Session, columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
+) -> dict[str, Energies]:
+    """Energies of all joints.
+
+    Args:
+        session: An open session.
+        columns: The session's columns.
+        artefacts: Of the analysed stretch; what a sensor falsifies has no energy.
+        span: The window.
+        warn: Told of joints whose power has gaps or is falsified.
+
+    Returns:
+        By joint name.
+    """
+    wrong = list(artefacts)
+    false = {one.joint for one in wrong if one.falsifies("velocity", "effort")}
+    false_el = {one.joint for one in wrong if one.falsifies("current", "voltage")}
+    for joints, kind in ((false, "mechanical"), (false_el, "electrical")):
+        if joints:
+            named = ", ".join(name for name in columns.names if name in joints)
+            warn(f"{named}: {kind} energies are null, since a sensor falsifies them")
+
+    def of_joint(name: str) -> Energies:
+        powers: dict[str, Series] = {}
+        found: dict[str, Energy | None] = {}
+        window = span.start_s, span.stop_s, max(span.cycles, 1)
+        for kind, (first, second), wrong in (
+            ("mechanical", (columns.effort, columns.velocity), false),
+            ("electrical", (columns.current, columns.voltage), false_el),
+        ):
+            if name in wrong:  # what accumulates powers goes by the same sensors
+                continue
+            found[kind] = _accumulated(columns, kind, name, span.origin_ns, window)
+            if found[kind] is None and name in first and name in second:
+                powers[kind] = power_of(first[name], second[name], span.origin_ns)
+        found |= zip(powers, integrate([*powers.values()], *window), strict=True)
+        return Energies(found.get("mechanical"), found.get("electrical"), frozenset(powers))
+
+    samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
+    found = in_threads(of_joint, columns.names, samples, session.forget)
+    result = dict(zip(columns.names, found, strict=True))
+    thin = [
+        name
+        for name, one in result.items()
+        if any(
+            e is not None and e.coverage < 1 - GAP_SHARE for e in (one.mechanical, one.electrical)
+        )
+    ]
+    if thin:
+        warn(
+            f"the power of {', '.join(thin)} has gaps, which are not bridged: energies count only "
+            "the time that has samples"
+        )
+    return result
+
+
+def _accumulated(
+    columns: Columns, kind: str, name: str, origin_ns: int, window: tuple[float, float, int]
+) -> Energy | None:
+    """Energy by the powers that the log has themselves, or None."""
+    net, plus = (
+        columns.powers[topic].get(name)
+        for topic in (
+            (PowerTopic.MECHANICAL, PowerTopic.MECHANICAL_PLUS)
+            if kind == "mechanical"
+            else (PowerTopic.ELECTRICAL, PowerTopic.ELECTRICAL_PLUS)
+        )
+    )
+    if net is None or plus is None:
+        return None
+    mean, positive = (clean(name, one.t_ns, one.values, origin_ns) for one in (net, plus))
+    return add_up(mean, positive, *window)
+
+
+def joint_results(
+    robot: Robot | None,
+    columns: Columns,
+    *,
+    responses: Mapping[str, Series],
+    gait: GaitFit | None,
+    energies: Mapping[str, Energies],
+    flags: Mapping[str, Sequence[str]],
+    dead: Mapping[str, DeadBand],
+    span: Span,
+) -> tuple[JointResult, ...]:
+    """The joints' lines, head to tail.
+
+    Args:
+        robot: The robot, or None.
+        columns: The session's columns.
+        responses: By joint name, on the analysed stretch.
+        gait: The fitted gait, or None.
+        energies: By joint name.
+        flags: Artefacts of each joint on the analysed stretch, by name.
+        dead: Dead bands, by name.
+        span: The window of energies and coverage.
+
+    Returns:
+        One result a joint.
+    """
+    planes = planes_of(robot)
+    results: list[JointResult] = []
+    for name in columns.names:
+        response = responses.get(name)
+        part = None if response is None else response.between(span.start_s, span.stop_s)
+        fraction = 0.0 if part is None else coverage(part.t_s, span.start_s, span.stop_s)
+        own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
+        if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
+            own.append("gaps")
+        index = None if gait is None else gait.group_of(name)
+        group = None if gait is None or index is None else gait.groups[index]
+        gain, lag = _estimates(group, name)
+        power = energies[name]
+        mechanical, electrical = power.mechanical, power.electrical
+        results.append(
+            JointResult(
+                name=name,
+                plane=planes.get(name),
+                command_amplitude_rad=None if gait is None else gait.command_amplitudes.get(name),
+                gain=gain,
+                lag_rad=lag,
+                energy_net_j=_total(None if mechanical is None else mechanical.net_j),
+                energy_plus_j=_total(None if mechanical is None else mechanical.plus_j),
+                energy_abs_j=_total(None if mechanical is None else mechanical.abs_j),
+                energy_el_j=_total(None if electrical is None else electrical.net_j),
+                energy_el_clipped_j=_total(None if electrical is None else electrical.plus_j),
+                coverage=fraction,
+                samples=0 if part is None else part.count,
+                flags=tuple(own),
+                group=index,
+                frequency_hz=None if group is None else group.fit.frequency_hz,
+                dead_band=dead.get(name),
+            )
+        )
+    return tuple(results)
+
+
+def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
+    if gait is None or gait.response is None or name not in gait.answered:
+        return Estimate(), Estimate()
+    place = gait.answered.index(name)
+    lag = lag_estimate(gait.response, place)
+    # A phase that noise leaves open means an amplitude that isn't there.
+    return (gain_estimate(gait.response, place) if lag.value is not None else Estimate()), lag
+
+
+def _total(per_cycle: FloatArray | None) -> float | None:
+    return None if per_cycle is None else float(np.sum(per_cycle))

@@ -1,0 +1,322 @@
+"""Which sessions are runs of one gait, and which way its wave runs: told from the commands alone.
+
+With c the complex amplitudes of a run's commands, head to tail, another run has the same gait if
+its c is the same but for a common phase (it started at another time), and the reverse gait if its
+c read from tail to head is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import zip_longest
+
+import numpy as np
+
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.robot.model import Robot
+
+from ..response.fitting import GaitFit
+from ..response.gait import phase_step, wave_name
+from ..response.response import Response
+from ..results import formats
+from ..results.analysis import Analysis
+from ..results.deciding import distinct
+from ..signals.reading import by_plane
+from .posture import UNKNOWN_POSTURE, Posture
+
+SAME_COMMAND = 0.01
+"""Largest deviation of a command, over its amplitude, that is the same gait still."""
+
+SAME_FREQUENCY = 0.005
+"""Relative."""
+
+
+class Role(StrEnum):
+    """A run's part in a reversal."""
+
+    FORWARD = "forward"
+    REVERSE = "reverse"
+
+
+@dataclass(frozen=True)
+class GaitRun:
+    """One session as a run of a gait.
+
+    Attributes:
+        label: The file's name, for messages.
+        robot: Name of the robot, or None.
+        start_ns: When it started [Unix ns].
+        names: Driven joints, head to tail, m; none where there is no gait.
+        planes: Planes they are in; of several groups, those of the group that is in most.
+        frequency_hz: Of the gait; of several groups, the largest group's.
+        command: Complex amplitudes of the commands, each at its group's frequency [rad], (m,).
+        wave: Which way the wave runs; of several groups, the largest group's.
+        response: Response of the joints to their commands, NaN where it isn't known, m joints.
+        posture: How the robot lay.
+        group: Index of each joint's group, m.
+        frequencies_hz: Of each group, the largest group first.
+        waves: Which way each group's wave runs.
+    """
+
+    label: str
+    robot: str | None
+    start_ns: int
+    names: tuple[str, ...]
+    planes: tuple[str, ...]
+    frequency_hz: float
+    command: ComplexArray
+    wave: str | None
+    response: Response
+    posture: Posture = UNKNOWN_POSTURE
+    group: tuple[int, ...] = ()
+    frequencies_hz: tuple[float, ...] = ()
+    waves: tuple[str | None, ...] = ()
+
+    @property
+    def ratio(self) -> ComplexArray:
+        """Response over command, NaN where it isn't known, shape (m,)."""
+        return self.response.ratio
+
+    @property
+    def by_group(self) -> list[IntArray]:
+        """Indices of each group's joints."""
+        groups = np.array(self.group, dtype=np.int64)
+        return [np.flatnonzero(groups == k) for k in range(len(self.frequencies_hz))]
+
+
+def gait_run(
+    label: str,
+    robot: Robot | None,
+    analysis: Analysis,
+    gait: GaitFit | None,
+    posture: Posture = UNKNOWN_POSTURE,
+) -> GaitRun:
+    """What an experiment needs of one session.
+
+    Args:
+        label: The file's name.
+        robot: Its robot, or None.
+        analysis: Its numbers.
+        gait: Its fitted gait, or None.
+        posture: How the robot lay.
+
+    Returns:
+        The run.
+    """
+    name, start_ns = analysis.session.robot, analysis.session.start_ns
+    if gait is None or not gait.driven:
+        nothing = np.zeros(0, dtype=np.complex128)
+        return GaitRun(label, name, start_ns, (), (), 0.0, nothing, None, _unknown(0), posture)
+    group_of = {joint: k for k, one in enumerate(gait.groups) for joint in one.driven}
+    chain = [joint.name for joint in analysis.joints if joint.name in group_of]
+    names = tuple(chain) if gait.others else gait.driven
+    command = np.zeros(len(names), dtype=np.complex128)
+    response = _unknown(len(names))
+    known = {joint.name for joint in analysis.joints if joint.gain.value is not None}
+    planes: list[tuple[str, ...]] = []
+    waves: list[str | None] = []
+    for group in gait.groups:
+        fundamental = group.fit.fundamental[: len(group.driven)]
+        command[[names.index(joint) for joint in group.driven]] = fundamental
+        planes.append(tuple(by_plane(robot, group.driven)))
+        waves.append(wave_name(phase_step(fundamental)) if fundamental.size > 1 else None)
+        if group.response is None:
+            continue
+        own = [k for k, joint in enumerate(group.answered) if joint in known]
+        at = [names.index(group.answered[k]) for k in own]
+        response.ratio[at] = group.response.ratio[own]
+        response.log_gain_variance[at] = group.response.log_gain_variance[own]
+        response.lag_variance[at] = group.response.lag_variance[own]
+        response.dof[at] = group.response.dof[own]
+    return GaitRun(
+        label=label,
+        robot=name,
+        start_ns=start_ns,
+        names=names,
+        planes=max(planes, key=len),
+        frequency_hz=gait.fit.frequency_hz,
+        command=command,
+        wave=waves[0],
+        response=response,
+        posture=posture,
+        group=tuple(group_of[joint] for joint in names),
+        frequencies_hz=tuple(one.fit.frequency_hz for one in gait.groups),
+        waves=tuple(waves),
+    )
+
+
+def _unknown(count: int) -> Response:
+    """The response of joints of which none is known yet."""
+    gain, lag, dof = (np.full(count, np.nan) for _ in range(3))
+    return Response(np.full(count, np.nan, dtype=np.complex128), gain, lag, dof)
+
+
+def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]:
+    """Runs of the commonest gait and of its reverse.
+
+    Args:
+        runs: All runs.
+
+    Returns:
+        Roles by index (the wave from head to tail is forward), and why the others have none.
+    """
+    why = {k: reason for k, run in enumerate(runs) if (reason := _unfit(run)) is not None}
+    fit = [k for k in range(len(runs)) if k not in why]
+    if not fit:
+        return {}, why
+    alike = {k: [j for j in fit if _difference(runs[j], runs[k]) is None] for k in fit}
+    model = runs[max(fit, key=lambda k: len(alike[k]))]
+    roles: dict[int, Role] = {}
+    first: dict[bytes, int] = {}
+    for k in fit:
+        run = runs[k]
+        different = _difference(run, model)
+        if different is not None:
+            why[k] = different
+            continue
+        numbers = run.ratio.tobytes()
+        if numbers in first:
+            why[k] = (
+                f"gives the very numbers of {runs[first[numbers]].label}: a copy is not a run of "
+                "its own"
+            )
+            continue
+        first[numbers] = k
+        roles[k] = Role.FORWARD if run.wave == "head-to-tail" else Role.REVERSE
+    return roles, why
+
+
+def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
+    """Responses of the joints that every run knows, and whose mirror joints every run knows.
+
+    Args:
+        runs: Of the same driven joints.
+
+    Returns:
+        Names of those joints, head to tail, and y = ln(response/command), shape (runs, joints), its
+        imaginary parts within pi of their common mean.
+    """
+    ratio = np.stack([run.ratio for run in runs])
+    known = np.all(np.isfinite(ratio), axis=0)
+    known &= known[::-1]
+    ratio = ratio[:, known]
+    unit: ComplexArray = ratio / np.abs(ratio)
+    turn = np.angle(unit.sum())
+    phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
+    names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
+    y = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
+    return names, y
+
+
+def mirror_fault(robot: Robot | None, driven: Sequence[str]) -> str | None:
+    """Why a robot isn't its own mirror image.
+
+    Args:
+        robot: The robot; of None nothing is known, and nothing said against it.
+        driven: Names of the driven joints, head to tail.
+
+    Returns:
+        The reason, or None where head and tail may change places.
+    """
+    if robot is None:
+        return None
+    planes = [joint.plane for joint in robot.joints]
+    if planes != planes[::-1]:
+        return "its joints' planes, read from tail to head, come in another order"
+    shape = [(link.length, link.mass, *link.inertia) for link in robot.links]
+    if not np.allclose(shape, shape[::-1], rtol=1e-6, atol=0.0):
+        return "its links differ in length, mass or inertia from their mirror images"
+    moved = [name in driven for name in robot.joint_names]
+    if moved != moved[::-1]:
+        return "the driven joints are not their own mirror image"
+    return None
+
+
+def command_change(command: ComplexArray, model: ComplexArray) -> ComplexArray:
+    """Each joint's command over that of another run, less the phase that all have in common.
+
+    Args:
+        command: Complex amplitudes [rad], shape (m,).
+        model: Those of the other run, shape (m,).
+
+    Returns:
+        1 where it is the same, shape (m,).
+    """
+    change: ComplexArray = command / model
+    change *= np.exp(-1j * np.angle(change.sum()))
+    change *= np.exp(-1j * np.median(np.angle(change)))  # as if the odd joint weren't there
+    return change
+
+
+def other_frequency(run: GaitRun, model: GaitRun) -> tuple[str, str] | None:
+    """Find a group whose frequency is not the model's.
+
+    Args:
+        run: A run.
+        model: Another one.
+
+    Returns:
+        Both frequencies [Hz] of the first such group, with the digits in which they differ; None
+        where they agree.
+    """
+    pairs = zip_longest(run.frequencies_hz, model.frequencies_hz, fillvalue=float("nan"))
+    for own, other in pairs:
+        if not abs(own - other) <= SAME_FREQUENCY * other:
+            return distinct(own, other)
+    return None
+
+
+def _unfit(run: GaitRun) -> str | None:
+    if not run.names:
+        return "has no gait"
+    if len(run.planes) > 1:
+        return "drives both planes; the reversal test is made of one wave"
+    if any(wave in (None, "standing") for wave in run.waves):
+        return "has no travelling wave, so there is no reverse of it"
+    if not np.isfinite(run.ratio).any():
+        return "has no gain and lag"
+    return None
+
+
+def _other_drive(run: GaitRun, model: GaitRun) -> str | None:
+    """What a run drives otherwise than the model; None if nothing but the wave differs."""
+    if run.robot != model.robot:
+        return f"is of {run.robot or 'no known robot'}, {model.label} of {model.robot or 'none'}"
+    if run.names != model.names:
+        return f"drives other joints than {model.label}"
+    if run.group != model.group:
+        return f"has other joints than {model.label} at one frequency"
+    other = other_frequency(run, model)
+    return None if other is None else f"has {other[0]} Hz, {model.label} {other[1]} Hz"
+
+
+def _difference(run: GaitRun, model: GaitRun) -> str | None:
+    """What makes a run another gait than the model's or its reverse; None if nothing does."""
+    drive = _other_drive(run, model)
+    if drive is not None:
+        return drive
+    same = [own == way for own, way in zip(run.waves, model.waves, strict=True)]
+    if any(same) != all(same):
+        return f"has another direction of the wave than {model.label} in some groups only"
+    if not all(same) and run.group != run.group[::-1]:
+        return (
+            f"has the reverse wave of {model.label}, but its joints' frequencies, read from tail "
+            "to head, come in another order"
+        )
+    command = run.command if all(same) else run.command[::-1]
+    change = np.ones_like(command)
+    for members in model.by_group:
+        change[members] = command_change(command[members], model.command[members])
+    deviation = np.abs(change - 1)
+    worst = int(np.argmax(deviation))
+    if deviation[worst] <= SAME_COMMAND:
+        return None
+    joint = run.names[worst if all(same) else -1 - worst]
+    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
+    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
+    return (
+        f"commands another gait than {model.label}: at {joint} the amplitude is {percent} % and "
+        f"the phase {degrees} degrees off"
+    )

@@ -1,0 +1,1 @@
+"""The columns and the time window that an analysis uses."""

@@ -1,0 +1,278 @@
+"""Choosing the stretch of a session that is analysed, and saying why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from undulog.capture import Session
+from undulog.capture.common.arrays import IntArray
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import DataError, LogError, UsageError
+from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.unbroken import longest_unbroken
+
+from ..estimators.series import clean
+from ..response.gait import MIN_CYCLES
+from .reading import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns, settle_time_s
+from .soft_start import steady_part
+from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
+
+GAIT_TOPIC = "/gait"
+_NS = 1e9
+_WORTH_IT = 0.1
+"""Less than this part of a session after its settling time is not worth leaving the rest out."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user may choose.
+
+    Attributes:
+        start_s: Start of what is analysed, from the session's start [s]; None: chosen.
+        stop_s: Its end, not included [s]; None: chosen.
+        command_topic: JointState topic of the commands.
+        response_topic: JointState topic of the responses.
+        reference_topic: JointState topic of a second sensor of the same positions, or None.
+    """
+
+    start_s: float | None = None
+    stop_s: float | None = None
+    command_topic: str = COMMAND_TOPIC
+    response_topic: str = RESPONSE_TOPIC
+    reference_topic: str | None = None
+
+    def arguments(self) -> list[str]:
+        """What to give on the command line for these options, defaults left out."""
+        arguments: list[str] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value != field.default:
+                option = field.name.removesuffix("_s").replace("_", "-")
+                arguments += [f"--{option}", str(value)]
+        return arguments
+
+
+def without_breaks(
+    session: Session, columns: Columns, options: Options, warn: Warn
+) -> tuple[Columns, str]:
+    """Leave out all but the longest stretch in which samples follow each other.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        options: What the user chose; only samples between his limits count.
+        warn: Takes one sentence where something is left out.
+
+    Returns:
+        The columns of that stretch, and what is left out; empty where that is nothing.
+
+    Raises:
+        DataError: If there are no samples at all, or commands and responses don't overlap.
+    """
+    times = [one.t_ns for kind in (columns.command, columns.position) for one in kind.values()]
+    every = longest_unbroken(times)
+    if every is None or not every.others:
+        return columns, ""
+    both = recorded(session, columns, options)
+    found = longest_unbroken(times, both.start_ns, both.stop_ns)
+    if found is None:
+        return columns, ""
+    if found.others:
+        warn(str(found))
+    parts: dict[int, tuple[slice, IntArray]] = {}
+
+    def part(one: Signal) -> Signal:
+        if id(one.t_ns) not in parts:  # signals that share their times go on sharing them
+            inside = slice(*np.searchsorted(one.t_ns, (found.start_ns, found.last_ns + 1)).tolist())
+            parts[id(one.t_ns)] = inside, one.t_ns[inside]
+        inside, t_ns = parts[id(one.t_ns)]
+        return Signal(one.name, one.unit, t_ns, one.values[inside])
+
+    def parts_of(signals: Mapping[str, Signal]) -> dict[str, Signal]:
+        return {name: part(one) for name, one in signals.items()}
+
+    kept = replace(
+        columns,
+        **{quantity: parts_of(columns.of(quantity)) for quantity in QUANTITIES},
+        powers={topic: parts_of(signals) for topic, signals in columns.powers.items()},
+    )
+    return kept, str(found) if found.others else ""
+
+
+def choose_stretch(session: Session, columns: Columns, options: Options, warn: Warn) -> Stretch:
+    """The stretch to analyse.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        options: What the user chose; a start of his own replaces the settling time.
+        warn: Takes one sentence where the choice needs one.
+
+    Returns:
+        The stretch.
+
+    Raises:
+        DataError: If there are no samples at all.
+        UsageError: If the user's limits leave nothing.
+    """
+    recorded = _recorded(session, columns)
+    chosen = recorded.intersect(
+        _absolute(session, options.start_s), _absolute(session, options.stop_s)
+    )
+    if chosen.duration_s <= 0:
+        first, last = ((t - session.start_ns) / _NS for t in (recorded.start_ns, recorded.stop_ns))
+        raise UsageError(
+            f"{session.path}: nothing between --start and --stop; it has joint samples from "
+            f"{first:.2f} to {last:.2f} s"
+        )
+    settle_s = settle_time_s(session) if options.start_s is None else 0.0
+    runs = _gait_runs(session, chosen, settle_s, warn)
+    if not runs and settle_s > 0:
+        runs = _gait_runs(session, chosen, 0.0, warn)
+        if runs:
+            settle_s = 0.0
+            warn(
+                f"fewer than {MIN_CYCLES:g} steady cycles are left after the settling time that "
+                "the session states: the gait is analysed before it has settled"
+            )
+    if runs:
+        longest = max(runs, key=lambda run: run.duration_s)
+        if len(runs) > 1:
+            rest = sum(run.duration_s for run in runs) - longest.duration_s
+            warn(
+                f"the gait parameters change: the longest steady stretch is analysed, {rest:.1f} s "
+                f"in {len(runs) - 1} others are not (choose with --start and --stop)"
+            )
+        return longest
+    if GAIT_TOPIC in session.channels:
+        warn(
+            f"no stretch of {MIN_CYCLES:g} cycles has steady gait parameters: the commands are "
+            "analysed as if it were steady"
+        )
+    later = settled(chosen, session.start_ns, settle_s)
+    if later.duration_s < _WORTH_IT * chosen.duration_s:
+        warn(
+            f"next to nothing is left after the settling time of {settle_s:g} s: all of it is "
+            "analysed, unsettled as it is"
+        )
+        later = chosen
+    stated = settle_s > 0 or GAIT_TOPIC in session.channels
+    return _in_motion(columns, later, options, warn, stated=stated)
+
+
+def recorded(session: Session, columns: Columns, options: Options) -> Stretch:
+    """What was recorded of commands and positions, within the user's limits.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        options: What the user chose.
+
+    Returns:
+        The window, without regard to settling or steadiness.
+
+    Raises:
+        DataError: If there are no samples at all.
+    """
+    return _recorded(session, columns).intersect(
+        _absolute(session, options.start_s), _absolute(session, options.stop_s)
+    )
+
+
+def _recorded(session: Session, columns: Columns) -> Stretch:
+    """Where commands and responses overlap, or where the one that exists lies."""
+    kinds = (columns.command, columns.position)
+    spans = [covered([signal.t_ns for signal in kind.values()]) for kind in kinds]
+    known = [span for span in spans if span is not None]
+    if not known:
+        raise DataError(f"{session.path}: the joint topics hold no samples; nothing to analyse")
+    both = Stretch(max(s.start_ns for s in known), min(s.stop_ns for s in known))
+    if both.duration_s <= 0:
+        raise DataError(
+            f"{session.path}: commands and responses don't overlap in time; their clocks differ"
+        )
+    return both
+
+
+def _absolute(session: Session, time_s: float | None) -> int | None:
+    return None if time_s is None else session.start_ns + round(time_s * _NS)
+
+
+def _gait_runs(session: Session, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:
+    """Steady, settled runs of the logged gait with enough cycles; empty if none is known."""
+    if GAIT_TOPIC not in session.channels:
+        return []
+    try:
+        logged = session.joints(GAIT_TOPIC)
+    except (DataError, LogError) as error:
+        warn(f"{GAIT_TOPIC} can't be used to find steady stretches: {error}")
+        return []
+    omegas = [k for k, name in enumerate(logged.names) if name.endswith(".omega")]
+    if not omegas or len({t.size for t in logged.t_ns}) != 1 or not logged.t_ns[0].size:
+        warn(f"{GAIT_TOPIC} names no plane's omega: it can't be used to find steady stretches")
+        return []
+    t_ns, values = logged.t_ns[0], np.stack(logged.values, axis=-1)
+    start_ns = session.start_ns
+    fastest = float(np.nanmax(np.abs(values[:, omegas]), initial=0.0)) / (2 * math.pi)
+    if fastest <= 0:
+        return []
+    for ignore in ((), ("offset",)):
+        found: list[Stretch] = []
+        least_s = (MIN_CYCLES - 1) / fastest  # each run's own frequency decides below
+        for run in steady_runs(t_ns, logged.names, values, ignore, least_s=least_s):
+            part = settled(run, start_ns, settle_s)
+            part = part.intersect(chosen.start_ns, chosen.stop_ns)
+            row = int(np.searchsorted(t_ns, run.start_ns))
+            frequency = max(abs(float(values[row, k])) for k in omegas) / (2 * math.pi)
+            if long_enough(part.duration_s, frequency):
+                found.append(part)
+        if found:
+            if ignore:
+                warn("the gait's offset changes within the analysed stretch: the robot steers")
+            return found
+    return []
+
+
+def _in_motion(
+    columns: Columns, stretch: Stretch, options: Options, warn: Warn, *, stated: bool
+) -> Stretch:
+    """Without standing still at the ends; without a soft start where the session states none."""
+    origin = stretch.start_ns
+    series = [
+        clean(name, signal.t_ns, signal.values, origin).between(0.0, stretch.duration_s)
+        for name, signal in columns.command.items()
+    ]
+    span = moving(series)
+    if span is None:
+        return stretch
+    if not stated:
+        soft = span
+        span = steady_part([one.between(span[0], span[1]) for one in series], *span)
+        span = (
+            span[0] if options.start_s is None else soft[0],
+            span[1] if options.stop_s is None else soft[1],
+        )
+        _warn_soft(soft, span, warn)
+    start, stop = (origin + round(time_s * _NS) for time_s in span)
+    period = max((one.period_s for one in series if one.count > 1), default=0.0)
+    # Moving to the last sample: that sample's own interval belongs to it.
+    ends = stretch.stop_ns - stop <= 2 * round(period * _NS)
+    return stretch.intersect(start, None if ends else stop)
+
+
+def _warn_soft(motion: tuple[float, float], steady: tuple[float, float], warn: Warn) -> None:
+    """Report what is left out by the amplitude of the commands."""
+    ends = (
+        ("start", "before", steady[0] - motion[0], "--start"),
+        ("stop", "after", motion[1] - steady[1], "--stop"),
+    )
+    for kind, when, left_s, option in ends:
+        if left_s > 0:
+            warn(
+                f"soft {kind}: {left_s:.1f} s {when} the commands have their steady amplitude are "
+                f"left out (choose with {option})"
+            )

@@ -1,0 +1,1 @@
+"""The commands that record, import, export and edit logs."""

@@ -1,0 +1,70 @@
+"""What is installed: the verb ``info``, and the versions that go into results."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+from ..common.console import emit_json, say
+
+_BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
+_EXTRAS: dict[str, tuple[str, ...]] = {
+    "sim": ("pybullet",),
+    "mujoco": ("mujoco",),
+    "numba": ("numba",),
+    "replay": ("rerun-sdk", "av"),
+    "report": ("jinja2", "matplotlib"),
+    "parquet": ("pyarrow",),
+    "mf4": ("asammdf",),
+    "cluster": ("dask", "distributed"),
+}
+
+
+def package_version(name: str) -> str | None:
+    """Version of an installed package.
+
+    Args:
+        name: Its name in the package index.
+
+    Returns:
+        The version, or None where it is not installed.
+    """
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def base_versions() -> dict[str, str]:
+    """Python and the packages that every result depends on, for provenance.
+
+    Returns:
+        Name to version.
+    """
+    found = {name: package_version(name) for name in _BASE}
+    return {"python": platform.python_version()} | {k: v for k, v in found.items() if v}
+
+
+def info(*, json: bool = False) -> None:
+    """Say what is installed, for a bug report.
+
+    Example: `undulog info --json`
+
+    Args:
+        json: Print one JSON object.
+    """
+    extras = {
+        extra: {name: package_version(name) for name in packages}
+        for extra, packages in _EXTRAS.items()
+    }
+    if json:
+        emit_json({"platform": platform.platform(), "packages": base_versions(), "extras": extras})
+        return
+    packages = base_versions()
+    say(f"undulog {packages['undulog']} on Python {packages['python']}, {platform.platform()}")
+    say("packages  " + ", ".join(f"{k} {v}" for k, v in packages.items() if k != "undulog"))
+    for extra, found in extras.items():
+        missing = [name for name, number in found.items() if number is None]
+        listed = ", ".join(f"{name} {number}" for name, number in found.items() if number)
+        state = listed if not missing else f"not installed: pip install 'undulog[{extra}]'"
+        say(f"{extra:<9} {state}")

@@ -1,0 +1,119 @@
+"""The verbs ``log cut`` and ``log merge``: an edit always writes a new file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from ..common.console import emit_json, say
+from ..common.interruption import interruptible
+
+if TYPE_CHECKING:
+    from ..log.edit.edit import EditReport
+
+
+def log_cut(
+    file: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    start: float = 0.0,
+    stop: float | None = None,
+    topics: Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)] = (),
+    carry_state: bool = False,
+    force: bool = False,
+    json: bool = False,
+) -> None:
+    """Write a part of a log, of any make, to a new file.
+
+    The window is half-open in log time: a message at --start is in, one at --stop is not, so that
+    cuts laid side by side hold every message once. Message bytes, sequence numbers and times stay
+    as they are, and so do attachments and metadata; the record `undulog.edit` says what was cut
+    from what. Topics that speak only when something changes (`/gait/mode`, `/robot_description`,
+    `/tf_static`, whatever was recorded as transient local) may have said their last word before
+    the window: that is told, and --carry-state copies it, with the log time of --start.
+
+    Example: `undulog log cut run.mcap --start 8 --stop 16 -o steady.mcap`
+
+    Only the joints: `undulog log cut run.mcap --topics '/joint_*' /gait -o joints.mcap`
+
+    Args:
+        file: An MCAP file, of any make; of a damaged one, what can be read.
+        output: The log to write, `.mcap`.
+        start: First log time wanted [s], from the log's first message.
+        stop: End of the window [s], from the log's first message; the log's end by default.
+        topics: Topics to keep, `*` and `?` as in a shell; all by default.
+        carry_state: Copy the last earlier message of each such topic to the start.
+        force: Replace an existing output.
+        json: Report as one JSON object.
+    """
+    from ..log.edit.cut import cut_log
+
+    with interruptible() as request:
+        report = cut_log(
+            file,
+            output,
+            start_s=start,
+            stop_s=stop,
+            topics=topics,
+            carry_state=carry_state,
+            force=force,
+            stop=request,
+        )
+    _tell(report, as_json=json)
+
+
+def log_merge(
+    *files: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    robot: str | None = None,
+    apart: bool = False,
+    force: bool = False,
+    json: bool = False,
+) -> None:
+    """Put several logs into one new file, interleaved by log time.
+
+    Of equal log times the log that is named first comes first. A topic that several logs have
+    becomes one; if its types or units differ, nothing is merged. Message bytes, sequence numbers
+    and times stay as they are. Of attachments and metadata the same is kept once and the different
+    under a name of its own; the record `undulog.edit` lists the session ids and hashes of all logs.
+    Logs of different robots are refused unless --robot names the one that the session is of, and
+    logs with more than a day between them unless --apart is given; both are warned of then, and so
+    are logs that have no joint in common or more than a minute between them.
+
+    Example: `undulog log merge robot.mcap tracking.mcap -o both.mcap`
+
+    Args:
+        files: MCAP files, of any make; of a damaged one, what can be read.
+        output: The log to write, `.mcap`.
+        robot: Where the logs are of different robots, the one that the merged session is of.
+        apart: Merge logs with more than a day between them, too.
+        force: Replace an existing output.
+        json: Report as one JSON object.
+    """
+    from ..log.edit.merge import merge_logs
+
+    with interruptible() as request:
+        report = merge_logs(files, output, robot=robot, apart=apart, force=force, stop=request)
+    _tell(report, as_json=json)
+
+
+def _tell(report: EditReport, *, as_json: bool) -> None:
+    if as_json:
+        emit_json(report.as_json())
+        return
+    messages = sum(report.messages.values())
+    origin = ", ".join(dict.fromkeys(source["session_id"] for source in report.sources))
+    say(
+        f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, "
+        f"{report.output.stat().st_size / 1e6:.1f} MB"
+    )
+    for warning in report.warnings:
+        say(f"warning: {warning}")
+    for note in report.notes:
+        say(f"note: {note}")
+    width = max(map(len, report.messages), default=0)
+    for topic, count in report.messages.items():
+        say(f"  {topic:<{width}}  {count} messages")

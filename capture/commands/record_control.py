@@ -1,0 +1,227 @@
+"""The verbs ``record status``, ``mark``, ``note``, ``split``, ``stop`` and ``unit``.
+
+They speak to running recorders by their control sockets.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from ..common.console import complain, emit_json, say
+from ..common.errors import ControlError, UsageError
+
+if TYPE_CHECKING:
+    from ..recorder.control_client import ControlClient
+
+
+_Words = Annotated[str, Parameter(show_default=False)]
+
+
+def status(*, socket: Path | None = None, json: bool = False) -> int:
+    """Say how the running recordings go.
+
+    Example: `undulog record status`
+
+    Args:
+        socket: Control socket of one recorder; all that run by default.
+        json: Report as one JSON object, `recordings`.
+    """
+    from ..recorder.control_client import ControlClient
+
+    found: list[dict[str, Any]] = []
+    silent: list[str] = []
+    for path in [socket] if socket is not None else _running():
+        try:
+            with ControlClient(path) as recorder:
+                found.append({"socket": str(path), **recorder.ask({"do": "status"})})
+        except ControlError as error:
+            silent.append(str(error))
+    if json:
+        emit_json({"recordings": found, "silent": silent})
+    for recording in [] if json else found:
+        say(*_summary(recording))
+    for error in silent:
+        complain(f"error: {error}")
+    return int(bool(silent))
+
+
+def mark(
+    *text: _Words, level: str = "info", socket: Path | None = None, json: bool = False
+) -> None:
+    """Mark this moment of the running recording; a ring is written to a file.
+
+    Example: `undulog record mark slipped on wet sand`
+
+    Args:
+        text: What there is to say of it; it goes to `/rosout`.
+        level: `info`, `warn` or `error`.
+        socket: The recorder's control socket, where several run.
+        json: Report as one JSON object.
+    """
+    with _recorder(socket) as recorder:
+        reply = recorder.ask({"do": "mark", "text": " ".join(text), "level": level})
+    _tell("marked", reply, as_json=json)
+
+
+def note(
+    *text: _Words, level: str = "info", socket: Path | None = None, json: bool = False
+) -> None:
+    """Write a remark into the running recording, to `/rosout`.
+
+    Example: `undulog record note battery changed`
+
+    Args:
+        text: The remark.
+        level: `info`, `warn` or `error`.
+        socket: The recorder's control socket, where several run.
+        json: Report as one JSON object.
+    """
+    if not text:
+        raise UsageError("a note needs a text: undulog record note battery changed")
+    with _recorder(socket) as recorder:
+        reply = recorder.ask({"do": "note", "text": " ".join(text), "level": level})
+    _tell("noted", reply, as_json=json)
+
+
+def split(*, socket: Path | None = None, json: bool = False) -> None:
+    """Have the running recording begin a new part.
+
+    Example: `undulog record split`
+
+    Args:
+        socket: The recorder's control socket, where several run.
+        json: Report as one JSON object.
+    """
+    with _recorder(socket) as recorder:
+        reply = recorder.ask({"do": "split"})
+    _tell("split", reply, as_json=json)
+
+
+def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) -> int:
+    """End the running recording in good order.
+
+    Example: `undulog record stop --wait`
+
+    Args:
+        wait: Wait until the file is whole, and say what it is.
+        socket: The recorder's control socket, where several run.
+        json: Report as one JSON object.
+    """
+    # Finalising takes as long as it takes; without --wait the answer comes at once.
+    with _recorder(socket, for_ever=wait) as recorder:
+        reply = recorder.ask({"do": "stop", "wait": True} if wait else {"do": "stop"})
+    if json or not wait:
+        _tell("stopping", reply, as_json=json)
+    else:
+        files = ", ".join(str(file) for file in reply.get("files", []))
+        say(f"{files or 'nothing written'}: {_facts(reply)}")
+        for reason in reply.get("reasons", []):
+            say(f"  reason: {reason}")
+    return int(bool(reply.get("failed", False)))
+
+
+def unit() -> None:
+    """Print a systemd unit for recordings that start with the computer.
+
+    It is hardened, runs as a user of its own and reads its settings from `/etc/undulog/NAME.toml`.
+
+    Example: `undulog record unit | sudo tee /etc/systemd/system/undulog-record@.service`
+    """
+    from ..recorder.unit import hidden_folder, installed_program, unit_text
+
+    program = installed_program()
+    say(*unit_text(program).splitlines())
+    if (folder := hidden_folder(program)) is not None:
+        complain(
+            f"warning: {program} lies below {folder}, which this unit hides from the service; "
+            "install undulog elsewhere, e.g. in /opt/undulog"
+        )
+
+
+def _running() -> list[Path]:
+    from ..recorder.control_socket import find_sockets
+
+    paths = find_sockets(os.environ)
+    if not paths:
+        raise ControlError("no recorder runs here; --socket names one elsewhere")
+    return paths
+
+
+def _recorder(socket: Path | None, *, for_ever: bool = False) -> ControlClient:
+    """The recorder that is meant: the one of that socket, or the only one that runs."""
+    from ..recorder.control_client import PATIENCE_S, ControlClient
+
+    if socket is None:
+        paths = _running()
+        if len(paths) > 1:
+            listed = "\n".join(f"  --socket {path}" for path in paths)
+            raise UsageError(f"{len(paths)} recorders run; which one?\n{listed}")
+        socket = paths[0]
+    return ControlClient(socket, patience_s=None if for_ever else PATIENCE_S)
+
+
+def _summary(recording: Mapping[str, Any]) -> list[str]:
+    """A recording's status: the answer first."""
+    lines = [
+        f"{recording.get('output')}: {recording.get('state', 'recording')}, {_facts(recording)}"
+    ]
+    lines += [f"  reason: {reason}" for reason in recording.get("reasons", [])]
+    lines += [f"  {_source(source)}" for source in recording.get("sources", [])]
+    lines.append(f"  socket: {recording['socket']}")
+    return lines
+
+
+def _source(source: Mapping[str, Any]) -> str:
+    """A source's state in one line."""
+    ended = "has ended" if source.get("finished") else "not connected"
+    parts = ["connected" if source.get("connected") and not source.get("finished") else ended]
+    if (frames := source.get("frames")) is not None:
+        parts.append(f"{frames} frames")
+    if (rate_hz := source.get("rate_hz")) is not None:
+        parts.append(f"{rate_hz:.0f} frames/s")
+    for key, what in (
+        ("dropped", "lost before us"),
+        ("malformed", "malformed"),
+        ("error_frames", "error frames"),
+        ("reconnects", "reconnects"),
+    ):
+        if source.get(key):
+            parts.append(f"{source[key]} {what}")
+    return f"{source.get('name')}: {', '.join(parts)}"
+
+
+def _facts(reply: Mapping[str, Any]) -> str:
+    """Duration, messages, size and verdict, as far as they are known."""
+    from ..common.amounts import format_size
+
+    parts: list[str] = []
+    seconds = reply.get("elapsed_s", reply.get("duration_s"))
+    if seconds is not None:
+        parts.append(f"{seconds:.1f} s")
+    if (messages := reply.get("messages")) is not None:
+        parts.append(f"{messages} messages")
+    if (size := reply.get("bytes", reply.get("size_bytes"))) is not None:
+        parts.append(format_size(size))
+    if (free := reply.get("free")) is not None:
+        parts.append(f"{format_size(free)} free")
+    if (verdict := reply.get("verdict")) is not None:
+        parts.append(f"verdict {verdict}")
+    if (ended := reply.get("ended")) is not None:
+        parts.append(f"ended: {ended}")
+    return ", ".join(parts)
+
+
+def _tell(done: str, reply: Mapping[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        emit_json(dict(reply))
+    else:
+        say(": ".join([done, *([_plain(reply)] if reply else [])]))
+
+
+def _plain(reply: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in reply.items())

@@ -1,0 +1,1 @@
+"""Files, text, errors and types that all packages use."""

@@ -1,0 +1,151 @@
+"""What every verb prints in the same way: lines, errors, progress and JSON.
+
+All text for a terminal passes :func:`plain`: names in a log are untrusted, and a terminal obeys the
+control characters in them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import unicodedata
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+from .errors import OutputExistsError, UsageError
+
+_UNSAFE = ("Cc", "Cf", "Cs", "Cn", "Co", "Zl", "Zp")
+"""Unicode categories: control, format (also text direction), surrogate, unassigned, private, line
+and paragraph ends. All characters that XML forbids are among them."""
+
+
+def plain(text: str) -> str:
+    r"""Return text that a terminal shows and doesn't obey.
+
+    Args:
+        text: Any text, e.g. with names from a log.
+
+    Returns:
+        One line: control and format characters, line breaks and lone surrogates as escapes, e.g.
+        ``\x1b``, ``\n``, ``\u202e``; the rest unchanged.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        c.encode("unicode_escape").decode("ascii") if unicodedata.category(c) in _UNSAFE else c
+        for c in text
+    )
+
+
+def say(*lines: str) -> None:
+    """Print lines on stdout.
+
+    Args:
+        lines: Any text; what would end a line or control a terminal is escaped (:func:`plain`).
+    """
+    sys.stdout.write("".join(f"{plain(line)}\n" for line in lines))
+    sys.stdout.flush()
+
+
+def complain(message: str) -> None:
+    """Print an error or a warning on stderr.
+
+    Args:
+        message: Any text, escaped as by :func:`plain` except for line feeds; a line behind the
+            first is indented, so that a name with a line feed can't pass for another message.
+    """
+    first, *rest = (plain(line) for line in message.split("\n"))
+    indented = (line if line.startswith("  ") else f"  {line}" for line in rest)
+    sys.stdout.flush()
+    sys.stderr.write("".join(f"{line}\n" for line in (first, *indented)))
+    sys.stderr.flush()
+
+
+class Progress(Protocol):
+    """What a long work reports to."""
+
+    def update(self, done: float, note: str = "") -> None:
+        """Say how far the work is.
+
+        Args:
+            done: In the units of the total.
+            note: A few words, e.g. the real-time factor.
+        """
+        ...
+
+
+class _Silent:
+    def update(self, done: float, note: str = "") -> None:
+        """Say nothing."""
+
+
+@contextmanager
+def progress(description: str, total: float) -> Generator[Progress]:
+    """A progress bar on stderr, or silence where stderr is not a terminal.
+
+    Args:
+        description: What is being done.
+        total: What ``done`` will reach.
+
+    Yields:
+        The object to report to.
+    """
+    if not sys.stderr.isatty():
+        yield _Silent()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task(plain(description), total=total, note="")
+
+        class _Bar:
+            def update(self, done: float, note: str = "") -> None:
+                bars.update(task, completed=done, note=plain(note))
+
+        yield _Bar()
+
+
+def emit_json(value: Any) -> None:
+    """Print one JSON value on stdout.
+
+    Args:
+        value: Plain JSON values; NaN is refused, since it is not JSON.
+    """
+    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def refuse_existing(path: Path, *, force: bool) -> None:
+    """Check an output path before any work is done.
+
+    Args:
+        path: Where the output will go.
+        force: Whether an existing file may be replaced.
+
+    Raises:
+        OutputExistsError: If it is there and ``force`` is not given.
+        UsageError: If it is a folder, or its folder doesn't exist.
+    """
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; name a file in it")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path}: the folder {path.parent} doesn't exist")
+    if path.exists() and not force:
+        raise OutputExistsError(path)
+
+
+UNLIMITED = 10_000
+"""A width at which nothing wraps."""
+
+
+Warn = Callable[[str], None]

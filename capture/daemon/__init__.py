@@ -1,1 +1,0 @@
-"""The recorder: sources in, a session out, for as long as it takes."""

@@ -1,0 +1,306 @@
+"""Messages in bulk: all messages of a channel as columns, without a Python loop over them.
+
+Messages that share their length, strings and sequence lengths (:class:`.Layout`)
+have every number at the same place, so one numpy call takes one field of hundreds of them out of
+the payload, and another holds their strings against the layout's. So a bag with one message per
+servo costs as many layouts as servos, and a message of any other layout is still read right, only
+slower.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...common.arrays import IntArray
+from ...common.errors import DataError
+from ..file.pages import FilePages
+from ..file.storage import LogFile
+from ..mcap.chunk import Buffer
+from ..mcap.message_heads import BODY_AT, FIXED_SIZE, Places
+from ..messages.cdr import Layout, layout_of
+from ..messages.rosmsg import MessageType
+from ..messages.schemas import JOINT_STATE
+from .batches import Records, Window, blocks_in, record_batches
+from .groups import MOST_JOINT_LISTS, Group, Matrix, Stamping, fits_layout
+from .stores import TimeStore
+
+_LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
+_MAX_LAYOUTS = 64
+_MAX_SHARED = 8
+_HELD = 8
+"""Batches after which what was read is let go of, where columns lie in files."""
+_EXPANSION = 64
+"""No more memory is reserved than this many times the bytes in the file; more may be used."""
+
+
+@dataclass
+class Unread:
+    """A message that has no layout here (big-endian, ``wstring``, damaged).
+
+    Attributes:
+        log_ns: Its log time.
+        data: Its bytes.
+        why: What was wrong.
+    """
+
+    log_ns: int
+    data: bytes
+    why: str
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to read of one topic.
+
+    Attributes:
+        topic: Its name.
+        channel_ids: The topic's channels.
+        message_type: Their type.
+        paths: Leaf paths to keep; None for all.
+        layouts: One of each length that was seen before, by length; new ones are noted.
+    """
+
+    topic: str
+    channel_ids: Sequence[int]
+    message_type: MessageType
+    paths: Sequence[str] | None = None
+    layouts: dict[int, Layout] = field(default_factory=dict[int, Layout])
+
+
+@dataclass
+class Messages:
+    """All messages of one topic.
+
+    Attributes:
+        groups: By layout, in order of first appearance.
+        unread: Those that have no layout.
+    """
+
+    groups: list[Group]
+    unread: list[Unread]
+
+
+def read_messages(
+    log_file: LogFile,
+    requests: Sequence[Request],
+    *,
+    window_ns: Window = (None, None),
+    warn: Callable[[str], None],
+    threads: int = 1,
+) -> list[Messages]:
+    """Read several topics in one pass over the file: each chunk is decompressed once.
+
+    Args:
+        log_file: The file.
+        requests: What to read, one a topic.
+        window_ns: Half-open window of log times [Unix ns]; None for open ends.
+        warn: Takes one sentence for each block that couldn't be read.
+        threads: How many decompress the blocks.
+
+    Returns:
+        The messages, one entry a request.
+
+    Raises:
+        DataError: If a topic of JointStates has more than :data:`MOST_JOINT_LISTS` lists of joints.
+    """
+    blocks = blocks_in(log_file, window_ns)
+    shared: list[TimeStore] = []
+    stamping = Stamping()
+    stored = sum(block.stop - block.start for block in blocks)
+    readers = [
+        _GroupReader(
+            request,
+            _expected(log_file, request, len(blocks)),
+            _EXPANSION * stored,
+            shared,
+            stamping=stamping,
+            pages=log_file.pages,
+        )
+        for request in requests
+    ]
+    wanted = [request.channel_ids for request in requests]
+    batches = record_batches(log_file, wanted, blocks, warn, threads)
+    for k, (_, found) in enumerate(batches, start=1):
+        for reader, records in zip(readers, found, strict=True):
+            if len(records.offsets):
+                reader.add(records, window_ns)
+        if log_file.pages is not None and k % _HELD == 0:
+            log_file.forget()
+    return [Messages(reader.groups, reader.unread) for reader in readers]
+
+
+def _expected(log_file: LogFile, request: Request, blocks: int) -> int:
+    """How many messages to expect of so many blocks."""
+    counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
+    part = blocks / max(len(log_file.blocks), 1)
+    return int(counted * min(part, 1.0)) + 1
+
+
+def message_blocks(
+    log_file: LogFile,
+    channel_ids: Sequence[int],
+    window_ns: Window,
+    warn: Callable[[str], None],
+) -> Iterator[tuple[Buffer, IntArray]]:
+    """The payloads that hold messages of one topic, with the offsets of their records.
+
+    Args:
+        log_file: The file.
+        channel_ids: The topic's channels.
+        window_ns: Blocks wholly outside this window of log times are passed over.
+        warn: Takes one sentence for each block that couldn't be read.
+
+    Yields:
+        Payload, to be used before the next is asked for, and checked record offsets, shape (n,).
+    """
+    for block in blocks_in(log_file, window_ns):  # one by one: who wants the first wants no more
+        for data, (records,) in record_batches(log_file, [channel_ids], [block], warn):
+            if len(records.offsets):
+                yield data, records.offsets
+
+
+def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
+    """One message record's log time and message.
+
+    Args:
+        data: The payload.
+        offset: Where the record starts.
+
+    Returns:
+        Log time [Unix ns] and the message's bytes.
+    """
+    length = int.from_bytes(data[offset + _LENGTH_AT : offset + 9], "little") - FIXED_SIZE
+    log_ns = int.from_bytes(data[offset + _LOG_TIME_AT : offset + 23], "little")
+    return log_ns, bytes(data[offset + BODY_AT : offset + BODY_AT + length])
+
+
+class _GroupReader:
+    """Sorts messages into groups by layout."""
+
+    def __init__(
+        self,
+        request: Request,
+        expected: int,
+        reserve: int,
+        shared: list[TimeStore],
+        *,
+        stamping: Stamping,
+        pages: FilePages | None,
+    ) -> None:
+        self._topic, self._type = request.topic, request.message_type
+        self._most = MOST_JOINT_LISTS if self._type.name == JOINT_STATE else None
+        self._paths = None if request.paths is None else frozenset(request.paths)
+        self._layouts = request.layouts
+        self._expected, self._reserve = expected, reserve
+        self._shared, self._stamping, self._pages = shared, stamping, pages
+        self._by_length: dict[int, list[Group]] = {}
+        self._count = 0
+        self.groups: list[Group] = []
+        self.unread: list[Unread] = []
+
+    def add(self, records: Records, window_ns: Window) -> None:
+        places, log_ns, length = records.bodies, records.log_ns, records.length
+        start, stop = window_ns
+        if (start is not None and (log_ns < start).any()) or (
+            stop is not None and (log_ns >= stop).any()
+        ):
+            keep = np.ones(len(places), dtype=bool)
+            keep &= True if start is None else log_ns >= start
+            keep &= True if stop is None else log_ns < stop
+            places, log_ns = places.take(keep), log_ns[keep]
+        if not len(places):
+            return
+        first = self._count
+        self._count += len(places)
+        if length is not None:
+            known = self._by_length.get(length)
+            if known and known[0].holds(places):  # the usual case
+                known[0].take(places, log_ns, range(first, self._count))
+            else:
+                self._sort_in(length, places, log_ns, np.arange(first, self._count))
+            return
+        heads = Places(places.data, places.at - BODY_AT)
+        lengths = heads.field("<i8", _LENGTH_AT) - FIXED_SIZE
+        for length in np.unique(lengths).tolist():
+            rows = np.flatnonzero(lengths == length)
+            self._sort_in(length, places.take(rows), log_ns[rows], first + rows)
+
+    def _sort_in(self, length: int, places: Places, log_ns: IntArray, order: IntArray) -> None:
+        """Take messages of one length, whatever their layouts."""
+        matrix = _matrix(places, length)
+        known = self._by_length.setdefault(length, [])
+        for group in known:
+            fits = fits_layout(matrix, group.layout)
+            if fits.any():
+                group.take(places.take(fits), log_ns[fits], order[fits])
+                rest = ~fits
+                matrix, places = matrix[rest], places.take(rest)
+                log_ns, order = log_ns[rest], order[rest]
+            if not len(places):
+                return
+        while len(places):
+            example = matrix[0].tobytes()
+            try:
+                layout = self._layout(example)
+            except DataError as error:
+                self.unread.append(Unread(int(log_ns[0]), example, str(error)))
+                matrix, places = matrix[1:], places.take(slice(1, None))
+                log_ns, order = log_ns[1:], order[1:]
+                continue
+            if self._most is not None and len(self.groups) >= self._most:
+                raise DataError(
+                    f"{self._topic} has more than {self._most} different lists of joints or frame "
+                    "ids; give each robot a topic of its own"
+                )
+            if len(known) < _MAX_LAYOUTS:
+                fits = fits_layout(matrix, layout)
+                group = self._group(layout, self._capacity(length, int(fits.sum())))
+                known.append(group)
+                rest = ~fits
+            else:  # text has a layout a message: don't hold every later message against each
+                group = self._new_group(layout, 1)
+                fits, rest = slice(0, 1), slice(1, None)
+            self.groups.append(group)
+            group.take(places.take(fits), log_ns[fits], order[fits])
+            matrix, places = matrix[rest], places.take(rest)
+            log_ns, order = log_ns[rest], order[rest]
+
+    def _layout(self, message: bytes) -> Layout:
+        """The layout of a message, found anew unless it is that of an earlier reading."""
+        known = self._layouts.get(len(message))
+        if known is not None and known.fits(message):
+            return known
+        found = layout_of(self._type, message)
+        if known is not None or len(self._layouts) < _MAX_LAYOUTS:
+            self._layouts[len(message)] = found
+        return found
+
+    def _group(self, layout: Layout, capacity: int) -> Group:
+        """A group; the first of a topic may have the times of another topic's first."""
+        if self.groups:
+            return self._new_group(layout, capacity)
+        group = self._new_group(layout, capacity, tuple(self._shared))
+        if len(self._shared) < _MAX_SHARED:
+            self._shared.append(group.kept_times)
+        return group
+
+    def _new_group(
+        self, layout: Layout, capacity: int, others: tuple[TimeStore, ...] = ()
+    ) -> Group:
+        return Group(
+            layout, self._paths, capacity, others, stamping=self._stamping, pages=self._pages
+        )
+
+    def _capacity(self, length: int, seen: int) -> int:
+        """Room for a group: all that is expected for the first, and what a file of its size has."""
+        if self.groups:
+            return 2 * seen
+        return max(seen, min(self._expected, self._reserve // max(length, 1)))
+
+
+def _matrix(places: Places, length: int) -> Matrix:
+    """Messages of one length as rows of bytes."""
+    return places.rows(np.dtype(np.uint8), length, 0)

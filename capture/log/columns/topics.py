@@ -1,0 +1,252 @@
+"""The topics of an open log: their channels, message types, and the general decoder."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from io import StringIO
+from types import MappingProxyType
+from typing import Any, cast
+
+from mcap.exceptions import McapError
+from mcap.records import Schema
+
+from ...common.errors import DataError, MissingChannelError
+from ..file.storage import LogFile
+from ..mcap.chunk import LAST_NS
+from ..messages.cdr import Layout
+from ..messages.rosmsg import MessageType, parse_message_type
+from .batches import Window
+from .columns import Messages, Request, message_blocks, message_bytes, read_messages
+
+_ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One topic of a session.
+
+    Attributes:
+        topic: E.g. ``/joint_states``.
+        type_name: E.g. ``sensor_msgs/msg/JointState``.
+        count: Number of messages.
+        metadata: Of the channel, e.g. ``unit``.
+        encoding: Of its messages, e.g. ``cdr``; ``json``, ``protobuf`` or ``ros1`` in other makes.
+        schema_encoding: E.g. ``ros2msg``; empty without a schema.
+    """
+
+    topic: str
+    type_name: str
+    count: int
+    metadata: Mapping[str, str]
+    encoding: str
+    schema_encoding: str
+
+    @property
+    def is_ros2(self) -> bool:
+        """Whether its messages are of ROS 2, which can be read."""
+        return (self.encoding, self.schema_encoding) == (_ENCODING, _SCHEMA_ENCODING)
+
+
+class Topics:
+    """Reads topics of one file by name."""
+
+    def __init__(self, log_file: LogFile, warn: Callable[[str], None], *, threads: int = 1) -> None:
+        """Sort the file's channels by topic.
+
+        Args:
+            log_file: The open file.
+            warn: Takes one sentence for each irregularity.
+            threads: How many decompress what is read.
+        """
+        self._file = log_file
+        self._threads = threads
+        self._warn = warn
+        self._types: dict[int, MessageType | DataError] = {}  # by schema
+        self._layouts: dict[str, dict[int, Layout]] = {}
+        self._ids: dict[str, list[int]] = {}
+        for channel in log_file.channels.values():
+            self._ids.setdefault(channel.topic, []).append(channel.id)
+        self.channels: Mapping[str, Channel] = MappingProxyType(
+            {topic: self._channel(topic) for topic in self._ids}
+        )
+
+    def read(
+        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+    ) -> dict[str, Messages]:
+        """Read topics in one pass.
+
+        Args:
+            wanted: Topic to leaf paths; None for all.
+            window_ns: Half-open window of log times [Unix ns]; None for open ends.
+
+        Returns:
+            Topic to messages.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If a topic's type can't be read, or one of JointStates has too many lists of
+                joints.
+        """
+        requests = [
+            Request(
+                topic,
+                self._channel_ids(topic),
+                self.message_type(topic),
+                paths,
+                self._layouts.setdefault(topic, {}),
+            )
+            for topic, paths in wanted.items()
+        ]
+        try:
+            found = read_messages(
+                self._file, requests, window_ns=window_ns, warn=self._warn, threads=self._threads
+            )
+        except DataError as error:
+            raise DataError(f"{self._file.path}: {error}") from None
+        return dict(zip(wanted, found, strict=True))
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether undulog wrote the file: then its log times follow the stamps closely."""
+        return self._file.library.startswith("undulog/")
+
+    def message_type(self, topic: str) -> MessageType:
+        """The type of a topic's messages.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            The parsed schema.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the schema can't be read.
+        """
+        schema = self._schema(topic)
+        kind = self._types.get(schema.id)
+        if kind is None:
+            try:
+                kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
+            except DataError as error:
+                kind = error
+            self._types[schema.id] = kind
+        if isinstance(kind, DataError):
+            raise DataError(str(kind))
+        return kind
+
+    def first(self, topic: str) -> tuple[int, bytes, MessageType] | None:
+        """The first message of a topic.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            Log time [Unix ns], bytes and type; None where there is none.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the topic's type can't be read.
+        """
+        kind = self.message_type(topic)
+        for log_ns, message in self.raw(topic):
+            return log_ns, message, kind
+        return None
+
+    def raw(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """The messages of a topic as bytes, in the order of the file.
+
+        Args:
+            topic: Its name.
+
+        Yields:
+            Log time [Unix ns] and the message's bytes.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+        """
+        ids = self._channel_ids(topic)
+        for data, offsets in message_blocks(self._file, ids, (None, None), self._warn):
+            for offset in offsets.tolist():
+                log_ns, message = message_bytes(data, offset)
+                yield min(log_ns, LAST_NS), message
+
+    def decoder(self, topic: str) -> Callable[[bytes], Any]:
+        """The general decoder of a topic, for messages of any shape.
+
+        Args:
+            topic: Its name.
+
+        Returns:
+            A function from bytes to a message with fields as attributes; it raises DataError for a
+            damaged message.
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the topic's schema can't be used.
+        """
+        from mcap_ros2.decoder import DecoderFactory
+
+        schema = self._schema(topic)
+        self.message_type(topic)  # ours says more of a damaged schema, and says it once
+        where = f"{self._file.path}: {topic}"
+        try:
+            with redirect_stderr(StringIO()):  # its parser prints what it raises
+                decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
+        except Exception as error:  # the library's parser has no error tree of its own
+            raise DataError(f"{where}: its schema can't be used: {error}") from error
+
+        def checked(message: bytes) -> Any:
+            try:
+                return decode(message)
+            except (McapError, struct.error, ValueError, IndexError, ArithmeticError) as error:
+                raise DataError(f"{where}: a message is damaged: {error}") from error
+
+        return checked
+
+    def _channel(self, topic: str) -> Channel:
+        channels = [self._file.channels[channel_id] for channel_id in self._ids[topic]]
+        types = [self._file.schemas.get(channel.schema_id) for channel in channels]
+        names = [schema.name if schema is not None else "" for schema in types]
+        if len(set(names)) > 1:
+            self._warn(
+                f"{topic} has several types, {', '.join(sorted(set(names)))}: {names[0]} is read"
+            )
+            self._ids[topic] = [
+                channel.id
+                for channel, name in zip(channels, names, strict=True)
+                if name == names[0]
+            ]
+        count = sum(self._file.counts.get(channel_id, 0) for channel_id in self._ids[topic])
+        return Channel(
+            topic=topic,
+            type_name=names[0],
+            count=count,
+            metadata=MappingProxyType(dict(channels[0].metadata)),
+            encoding=channels[0].message_encoding,
+            schema_encoding=types[0].encoding if types[0] is not None else "",
+        )
+
+    def _channel_ids(self, topic: str) -> list[int]:
+        if topic not in self._ids:
+            raise MissingChannelError(self._file.path, topic, sorted(self._ids))
+        return self._ids[topic]
+
+    def _schema(self, topic: str) -> Schema:
+        channel = self._file.channels[self._channel_ids(topic)[0]]
+        schema = self._file.schemas.get(channel.schema_id)
+        if (
+            schema is None
+            or schema.encoding != _SCHEMA_ENCODING
+            or channel.message_encoding != _ENCODING
+        ):
+            found = f"{channel.message_encoding or 'no encoding'} with " + (
+                f"a {schema.encoding or 'nameless'} schema" if schema is not None else "no schema"
+            )
+            raise DataError(
+                f"{self._file.path}: {topic} is {found}; only ROS 2 messages (cdr) are read"
+            )
+        return schema

@@ -1,0 +1,1 @@
+"""Logs cut, merged and recovered."""

@@ -1,0 +1,303 @@
+"""Merge logs: all messages of several logs in one, interleaved by log time.
+
+A topic of the same type in several logs becomes one topic. Of what explains the logs, the same is
+kept once and the different under different names; the sources' ids and hashes are kept.
+
+The order: by log time, and of equal times the log that was named first. A log whose own messages
+are not in order of time keeps its order, so that memory holds one chunk a log; readers of MCAP
+sort by log time anyway.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from itertools import combinations
+from pathlib import Path
+
+from mcap.records import Schema
+
+from ...common.console import progress
+from ...common.errors import DataError, UsageError
+from ...common.interruption import StopRequest
+from ..columns.topics import Topics
+from ..messages.cdr import layout_of
+from ..messages.rosmsg import parse_message_type
+from ..messages.schemas import JOINT_STATE
+from .edit import (
+    EDIT_RECORD,
+    NS,
+    EditedLog,
+    EditReport,
+    edited_log,
+    portable,
+    refuse_output,
+    refuse_stopped,
+)
+from .merge_records import copy_records
+from .raw_log import RawLog, RawMessage
+
+FAR_APART_S = 86400.0
+"""Logs with a longer time between them are merged only on request [s]: one of them is of another
+day's session, or a clock was wrong."""
+
+_LATER_S = 60.0
+_FOREVER_NS = 2**64
+_LOOK_EVERY = 1024
+
+
+def merge_logs(
+    paths: Sequence[Path],
+    output: Path,
+    *,
+    robot: str | None = None,
+    apart: bool = False,
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> EditReport:
+    """Write the messages of several logs to one new file.
+
+    Args:
+        paths: The logs, two or more.
+        output: The new log.
+        robot: The robot that the merged session is of, where the logs are of different ones.
+        apart: Merge logs with more than :data:`FAR_APART_S` between them.
+        force: Replace an existing file.
+        stop: Request to stop.
+
+    Returns:
+        What was done.
+
+    Raises:
+        UsageError: If there are fewer than two logs, one is given twice, they are of different
+            robots and ``robot`` names none of them, they lie far apart in time and ``apart`` is
+            not given, or the output can't be that.
+        DataError: If a topic has different types or units in two logs, or there is no message.
+        LogError: If a log can't be read or the new one can't be written.
+        UndulogError: If a stop was requested; nothing is left behind then.
+    """
+    if len(paths) < 2:
+        raise UsageError("a merge needs two logs or more")
+    refuse_output(output, paths, force=force)
+    stop = stop or StopRequest()
+    with ExitStack() as stack:
+        sources = [stack.enter_context(RawLog(path)) for path in paths]
+        _refuse_twice(sources)
+        of_robot = _common_robot(sources, robot)
+        _refuse_other_types(sources)
+        warnings = [*_other_robots(sources, of_robot), *_apart(sources, allowed=apart)]
+        warnings += _mixed(sources)
+        with edited_log(sources, output, force=force, stop=stop) as log:
+            last = copy_records(sources, log, of_robot, warnings)
+            _copy_messages(sources, log, stop)
+            if log.first_ns is None:
+                raise DataError(f"there is no message in {', '.join(map(str, paths))}")
+            warnings += [sentence for source in sources for sentence in source.warnings]
+            facts = {
+                "verb": "merge",
+                "undulog": version("undulog"),
+                "sources": json.dumps([source.path.name for source in sources]),
+                "session_ids": json.dumps([source.session_id for source in sources]),
+                "sha256": json.dumps([source.sha256 for source in sources]),
+                "robot": of_robot,
+                "warnings": portable(warnings, sources),
+            }
+            for name, entries in [(EDIT_RECORD, facts), *last]:
+                log.note(name, entries)
+    return EditReport(
+        verb="merge",
+        output=output,
+        sources=[
+            {"path": str(source.path), "session_id": source.session_id, "sha256": source.sha256}
+            for source in sources
+        ],
+        start_ns=log.first_ns,
+        end_ns=log.last_ns,
+        messages=dict(sorted(log.counts.items())),
+        warnings=warnings,
+    )
+
+
+def _refuse_twice(sources: Sequence[RawLog]) -> None:
+    for one, other in combinations(sources, 2):
+        if one.sha256 == other.sha256:
+            raise UsageError(f"{one.path} and {other.path} are the same log, byte for byte")
+
+
+def _common_robot(sources: Sequence[RawLog], told: str | None) -> str:
+    """The robot that the merged session is of; empty where no log says one."""
+    robots = {source.robot: source.path for source in reversed(sources) if source.robot}
+    if told is not None:
+        if told not in robots:
+            there = ", ".join(sorted(robots)) or "none"
+            raise UsageError(f"--robot {told}: the logs' robots are: {there}")
+        return told
+    if len(robots) > 1:
+        listed = ", ".join(f"{name} ({path})" for name, path in reversed(robots.items()))
+        raise UsageError(
+            f"the logs are of different robots: {listed}; a session is of one: --robot NAME "
+            "says which, and its description keeps its name"
+        )
+    return next(iter(robots), "")
+
+
+def _refuse_other_types(sources: Sequence[RawLog]) -> None:
+    """Refuse topics whose messages would be read wrong under one name."""
+    faults: list[str] = []
+    for (one, kinds), (other, others) in combinations(
+        [(each, _kinds(each)) for each in sources], 2
+    ):
+        for topic in sorted(kinds.keys() & others.keys()):
+            this, that = kinds[topic], others[topic]
+            if this.definitions != that.definitions:
+                a, b = ", ".join(sorted(this.names)), ", ".join(sorted(that.names))
+                b = b if a != b else "the same name with another definition"
+            elif this.units and that.units and this.units != that.units:
+                a, b = (f"in {', '.join(sorted(kind.units))}" for kind in (this, that))
+            else:
+                continue
+            faults.append(f"{topic} is {a} in {one.path} and {b} in {other.path}")
+    if faults:
+        raise DataError(
+            f"{'; '.join(faults)}. A topic has one type and one unit: leave it out of one log "
+            "first (undulog log cut --topics)"
+        )
+
+
+@dataclass
+class _Kind:
+    """How a topic's messages are to be read; one entry each, unless the log itself is at odds.
+
+    Attributes:
+        names: Types, with their encoding where it is not that of ROS 2.
+        definitions: What tells types apart.
+        units: Those that are stated.
+    """
+
+    names: set[str] = field(default_factory=set[str])
+    definitions: set[object] = field(default_factory=set[object])
+    units: set[str] = field(default_factory=set[str])
+
+
+def _kinds(source: RawLog) -> dict[str, _Kind]:
+    found: dict[str, _Kind] = {}
+    definitions = {key: _definition(schema) for key, schema in source.file.schemas.items()}
+    for channel in source.file.channels.values():
+        kind = found.setdefault(channel.topic, _Kind())
+        schema = source.file.schemas.get(channel.schema_id)
+        coding = channel.message_encoding, schema.encoding if schema is not None else ""
+        name = source.type_name(channel) or "without a type"
+        kind.names.add(name if coding == ("cdr", "ros2msg") else f"{name} ({'/'.join(coding)})")
+        kind.definitions.add((name, coding, definitions.get(channel.schema_id)))
+        if channel.metadata.get("unit"):
+            kind.units.add(channel.metadata["unit"])
+    return found
+
+
+def _definition(schema: Schema) -> object:
+    """A message definition that can be compared: comments and spaces don't matter."""
+    if schema.encoding == "ros2msg":
+        with suppress(DataError):  # what can't be parsed is compared as bytes
+            return parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
+    return schema.data
+
+
+def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
+    """Warn of logs that are not, or seem not to be, of the merged session's robot."""
+    said = [
+        f"{source.path} is of {source.robot}, not of {robot}: its messages are merged all the same"
+        for source in sources
+        if source.robot and source.robot != robot
+    ]
+    joints = [(source, _joint_names(source)) for source in sources]
+    for (one, names), (other, others) in combinations(joints, 2):
+        unstated = not one.robot or not other.robot
+        if unstated and names and others and names.isdisjoint(others):
+            said.append(
+                f"{one.path} has {_listed(names)}, {other.path} has {_listed(others)}: no joint "
+                "is in both, are they of one robot?"
+            )
+    return said
+
+
+def _joint_names(source: RawLog) -> set[str]:
+    """The joints that the first message of each JointState topic names."""
+    topics, found = Topics(source.file, source.warn), set[str]()
+    for topic, channel in topics.channels.items():
+        if channel.type_name == JOINT_STATE and channel.is_ros2 and channel.count:
+            with suppress(DataError):  # damage has no names; whoever reads the topic is told
+                first = topics.first(topic)
+                strings = {} if first is None else layout_of(first[2], first[1]).strings
+                found |= {name for path, name in strings.items() if path.startswith("name[")}
+    return found
+
+
+def _listed(names: set[str]) -> str:
+    listed = sorted(names)
+    return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
+
+
+def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
+    """Warn of logs with time between them, and refuse those that are far apart."""
+    said: list[str] = []
+    ordered = sorted((each for each in sources if each.end_ns), key=lambda each: each.start_ns)
+    for k, later in enumerate(ordered[1:], start=1):
+        earlier = max(ordered[:k], key=lambda each: each.end_ns)
+        gap_s = (later.start_ns - earlier.end_ns) / NS
+        sentence = f"{later.path} begins {_span(gap_s)} after {earlier.path} ends"
+        if gap_s > FAR_APART_S and not allowed:
+            raise UsageError(f"{sentence}: not one session; --apart merges them all the same")
+        if gap_s > _LATER_S:
+            said.append(sentence)
+    return said
+
+
+def _span(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("h", 3600.0)):
+        if seconds > size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _mixed(sources: Sequence[RawLog]) -> list[str]:
+    """Warn of logs that hold the same topics at the same times."""
+    said: list[str] = []
+    for one, other in combinations(sources, 2):
+        start, stop = max(one.start_ns, other.start_ns), min(one.end_ns, other.end_ns)
+        topics = {c.topic for c in one.file.channels.values() if one.file.counts.get(c.id)} & {
+            c.topic for c in other.file.channels.values() if other.file.counts.get(c.id)
+        }
+        if start <= stop and topics:
+            said.append(
+                f"{one.path} and {other.path} overlap by {(stop - start) / NS:.2f} s and share "
+                f"{len(topics)} topics ({', '.join(sorted(topics)[:3])}"
+                f"{', ...' if len(topics) > 3 else ''}): their messages are mixed"
+            )
+    return said
+
+
+def _copy_messages(sources: Sequence[RawLog], log: EditedLog, stop: StopRequest) -> None:
+    start_ns = min(source.start_ns for source in sources)
+    total_s = (max(source.end_ns for source in sources) - start_ns) / NS
+    merged = heapq.merge(
+        *(_in_order(source, log) for source in sources), key=lambda entry: entry[0]
+    )
+    with progress(f"merging {len(sources)} logs", total_s) as bar:
+        for k, (t_ns, channel_id, message) in enumerate(merged):
+            log.write(channel_id, message)
+            if k % _LOOK_EVERY == 0:
+                refuse_stopped(stop)
+                bar.update((t_ns - start_ns) / NS)
+
+
+def _in_order(source: RawLog, log: EditedLog) -> Iterator[tuple[int, int, RawMessage]]:
+    """Latest log time so far, new channel id and message, in the order of the file."""
+    ids = {c.id: log.channel(source, c) for c in source.file.channels.values()}
+    latest_ns = 0
+    for message in source.messages(ids, 0, _FOREVER_NS):
+        latest_ns = max(latest_ns, message.log_time_ns)
+        yield latest_ns, ids[message.channel_id], message

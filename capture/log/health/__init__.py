@@ -1,0 +1,1 @@
+"""The health of a log: measures, findings, verdict."""

@@ -1,0 +1,132 @@
+"""Raw CAN frames: rate, error frames and an estimate of the bus load."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...common.arrays import IntArray
+from ..messages.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameArray, holds_fd
+from .measures import BusHealth
+from .tallies import NS, TimingTally
+from .undecoded import IdentifierTally
+
+
+def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
+    """Length of classic CAN frames on the wire, interframe space included.
+
+    Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
+    refuted, revisited and revised" (2007): C = g + 8 s + 13 + floor((g + 8 s - 1) / 4), with
+    g = 34 for 11-bit and 54 for 29-bit identifiers; the last term is the most stuff bits.
+
+    Args:
+        frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
+
+    Returns:
+        Fewest and most bits, each of shape (n,); 0 for error frames, which report what happened
+        on the bus and are not on it themselves.
+    """
+    flags = frames["id_flags"]
+    g = np.where(flags & EXTENDED_FLAG, 54, 34)
+    s = np.where(flags & REMOTE_FLAG, 0, np.minimum(frames["dlc"], 8)).astype(np.int64)
+    on_bus = (flags & ERROR_FLAG) == 0
+    fewest = g + 8 * s + 13
+    return fewest * on_bus, (fewest + (g + 8 * s - 1) // 4) * on_bus
+
+
+class BusTally:
+    """Frames of one bus and one kind.
+
+    CAN FD frames are counted and timed. How long they are on the wire is not estimated: their data
+    may have a bit rate of their own, which no session tells.
+
+    Attributes:
+        identifiers: The data frames by identifier.
+    """
+
+    def __init__(self, horizon_s: int | None = None) -> None:
+        """Start empty.
+
+        Args:
+            horizon_s: Sum up seconds that are older than this against the newest [s]; None to
+                keep them all.
+        """
+        self.identifiers = IdentifierTally()
+        self._timing = TimingTally()
+        self._errors = 0
+        self._horizon_s = horizon_s
+        self._bits: dict[int, tuple[int, int]] = {}
+        self._closed = self._peak = (0, 0)  # of the seconds that were summed up
+
+    def add(self, frames: FrameArray) -> None:
+        """Take the next frames.
+
+        Args:
+            frames: In the order of the log, shape (n,).
+        """
+        if not len(frames):
+            return
+        t_ns = frames["t_host_ns"].astype(np.int64)
+        self._timing.add(t_ns)
+        self._errors += int(((frames["id_flags"] & ERROR_FLAG) != 0).sum())
+        self.identifiers.add(frames)
+        if holds_fd(frames):
+            return
+        fewest, most = frame_bits(frames)
+        seconds, place = np.unique(t_ns // NS, return_inverse=True)
+        sums = [np.bincount(place, bits).astype(np.int64).tolist() for bits in (fewest, most)]
+        for second, low, high in zip(seconds.tolist(), *sums, strict=True):
+            had = self._bits.get(second, (0, 0))
+            self._bits[second] = (had[0] + low, had[1] + high)
+        if self._horizon_s is not None and len(self._bits) > 2 * self._horizon_s:
+            self._close(max(self._bits) - self._horizon_s)
+
+    def result(self, topic: str, bitrate: int | None) -> BusHealth:
+        """What the frames so far say.
+
+        Args:
+            topic: The bus's topic.
+            bitrate: [bit/s], None where unknown.
+
+        Returns:
+            The bus's health.
+        """
+        timing = self._timing.result()
+        span_s = (timing.last_ns - timing.first_ns) / NS
+        load = peak = None
+        if bitrate and span_s > 0 and self._bits:
+            every = [self._closed, *self._bits.values()]
+            low, high = (sum(bits[k] for bits in every) for k in (0, 1))
+            load = low / span_s / bitrate, high / span_s / bitrate
+            every[0] = self._peak
+            low, high = (max(bits[k] for bits in every) for k in (0, 1))
+            peak = low / bitrate, high / bitrate
+        return BusHealth(
+            topic,
+            timing.count,
+            timing.rate_hz,
+            self._errors,
+            timing.longest_s,
+            timing.longest_at_ns,
+            load,
+            peak,
+        )
+
+    def last_second(self, bitrate: int | None) -> tuple[float, float] | None:
+        """Load of the last whole second.
+
+        Args:
+            bitrate: [bit/s], None where unknown.
+
+        Returns:
+            Part of the bitrate without and with the most stuff bits; None where unknown.
+        """
+        if not bitrate or not self._bits:
+            return None
+        low, high = self._bits.get(max(self._bits) - 1, (0, 0))
+        return low / bitrate, high / bitrate
+
+    def _close(self, before: int) -> None:
+        for second in [second for second in self._bits if second < before]:
+            low, high = self._bits.pop(second)
+            self._closed = self._closed[0] + low, self._closed[1] + high
+            self._peak = max(self._peak[0], low), max(self._peak[1], high)

@@ -1,0 +1,217 @@
+"""Joints that stand, to the bit, while their commands move: by the second, in bounded memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from ...common.arrays import BoolArray, FloatArray, IntArray
+
+NS = 1_000_000_000
+
+FROZEN_COMMAND_RAD = 0.05
+"""A joint is frozen in a second if its angle keeps one value, to the bit, while its command moves
+by more than this: ten steps of the coarsest common servo (0.29 degrees)."""
+
+FROZEN_SAMPLES = 5
+"""A second with fewer samples can't tell."""
+
+KEPT_S = 600
+"""Seconds that a live tally keeps for a partner whose stamps lag behind, at most."""
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Smallest and largest value of each joint in each second.
+
+    Attributes:
+        second: Unix seconds, increasing, shape (s,).
+        count: Samples in each, shape (s,).
+        low: Shape (s, k); NaN where a second has nothing else.
+        high: Shape (s, k).
+    """
+
+    second: IntArray
+    count: IntArray
+    low: FloatArray
+    high: FloatArray
+
+
+class RangeTally:
+    """Ranges by the second: what tells a frozen joint from a still one. 16 byte a joint-second."""
+
+    def __init__(self, horizon_s: int | None = None) -> None:
+        """Start empty.
+
+        Args:
+            horizon_s: Leave out samples older than this against the newest before them [s], so
+                that seconds further back are complete and can be forgotten; None for never.
+        """
+        self._horizon_s = horizon_s
+        self._newest: int | None = None
+        self._parts: list[Ranges] = []
+
+    def add(self, t_ns: IntArray, values: FloatArray) -> None:
+        """Take the next samples.
+
+        Args:
+            t_ns: Their times [Unix ns], shape (n,).
+            values: Shape (n, k).
+        """
+        if not len(t_ns):
+            return
+        second = t_ns // NS
+        if self._horizon_s is not None:
+            newest = np.maximum.accumulate(second)
+            if self._newest is not None:
+                newest = np.maximum(newest, self._newest)
+            kept = second >= newest - self._horizon_s
+            self._newest = int(newest[-1])
+            if not kept.all():
+                second, values = second[kept], values[kept]
+        if len(second):
+            self._parts.append(_by_second(second, np.ones(len(second), int), values, values))
+
+    def result(self, width: int) -> Ranges:
+        """The ranges so far.
+
+        Args:
+            width: Number of joints k, for a stream without samples.
+
+        Returns:
+            One row a second that has samples and was not forgotten.
+        """
+        if not self._parts:
+            none = np.empty((0, width))
+            return Ranges(np.empty(0, np.int64), np.empty(0, np.int64), none, none)
+        if len(self._parts) > 1:
+            self._parts = [
+                _by_second(
+                    np.concatenate([part.second for part in self._parts]),
+                    np.concatenate([part.count for part in self._parts]),
+                    np.concatenate([part.low for part in self._parts]),
+                    np.concatenate([part.high for part in self._parts]),
+                )
+            ]
+        return self._parts[0]
+
+    @property
+    def closed(self) -> int | None:
+        """Seconds before this one are complete; None without a horizon or a sample."""
+        if self._horizon_s is None or self._newest is None:
+            return None
+        return self._newest - self._horizon_s
+
+    def forget(self, before: int | None) -> None:
+        """Drop complete seconds that are no longer needed.
+
+        Args:
+            before: The first second to keep; None to keep all but the oldest of a live tally.
+        """
+        if self._newest is None or not self._parts:
+            return
+        oldest = self._newest - KEPT_S
+        first = oldest if before is None else max(before, oldest)
+        whole = self.result(self._parts[0].low.shape[1])
+        kept = whole.second >= first
+        if not kept.all():
+            self._parts = [
+                Ranges(whole.second[kept], whole.count[kept], whole.low[kept], whole.high[kept])
+            ]
+
+
+def _by_second(second: IntArray, count: IntArray, low: FloatArray, high: FloatArray) -> Ranges:
+    if (np.diff(second) < 0).any():
+        order = np.argsort(second, kind="stable")
+        second, count, low, high = second[order], count[order], low[order], high[order]
+    first = np.flatnonzero(np.diff(second, prepend=second[:1] - 1))
+    return Ranges(
+        second[first],
+        np.add.reduceat(count, first),
+        np.fmin.reduceat(low, first, axis=0),
+        np.fmax.reduceat(high, first, axis=0),
+    )
+
+
+class FreezeTally:
+    """The longest time that joints of one series stood while a series of commands moved."""
+
+    def __init__(self, names: tuple[str, ...], commanded: tuple[str, ...]) -> None:
+        """Start with nothing seen.
+
+        Args:
+            names: Joints that are measured.
+            commanded: Joints that are commanded.
+        """
+        place = {name: k for k, name in reversed([*enumerate(commanded)])}
+        self.columns = tuple(k for k, name in enumerate(names) if name in place)
+        """Places in ``names`` of the joints of both, m of them."""
+        self._measured = list(self.columns)
+        self._commanded = [place[names[k]] for k in self.columns]
+        self._runs = _Runs(len(self.columns))
+
+    def result(
+        self, measured: Ranges, command: Ranges, closed: int | None
+    ) -> tuple[IntArray, IntArray]:
+        """Take the seconds that have come and say what is known.
+
+        Args:
+            measured: Of the measured angles [rad]; every second since ``closed`` of the last call.
+            command: Of the commands [rad], the same.
+            closed: Seconds before this one will never change; None where any may.
+
+        Returns:
+            Longest run of frozen seconds [s] and its first second [Unix s], each of shape (m,);
+            0 where a joint never froze.
+        """
+        found = np.intersect1d(
+            measured.second, command.second, assume_unique=True, return_indices=True
+        )
+        # numpy's types don't say that there are three
+        seconds, here, there = cast("tuple[IntArray, IntArray, IntArray]", found)
+        stood = measured.high[here][:, self._measured]
+        stood = stood == measured.low[here][:, self._measured]
+        stood &= (measured.count[here] >= FROZEN_SAMPLES)[:, None]
+        span = command.high[there][:, self._commanded]
+        span = span - command.low[there][:, self._commanded]
+        frozen = stood & (span > FROZEN_COMMAND_RAD)
+        fresh = seconds > self._runs.second
+        seconds, frozen = seconds[fresh], frozen[fresh]
+        split = 0 if closed is None else int(np.searchsorted(seconds, closed))
+        self._runs = self._runs.after(seconds[:split], frozen[:split])
+        ahead = self._runs.after(seconds[split:], frozen[split:])
+        return ahead.longest, ahead.longest_at
+
+
+class _Runs:
+    """Runs of flagged, consecutive seconds: the one that goes on, and the longest."""
+
+    def __init__(self, width: int) -> None:
+        self.second = -(2**62)
+        self.run = np.zeros(width, np.int64)
+        self.longest = np.zeros(width, np.int64)
+        self.longest_at = np.zeros(width, np.int64)
+
+    def after(self, seconds: IntArray, flags: BoolArray) -> _Runs:
+        """The same with more seconds, shape (s,), and flags, shape (s, m)."""
+        if not len(seconds):
+            return self
+        runs = _Runs(len(self.run))
+        before, run = self.second, self.run
+        longest, longest_at = self.longest.copy(), self.longest_at.copy()
+        quiet = not run.any()
+        some: list[bool] = np.asarray(flags.any(axis=1)).tolist()
+        numbers: list[int] = seconds.tolist()
+        for k, second in enumerate(numbers):
+            if some[k] or not quiet:
+                row = flags[k]
+                run = np.where(row, (run if second == before + 1 else 0) + 1, 0)
+                more = run > longest
+                longest = np.where(more, run, longest)
+                longest_at = np.where(more, second + 1 - run, longest_at)
+                quiet = not some[k]
+            before = second
+        runs.second, runs.run, runs.longest, runs.longest_at = before, run, longest, longest_at
+        return runs

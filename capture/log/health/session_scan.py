@@ -1,0 +1,385 @@
+"""A session's messages to one statement of health, wherever they come from.
+
+The same scan is fed from the chunks of a file (:mod:`.health.session_check`) and from the
+messages of a running recording, so both come to the same verdict.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import IntArray
+from ...robot.model import Robot
+from ..edit.joined import Finding, joined
+from ..mcap.chunk import Buffer
+from ..messages.frames import identifier_text
+from ..messages.rosmsg import MessageType
+from ..messages.schemas import JOINT_STATE
+from .channel_scan import ChannelScan, Limits, Series
+from .freeze import FreezeTally
+from .health import (
+    judge_body,
+    judge_bus,
+    judge_channel,
+    judge_joints,
+    judge_series,
+    judge_silences,
+    judge_topics,
+    verdict_of,
+)
+from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
+from .source_health import SourceHealth, judge_source, measure_sources
+from .tallies import NS
+from .undecoded import named_identifiers, undecoded
+
+_MOST_PAIRS = 4096
+"""Pairs of joint sets, measured and commanded, that are looked at for joints that stand still."""
+
+COMMANDS, STATES = "/joint_commands", "/joint_states"
+
+
+@dataclass(frozen=True)
+class SessionMeasures:
+    """What the messages of a session say of its health.
+
+    Attributes:
+        robot: Name of the robot; None without a usable description.
+        start_ns: Log time of the first message [Unix ns]; 0 without messages.
+        end_ns: Log time of the last.
+        findings: All that was found, heaviest first.
+        channels: By topic.
+        series: By topic and names.
+        joints: By topic, in the order of the messages.
+        buses: By topic.
+        sources: As the recorder counted them, by name.
+    """
+
+    robot: str | None
+    start_ns: int
+    end_ns: int
+    findings: tuple[Finding, ...]
+    channels: tuple[ChannelHealth, ...]
+    series: tuple[SeriesHealth, ...]
+    joints: tuple[JointHealth, ...]
+    buses: tuple[BusHealth, ...]
+    sources: tuple[SourceHealth, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return (self.end_ns - self.start_ns) / NS
+
+    @property
+    def verdict(self) -> str:
+        """``good``, ``degraded`` or ``bad``."""
+        return verdict_of(self.findings)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is not better, heaviest first."""
+        return tuple(finding.sentence for finding in self.findings if finding.weight)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is worth knowing and no fault."""
+        return tuple(finding.sentence for finding in self.findings if not finding.weight)
+
+
+@dataclass(frozen=True)
+class ChannelMeasures:
+    """What one channel's messages say.
+
+    Attributes:
+        channel: Counts and sequence numbers.
+        series: One for each set of names.
+    """
+
+    channel: ChannelHealth
+    series: tuple[SeriesHealth, ...]
+
+
+class SessionScan:
+    """The scan of one session, channel by channel."""
+
+    def __init__(self, robot: Robot | None, *, horizon_s: int | None = None) -> None:
+        """Start without channels.
+
+        Args:
+            robot: The robot that the session describes; None without a usable description.
+            horizon_s: For a session that is still being recorded: how far stamps may go back [s].
+                What is older is summed up, so that memory is bounded; samples that come later
+                still are left out where joints are looked at for standing still. None for a file.
+        """
+        self._robot = robot
+        self._horizon_s = horizon_s
+        self._freezes: dict[tuple[int, tuple[str, ...], int, tuple[str, ...]], FreezeTally] = {}
+        self._scans: dict[int, ChannelScan] = {}
+        self._types: dict[int, str] = {}
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The channels defined so far."""
+        return tuple(self._scans)
+
+    def has(self, key: int) -> bool:
+        """Whether a channel is defined.
+
+        Args:
+            key: The channel.
+        """
+        return key in self._scans
+
+    def define(
+        self,
+        key: int,
+        topic: str,
+        type_name: str,
+        kind: MessageType | None,
+        metadata: Mapping[str, str],
+    ) -> None:
+        """Take a channel, before its messages.
+
+        Args:
+            key: The channel's id.
+            topic: Its topic.
+            type_name: Its type, by name.
+            kind: Its type; None where it can't be read: only times are looked at then.
+            metadata: Of the channel, e.g. ``unit``.
+        """
+        angles = topic in (COMMANDS, STATES) and metadata.get("unit", "rad") == "rad"
+        limits: Limits | None = {} if angles else None
+        if angles and self._robot is not None:
+            limits = {joint.name: (joint.lower, joint.upper) for joint in self._robot.joints}
+        joints = kind is not None and type_name == JOINT_STATE
+        self._scans[key] = ChannelScan(
+            topic, kind, joints=joints, limits=limits, horizon_s=self._horizon_s
+        )
+        self._types[key] = type_name
+
+    def add(self, key: int, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
+        """Take messages of one channel.
+
+        Args:
+            key: The channel.
+            data: Bytes that hold their records.
+            offsets: Where the records start, in the order of the session, shape (n,).
+            heads: The records' heads, of :data:`.capture.log.mcap.message_heads.HEAD`, shape (n,).
+        """
+        self._scans[key].add(data, offsets, heads)
+
+    def count(self, key: int) -> int:
+        """Messages of a channel so far.
+
+        Args:
+            key: The channel.
+        """
+        self._scans[key].flush()
+        return self._scans[key].count
+
+    def topic(self, key: int) -> str:
+        """Topic of a channel.
+
+        Args:
+            key: The channel.
+        """
+        return self._scans[key].topic
+
+    def measure(self, key: int) -> ChannelMeasures:
+        """What a channel's messages say so far.
+
+        Args:
+            key: The channel.
+        """
+        scan, type_name = self._scans[key], self._types[key]
+        scan.flush()
+        return ChannelMeasures(
+            ChannelHealth(scan.topic, type_name, scan.count, scan.unread, scan.sequence.result()),
+            tuple(_series(scan.topic, type_name, tally) for tally in scan.series.values()),
+        )
+
+    def result(
+        self,
+        start_ns: int,
+        end_ns: int,
+        before: Iterable[Finding] = (),
+        measured: Mapping[int, ChannelMeasures] | None = None,
+    ) -> SessionMeasures:
+        """Judge what has come so far.
+
+        Args:
+            start_ns: Log time of the first message [Unix ns]; 0 without messages.
+            end_ns: Log time of the last.
+            before: Findings of another kind, e.g. on the container.
+            measured: Measures of channels that were taken already.
+
+        Returns:
+            The measures and what they mean.
+        """
+        taken = measured or {}
+        found = [
+            (key, scan) for key, scan in self._scans.items() if key in taken or self.count(key)
+        ]
+        found.sort(key=lambda item: item[1].topic)
+        every = [taken.get(key) or self.measure(key) for key, _ in found]
+        channels = tuple(each.channel for each in every)
+        series = tuple(one for each in every for one in each.series)
+        joints = self._joints(found)
+        bitrate = self._bitrate([scan for _, scan in found if scan.bus is not None])
+        buses = tuple(
+            scan.bus.result(scan.topic, bitrate) for _, scan in found if scan.bus is not None
+        )
+        sources = tuple(
+            source
+            for _, scan in found
+            if scan.ends is not None and scan.kind is not None
+            for source in measure_sources(scan.kind, *scan.ends)
+        )
+        types = {channel.topic: channel.type_name for channel in channels}
+        chain = self._robot.joint_names if self._robot is not None else ()
+        seen = [joint.name for joint in joints if joint.topic == STATES]
+        unseen = set(chain).difference(one.name for one in joints if one.nan < one.samples)
+        why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
+        findings = [*before, *judge_topics(types, chain, seen, why)]
+        faults = [fault for channel in channels for fault in judge_channel(channel)]
+        # Messages of frames come when a batch is full; the frames themselves are judged.
+        framed = {bus.topic for bus in buses}
+        for each in series:
+            if each.topic not in framed:
+                faults += judge_series(each, start_ns, end_ns)
+        findings += joined([*faults, *judge_joints(joints, start_ns)])
+        findings += judge_body(joints)
+        for bus in buses:
+            findings += judge_bus(bus)
+        findings += judge_silences(buses, start_ns)
+        for source in sources:
+            findings += judge_source(source)
+        findings.sort(key=lambda finding: -finding.weight)
+        return SessionMeasures(
+            robot=self._robot.name if self._robot is not None else None,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            findings=tuple(dict.fromkeys(findings)),
+            channels=channels,
+            series=series,
+            joints=joints,
+            buses=buses,
+            sources=sources,
+        )
+
+    @cached_property
+    def _named(self) -> frozenset[int]:
+        return frozenset() if self._robot is None else named_identifiers(self._robot)
+
+    def _undecoded(self, scans: list[ChannelScan], *, all_joints: bool) -> str | None:
+        """Why the frames brought nothing or hardly anything; None if they did, or without a map."""
+        tallies = [scan.bus.identifiers for scan in scans if scan.bus is not None]
+        robot = self._robot
+        if all_joints or robot is None or robot.bus is None or not tallies:
+            return None
+        counts = Counter[int]()
+        for tally in tallies:
+            counts.update(tally.counts)
+        decoded = sum(counts.pop(identifier, 0) for identifier in self._named)
+        others = {identifier_text(identifier): count for identifier, count in counts.items()}
+        frames = sum(tally.frames for tally in tallies)
+        return undecoded(robot.name, decoded, frames, others, all_joints=all_joints)
+
+    def _joints(self, scans: list[tuple[int, ChannelScan]]) -> tuple[JointHealth, ...]:
+        limited = set(self._robot.joint_names) if self._robot is not None else set[str]()
+        found: dict[tuple[str, str], JointHealth] = {}
+        for key, scan in scans:
+            for series in scan.series.values():
+                runs = self._frozen(key, series, scans) if scan.topic == STATES else {}
+                for k, name in enumerate(series.names):
+                    bounded = name in limited and scan.topic in (COMMANDS, STATES) and series.rows
+                    longest = max(runs.get(k, ()), default=None)
+                    joint = JointHealth(
+                        topic=scan.topic,
+                        name=name,
+                        samples=series.rows,
+                        nan=int(series.joint_nan[k]),
+                        at_limit=float(series.at_limit[k] / series.rows) if bounded else None,
+                        frozen_s=None if longest is None else longest[0],
+                        frozen_at_ns=0 if longest is None else longest[1] * NS,
+                    )
+                    had = found.get((scan.topic, name))
+                    found[scan.topic, name] = joint if had is None else had.with_more(joint)
+        closed = _closed(scans)
+        for _, scan in scans:
+            for series in scan.series.values():
+                series.ranges.forget(closed)
+        return tuple(found.values())
+
+    def _frozen(
+        self, key: int, series: Series, scans: list[tuple[int, ChannelScan]]
+    ) -> dict[int, list[tuple[int, int]]]:
+        """Frozen seconds and their first one, for each joint with a command, by its place."""
+        measured = series.ranges.result(len(series.names))
+        runs: dict[int, list[tuple[int, int]]] = {}
+        closed = _closed(scans)
+        for other, scan in scans:
+            for command in scan.series.values() if scan.topic == COMMANDS else ():
+                if len(self._freezes) >= _MOST_PAIRS:
+                    return runs
+                pair = (key, series.names, other, command.names)
+                if pair not in self._freezes:
+                    self._freezes[pair] = FreezeTally(series.names, command.names)
+                freeze = self._freezes[pair]
+                if not freeze.columns:
+                    continue
+                ranges = command.ranges.result(len(command.names))
+                lasted, since = freeze.result(measured, ranges, closed)
+                for k, *run in zip(freeze.columns, lasted.tolist(), since.tolist(), strict=True):
+                    runs.setdefault(k, []).append((run[0], run[1]))
+        return runs
+
+    def last_load(self, topic: str) -> tuple[float, float] | None:
+        """Load of a bus in its last whole second.
+
+        Args:
+            topic: The bus's topic.
+
+        Returns:
+            Part of the bitrate without and with the most stuff bits; None where unknown.
+        """
+        buses = [scan for scan in self._scans.values() if scan.bus is not None and scan.count]
+        for scan in buses:
+            if scan.topic == topic and scan.bus is not None:
+                return scan.bus.last_second(self._bitrate(buses))
+        return None
+
+    def _bitrate(self, buses: list[ChannelScan]) -> int | None:
+        """The described bus's bitrate, where it is clear which one that is."""
+        if self._robot is None or self._robot.bus is None or len(buses) != 1:
+            return None
+        return self._robot.bus.bitrate
+
+
+def _series(topic: str, type_name: str, tally: Series) -> SeriesHealth:
+    return SeriesHealth(
+        topic=topic,
+        type_name=type_name,
+        names=tally.names,
+        timing=tally.timing.result(),
+        first_log_ns=tally.first_log_ns,
+        last_log_ns=tally.last_log_ns,
+        numbers=tally.numbers,
+        nan=tally.nan,
+    )
+
+
+def _closed(scans: list[tuple[int, ChannelScan]]) -> int | None:
+    """Seconds before this one will not change in any series of angles."""
+    every = [
+        series.ranges.closed
+        for _, scan in scans
+        for series in scan.series.values()
+        if scan.topic in (COMMANDS, STATES)
+    ]
+    return min((second for second in every if second is not None), default=None)

@@ -1,0 +1,244 @@
+"""Tallies of a stream: what its times, sequence numbers and values say about its health.
+
+Each tally takes arrays as they come (a block of a file, a second of a live recording), keeps a
+bounded summary, and gives a frozen result at any moment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...common.arrays import IntArray
+
+NS = 1_000_000_000
+
+GAP_PERIODS = 1.5
+"""An interval longer than this many median intervals is a gap: the nearest whole number of
+periods in it is two or more, so at least one sample is missing."""
+
+REGULAR_SPREAD = 0.5
+"""A series is regular if the middle half of its intervals spans no more than this part of the
+median. Only a regular series has a rhythm against which something can be missing."""
+
+PAUSE_S = 1.0
+"""A gap this long is a pause: it can be cut out, while losses scattered over the session can't.
+For slow series it is :data:`PAUSE_PERIODS`."""
+
+PAUSE_PERIODS = 10.0
+"""Median intervals that a pause has at least."""
+
+MIN_INTERVALS = 20
+"""Fewer intervals than this have no reliable median and 99 % point."""
+
+SEQUENCE_COUNTS = 0.5
+"""Sequence numbers count the channel's messages if at least this part of the steps is one; a
+constant, or a counter shared by all channels, does not."""
+
+_BINS_PER_OCTAVE = 64
+_QUANTILES = (0.25, 0.5, 0.75, 0.99)
+_OCTAVES = 48  # 1 ns to 78 h
+_BINS = _BINS_PER_OCTAVE * _OCTAVES
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The rhythm of one series.
+
+    Attributes:
+        count: Samples.
+        first_ns: Earliest time [Unix ns]; 0 without samples.
+        last_ns: Latest time [Unix ns]; 0 without samples.
+        median_s: Median interval [s], None where there is no interval forward.
+        std_s: Standard deviation of the intervals that are not gaps [s].
+        p99_s: 99 % point of all intervals [s].
+        regular: Whether gaps can be told from the rhythm.
+        gaps: Intervals longer than :data:`GAP_PERIODS` medians; 0 where irregular.
+        missing: Samples that would fill the gaps; 0 where irregular.
+        scattered: Those of them that are not in pauses.
+        paused_s: All pauses together [s]; also of an irregular series.
+        longest_s: Longest interval [s].
+        longest_at_ns: Where the longest interval starts [Unix ns].
+        duplicates: Samples with the time of the sample before.
+        backward: Samples earlier than the sample before.
+    """
+
+    count: int
+    first_ns: int
+    last_ns: int
+    median_s: float | None
+    std_s: float | None
+    p99_s: float | None
+    regular: bool
+    gaps: int
+    missing: int
+    scattered: int
+    paused_s: float
+    longest_s: float
+    longest_at_ns: int
+    duplicates: int
+    backward: int
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate over the series' own span [Hz]."""
+        span_s = (self.last_ns - self.first_ns) / NS
+        return (self.count - 1) / span_s if span_s > 0 else None
+
+    @property
+    def missing_part(self) -> float:
+        """Missing samples as a part of those expected."""
+        return self.missing / (self.count + self.missing) if self.count else 0.0
+
+
+class TimingTally:
+    """Intervals of one series in bins of equal ratio, 64 an octave.
+
+    Quantiles are bin means: exact where a bin holds one value, within 1.1 % otherwise.
+    """
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._count = 0
+        self._first = self._last = self._previous = 0
+        self._duplicates = self._backward = 0
+        self._longest = (0, 0)
+        self._bins = np.empty(0, np.int64)  # those that have intervals, ascending
+        self._sums = np.empty((3, 0))  # number, sum and sum of squares of their intervals [ns]
+
+    def add(self, t_ns: IntArray) -> None:
+        """Take the next samples.
+
+        Args:
+            t_ns: Their times in the order they came [Unix ns], shape (n,).
+        """
+        if not len(t_ns):
+            return
+        low, high = int(t_ns.min()), int(t_ns.max())
+        if self._count:
+            steps = np.diff(t_ns, prepend=self._previous)
+            starts = t_ns - steps
+            low, high = min(low, self._first), max(high, self._last)
+        else:
+            steps, starts = np.diff(t_ns), t_ns[:-1]
+        self._count += len(t_ns)
+        self._first, self._last, self._previous = low, high, int(t_ns[-1])
+        self._duplicates += int((steps == 0).sum())
+        self._backward += int((steps < 0).sum())
+        forward = steps > 0
+        if not forward.any():
+            return
+        steps, starts = steps[forward], starts[forward]
+        longest = int(steps.argmax())
+        if int(steps[longest]) > self._longest[0]:  # of equal ones the first, as they came
+            self._longest = int(steps[longest]), int(starts[longest])
+        size = steps.astype(np.float64)
+        bins = np.minimum((np.log2(size) * _BINS_PER_OCTAVE).astype(np.int64), _BINS - 1)
+        had = len(self._bins)
+        self._bins, place = np.unique(np.concatenate([self._bins, bins]), return_inverse=True)
+        sums = np.zeros((3, len(self._bins)))
+        sums[:, place[:had]] = self._sums
+        for k, weight in enumerate((np.ones_like(size), size, size**2)):
+            sums[k] += np.bincount(place[had:], weight, sums.shape[1])
+        self._sums = sums
+
+    def result(self) -> Timing:
+        """What the samples so far say."""
+        number, total, squares = self._sums
+        intervals = int(number.sum())
+        median = std = p99 = None
+        regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0
+        if intervals:
+            mean = total / number
+            reached = np.cumsum(number)
+            places = np.searchsorted(reached, np.array(_QUANTILES) * intervals)
+            low, median, high, p99 = mean[places].tolist()
+            regular = intervals >= MIN_INTERVALS and high - low <= REGULAR_SPREAD * median
+            long = (mean > GAP_PERIODS * median) & regular
+            gaps = int(number[long].sum())
+            lost = number * np.rint(mean / median - 1) * long
+            pause = mean > max(PAUSE_S * NS, PAUSE_PERIODS * median)
+            missing, scattered = int(lost.sum()), int(lost[~pause].sum())
+            paused = float(total[pause].sum())
+            n = number[~long].sum()
+            centre = total[~long].sum() / n
+            std = float(np.sqrt(max(squares[~long].sum() / n - centre**2, 0.0)))
+        return Timing(
+            count=self._count,
+            first_ns=self._first,
+            last_ns=self._last,
+            median_s=None if median is None else median / NS,
+            std_s=None if std is None else std / NS,
+            p99_s=None if p99 is None else p99 / NS,
+            regular=regular,
+            gaps=gaps,
+            missing=missing,
+            scattered=scattered,
+            paused_s=paused / NS,
+            longest_s=self._longest[0] / NS,
+            longest_at_ns=self._longest[1],
+            duplicates=self._duplicates,
+            backward=self._backward,
+        )
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """What a channel's MCAP sequence numbers prove.
+
+    Attributes:
+        kind: ``counted``; ``none`` where all are zero; ``not a count`` where they are constant or
+            shared by channels; ``too few`` where one message can't tell.
+        dropped: Messages missing between those present; None unless counted.
+        reordered: Messages numbered before the one they follow; None unless counted.
+    """
+
+    kind: str
+    dropped: int | None
+    reordered: int | None
+
+
+class SequenceTally:
+    """Sequence numbers of one channel; they wrap at 2^32."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._previous = 0
+        self._count = self._ones = self._repeated = self._reordered = 0
+        self._at = self._low = self._high = 0  # unwrapped, relative to the first
+        self._nonzero = False
+
+    def add(self, sequence: IntArray) -> None:
+        """Take the numbers of the next messages.
+
+        Args:
+            sequence: In the order of the file, shape (n,).
+        """
+        if not len(sequence):
+            return
+        before = self._previous if self._count else int(sequence[0])
+        steps = np.diff(sequence, prepend=before)
+        steps = (steps + 2**31) % 2**32 - 2**31  # the shorter way round
+        place = self._at + np.cumsum(steps)
+        steps = steps if self._count else steps[1:]
+        self._low = min(self._low, int(place.min()))
+        self._high = max(self._high, int(place.max()))
+        self._at, self._previous = int(place[-1]), int(sequence[-1])
+        self._nonzero = self._nonzero or bool(sequence.any())
+        self._count += len(sequence)
+        self._ones += int((steps == 1).sum())
+        self._repeated += int((steps == 0).sum())
+        self._reordered += int((steps < 0).sum())
+
+    def result(self) -> Sequence:
+        """What the numbers so far prove."""
+        if self._count < 2:
+            return Sequence("too few", None, None)
+        if not self._nonzero:
+            return Sequence("none", None, None)
+        if self._ones < SEQUENCE_COUNTS * (self._count - 1):
+            return Sequence("not a count", None, None)
+        span = self._high - self._low + 1
+        dropped = max(span - (self._count - self._repeated), 0)
+        return Sequence("counted", dropped, self._reordered)

@@ -1,0 +1,1 @@
+"""MCAP files, read block by block and written."""

@@ -1,0 +1,250 @@
+"""Chunks of an MCAP file: decompression and the walk over records.
+
+Format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import os
+import re
+import struct
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import lz4.frame
+import zstandard
+from mcap.opcode import Opcode
+
+from ...common.arrays import IntArray
+from ...common.errors import UsageError
+
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a file."""
+
+PREFIX_SIZE = 9
+"""Opcode (u8) and length (u64) before each record's body."""
+
+LAST_NS = 2**63 - 1
+"""Latest log time that is read [Unix ns], in the year 2262; a later one is read as this."""
+
+LARGEST_CHUNK_VARIABLE = "UNDULOG_MAX_CHUNK_MIB"
+"""Environment variable with the largest uncompressed size of a chunk that is read [MiB]."""
+
+_LARGEST_CHUNK_MIB = 256
+_LEAST_WINDOW = 1 << 23
+
+_NAME_AT = PREFIX_SIZE + 8 + 8 + 8 + 4  # of the compression's name in a chunk's record
+
+_COMPRESSION_NAME = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
+
+Buffer = bytes | bytearray | mmap.mmap
+
+
+class _Own(threading.local):
+    """Each thread's decompressor and compressed bytes, for one chunk after the other."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor()
+        self.raw = bytearray()
+
+
+_own = _Own()
+
+
+@dataclass
+class Block:
+    """A stretch of messages: one chunk, or the unchunked messages of a file.
+
+    Attributes:
+        start: First payload byte in the file.
+        stop: One past the last payload byte in the file.
+        compression: ``zstd``, ``lz4`` or empty.
+        size: Uncompressed size [byte].
+        crc: CRC-32 of the uncompressed payload, 0 where there is none.
+        start_ns: Earliest log time in it [ns].
+        end_ns: Latest log time in it [ns].
+        index_at: Channel id to the file offset of its MessageIndex record.
+        offsets: Channel id to message offsets in the payload; filled where there is no index.
+        complete: False for a chunk that the end of the file cuts short.
+        part: Which file of the session it is in, from 0.
+    """
+
+    start: int
+    stop: int
+    compression: str
+    size: int
+    crc: int
+    start_ns: int
+    end_ns: int
+    index_at: dict[int, int] = field(default_factory=dict[int, int])
+    offsets: dict[int, IntArray] | None = None
+    complete: bool = True
+    part: int = 0
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it declares to have no bytes."""
+        return self.size == 0 if self.compression else self.start == self.stop
+
+
+def largest_chunk() -> int:
+    """Largest uncompressed size of a chunk that is read [byte].
+
+    Raises:
+        UsageError: If the environment sets something else than a positive whole number of MiB.
+    """
+    text = os.environ.get(LARGEST_CHUNK_VARIABLE, str(_LARGEST_CHUNK_MIB))
+    if not text.isascii() or not text.isdecimal() or not 0 < int(text[:9]) < 1 << 24:
+        raise UsageError(f"{LARGEST_CHUNK_VARIABLE}={text!r}: give a whole number of MiB above 0")
+    return int(text) << 20
+
+
+def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
+    """Decompress a payload into no more memory than it is declared to need.
+
+    Args:
+        compression: ``zstd`` or ``lz4``.
+        raw: The compressed bytes.
+        size: Declared size of the whole payload [byte].
+        whole: False where the end of the file cuts ``raw`` short.
+
+    Returns:
+        The payload; of a cut one, its readable beginning.
+
+    Raises:
+        RuntimeError: If the compression is unknown, the lz4 frame is damaged, or the payload is
+            larger than declared or declared larger than :func:`largest_chunk`.
+        zstandard.ZstdError: If the zstd frame is damaged.
+    """
+    if size > largest_chunk():
+        raise RuntimeError(
+            f"it declares {size} bytes, more than {largest_chunk() >> 20} MiB; "
+            f"--max-chunk-mib {-(-size >> 20)} reads it"
+        )
+    if compression == "zstd":
+        # The library allocates what a frame states, whatever max_output_size says.
+        stated = zstandard.get_frame_parameters(raw).content_size
+        if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise RuntimeError(f"its frame states {stated} bytes, its record {size}")
+        if whole:
+            return zstandard.ZstdDecompressor().decompress(raw, max_output_size=max(size, 1))
+        decompressor = zstandard.ZstdDecompressor(max_window_size=max(size, _LEAST_WINDOW))
+        with cast("io.RawIOBase", decompressor.stream_reader(raw)) as reader:
+            data, more = reader.read(size) or b"", reader.read(1)
+    elif compression == "lz4":
+        frame = cast("Any", lz4.frame.LZ4FrameDecompressor())  # the package has no types
+        data = bytes(frame.decompress(raw, max_length=size))
+        more = b"" if frame.eof else frame.decompress(b"", max_length=1)
+    else:
+        raise RuntimeError(f"unknown compression {compression!r}")
+    if more:
+        raise RuntimeError(f"it expands beyond the {size} bytes that its record declares")
+    return data
+
+
+def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
+    """Decompress a zstd frame into memory that is there already: no page of it is new.
+
+    Args:
+        raw: The compressed bytes, one frame.
+        room: As much memory as the frame should need.
+
+    Returns:
+        Bytes that the frame has; at most one more than there is room for is found out.
+
+    Raises:
+        zstandard.ZstdError: If the frame is damaged.
+    """
+    with cast("io.RawIOBase", _own.decompressor.stream_reader(raw, closefd=False)) as reader:
+        size = reader.readinto(room) or 0  # all at once, since there is room for the whole frame
+        return size + len(reader.read(1) or b"")
+
+
+def read_at(descriptor: int, start: int, stop: int) -> memoryview:
+    """Read a stretch of a file that is looked at once.
+
+    Through a mapping its pages would stay in this process's memory, and each costs a fault.
+
+    Args:
+        descriptor: The file.
+        start: First byte.
+        stop: One past the last byte.
+
+    Returns:
+        The bytes, until this thread reads again; fewer than asked for where the file ends before.
+
+    Raises:
+        OSError: If it can't be read.
+    """
+    size, done = stop - start, 0
+    if len(_own.raw) < size:
+        _own.raw = bytearray(size)
+    room = memoryview(_own.raw)[:size]
+    while done < size and (got := os.preadv(descriptor, [room[done:]], start + done)):
+        done += got
+    return room[:done]
+
+
+def checks_itself(raw: memoryview) -> bool:
+    """Whether a zstd frame has a checksum of its content: decompression verifies it.
+
+    Args:
+        raw: The frame.
+
+    Returns:
+        Whether it has; False for what is no zstd frame.
+    """
+    try:
+        return zstandard.get_frame_parameters(raw).has_checksum
+    except zstandard.ZstdError:
+        return False
+
+
+def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
+    """Walk records back to back.
+
+    Args:
+        data: The bytes.
+        start: Offset of the first record's opcode.
+        stop: One past the last byte to look at.
+
+    Yields:
+        Opcode, body start and body stop of each whole record in [start, stop), up to zeros.
+    """
+    at = start
+    while at + PREFIX_SIZE <= stop:
+        opcode = data[at]
+        if not opcode:  # no record has it: millions of them fit into a small chunk
+            return
+        (length,) = struct.unpack_from("<Q", data, at + 1)
+        body = at + PREFIX_SIZE
+        if body + length > stop:
+            return
+        yield opcode, body, body + length
+        at = body + length
+
+
+def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
+    """Search for a whole compressed chunk where the chain of records is broken.
+
+    Args:
+        data: The bytes.
+        start: First place to look at.
+        stop: One past the last byte.
+
+    Returns:
+        Offset of its record's opcode, or None.
+    """
+    for tag in _COMPRESSION_NAME.finditer(data, start + _NAME_AT, stop):
+        at, size_at = tag.start() - _NAME_AT, tag.end()
+        if data[at] == Opcode.CHUNK and size_at + 8 <= stop:
+            (length,) = struct.unpack_from("<Q", data, at + 1)
+            (size,) = struct.unpack_from("<Q", data, size_at)
+            whole = size_at + 8 + size
+            if at + PREFIX_SIZE + length == whole <= stop:
+                return at
+    return None

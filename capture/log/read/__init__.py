@@ -1,0 +1,1 @@
+"""Sessions, and joint signals on their sampling times."""

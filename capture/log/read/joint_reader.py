@@ -1,0 +1,276 @@
+"""Reads JointState topics of any make: fields, clocks and sampling times put right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...common.arrays import IntArray
+from ...common.errors import DataError, MissingChannelError
+from ..columns.batches import Window
+from ..columns.columns import Messages
+from ..columns.topics import Topics
+from ..messages.rosmsg import MessageType
+from ..messages.schemas import JOINT_STATE
+from .joint_rows import JointRows, merge_rows, rows_of
+from .own_times import Series, own_times
+from .sampling_window import NEAR_NS, SLACK_NS, covers, cut, widened
+from .signals import JointSignals
+from .stamp_clock import StampClock
+
+UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+"""Field of a JointState to its unit, where the channel doesn't say otherwise."""
+
+_NS = 1_000_000_000
+_MEASURED = (
+    "/joint_states",
+    "/joint_velocity",
+    "/joint_effort",
+    "/joint_current",
+    "/joint_voltage",
+    "/joint_temperature",
+)
+OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
+    "/joint_commands": "/joint_command_offset"
+}
+"""Topic to the topic with its joints' times relative to the stamp: a bus goes joint by joint."""
+
+
+class JointReader:
+    """Joint signals of one session."""
+
+    def __init__(
+        self, path: Path, topics: Topics, clock: StampClock, warn: Callable[[str], None]
+    ) -> None:
+        """Keep what reading needs.
+
+        Args:
+            path: The file, for messages.
+            topics: Its topics.
+            clock: Of its header stamps.
+            warn: Takes one sentence for each irregularity.
+        """
+        self._path = path
+        self._topics = topics
+        self._clock = clock
+        self._warn = warn
+        self._offsets: dict[str, Series] = {}
+
+    def read(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window, chain: Sequence[str]
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Read fields of JointState topics in one pass over the file.
+
+        Args:
+            wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
+            window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
+            chain: Joint names head to tail; joints not in it come after it.
+
+        Returns:
+            (topic, field) to signals.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If a topic is not of JointStates, or there is no such field.
+        """
+        requests = self.requests(wanted)
+        found: dict[str, Messages] | None = None
+        if self._topics.is_ours and window_ns != (None, None):
+            found = self._topics.read(requests, widened(window_ns, NEAR_NS))
+        if found is None or not covers(found, window_ns):
+            found = self._topics.read(requests, widened(window_ns, SLACK_NS))
+        return self.signals(wanted, found, window_ns, chain)
+
+    def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+        """What has to be read of the file for some fields.
+
+        Args:
+            wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
+
+        Returns:
+            Topic to leaf paths; the offset topics are among them.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic is not of JointStates, or there is no such field.
+        """
+        self._check(wanted)
+        offsets = {topic for topic in map(self._offset_topic, wanted) if topic is not None}
+        self._check(dict.fromkeys(offsets, ()))
+        return {
+            topic: [*wanted.get(topic, ()), *(["position"] if topic in offsets else [])]
+            for topic in dict.fromkeys([*wanted, *sorted(offsets)])
+        }
+
+    def signals(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        found: Mapping[str, Messages],
+        window_ns: Window,
+        chain: Sequence[str],
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Make signals of what was read.
+
+        Args:
+            wanted: Topic to fields.
+            found: What was read for :meth:`requests`.
+            window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
+            chain: Joint names head to tail; joints not in it come after it.
+
+        Returns:
+            (topic, field) to signals.
+
+        Raises:
+            MissingChannelError: If a topic never carries a field.
+        """
+        keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
+        series = {key: self._series(*key, found[key[0]]) for key in keys}
+        times = {key: list(each.t_ns) for key, each in series.items()}
+        for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
+            own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
+            stamped = [series[key] for key in own]
+            offsets = self._offset_series(offset_topic, found, stamped, window_ns)
+            if not any(values.any() for values in offsets.values):
+                continue  # sampled together
+            if offset_topic in wanted:
+                offsets = _copied(offsets)
+            times |= zip(own, own_times(stamped, offsets), strict=True)
+            known = set(offsets.names)
+            for key in own:
+                for name in series[key].names:
+                    if name not in known:
+                        self._warn(f"{offset_topic} has no {name}: its message stamps are used")
+        shared = {id(t_ns): t_ns for key in keys for t_ns in times[key]}
+        cuts = {each: cut(t_ns, window_ns) for each, t_ns in shared.items()}
+        return {key: self._signals(key, series[key], times[key], cuts, chain) for key in keys}
+
+    def _offset_topic(self, topic: str) -> str | None:
+        name = OFFSET_TOPICS.get(topic)
+        return name if name in self._topics.channels else None
+
+    def _offset_series(
+        self,
+        topic: str,
+        found: Mapping[str, Messages],
+        stamped: Sequence[Series],
+        window_ns: Window,
+    ) -> Series:
+        """The offsets of a topic, from before the first stamp on; free to be overwritten."""
+        if topic in self._offsets:
+            return _copied(self._offsets[topic])
+        offsets = self._series(topic, "position", found[topic])
+        first = min((int(t[0]) for each in stamped for t in each.t_ns if len(t)), default=0)
+        known = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
+        if known or window_ns[0] is None:
+            return offsets
+        whole = self._topics.read({topic: ["position"]}, (None, None))[topic]
+        self._offsets[topic] = self._series(topic, "position", whole)  # such topics say little
+        return _copied(self._offsets[topic])
+
+    def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
+        channels = self._topics.channels
+        for topic, fields in wanted.items():
+            if topic not in channels:
+                raise MissingChannelError(self._path, topic, sorted(channels))
+            if channels[topic].type_name != JOINT_STATE:
+                kind = channels[topic].type_name
+                raise DataError(f"{self._path}: {topic} is {kind}, not {JOINT_STATE}")
+            if not _is_joint_state(self._topics.message_type(topic)):
+                raise DataError(f"{self._path}: {topic}: its schema is not that of {JOINT_STATE}")
+            for field in fields:
+                if field not in UNITS:
+                    raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
+
+    def _series(self, topic: str, field: str, found: Messages) -> Series:
+        """One field of a topic, at message stamps on the log's clock."""
+        rows = [rows_of(group, field) for group in found.groups]
+        rows.extend(self._general_rows(topic, field, found))
+        if rows and not any(row.values.size for row in rows):
+            raise MissingChannelError(self._path, f"{field} in {topic}", self._filled(topic))
+        rows = [self._on_log_clock(row, topic) for row in rows]
+        return Series(*merge_rows(rows, topic, field, self._warn))
+
+    def _signals(
+        self,
+        key: tuple[str, str],
+        series: Series,
+        times: Sequence[IntArray],
+        cuts: Mapping[int, tuple[slice, IntArray]],
+        chain: Sequence[str],
+    ) -> JointSignals:
+        topic, field = key
+        names = series.names
+        unit = UNITS[field]
+        if field == "position":
+            unit = self._topics.channels[topic].metadata.get("unit", unit)
+        signals = JointSignals(
+            topic,
+            field,
+            unit,
+            names,
+            tuple(cuts[id(t_ns)][1] for t_ns in times),
+            tuple(v[cuts[id(t_ns)][0]] for t_ns, v in zip(times, series.values, strict=True)),
+        )
+        there, of_chain = set(names), set(chain)
+        known = [name for name in chain if name in there]
+        order = (*known, *(name for name in names if name not in of_chain))
+        return signals if order == names else signals.select(order)
+
+    def _general_rows(self, topic: str, field: str, found: Messages) -> list[JointRows]:
+        """Rows of messages without a layout, through the general decoder."""
+        if not found.unread:
+            return []
+        decode = self._topics.decoder(topic)
+        rows: list[JointRows] = []
+        lost = 0
+        for item in found.unread:
+            try:
+                message = decode(item.data)
+            except DataError:
+                lost += 1
+                continue
+            stamp = message.header.stamp
+            stamp_ns = int(stamp.sec) * _NS + int(stamp.nanosec)
+            values = np.array([getattr(message, field)], dtype=np.float64)
+            times = np.array([stamp_ns]), np.array([item.log_ns])
+            rows.append(JointRows(tuple(message.name), *times, values))
+        if lost:
+            self._warn(f"{topic}: {lost} messages can't be read: {found.unread[0].why}")
+        return rows
+
+    def _filled(self, topic: str) -> list[str]:
+        """The fields that the topic does carry."""
+        found = self._topics.read({topic: list(UNITS)}, (None, None))[topic]
+        return [name for name in UNITS if any(name in group.paths for group in found.groups)]
+
+    def _on_log_clock(self, row: JointRows, topic: str) -> JointRows:
+        if len(row.stamp_ns) and not row.stamp_ns.any():
+            self._warn(f"{topic}: header stamps are zero; log times are used instead")
+            return JointRows(row.names, row.log_ns, row.log_ns, row.values)
+        shift_ns = self._clock.shift_ns(topic)
+        if not shift_ns:
+            return row
+        return JointRows(row.names, row.stamp_ns + shift_ns, row.log_ns, row.values)
+
+
+def _is_joint_state(found: MessageType) -> bool:
+    """Whether a type has all that a JointState has, whatever else it has."""
+    fields = {field.name: field for field in found.fields}
+    arrays = [fields.get(name) for name in UNITS]
+    header = fields["header"].nested if "header" in fields else None
+    stamp = [field.nested for field in header.fields if field.name == "stamp"] if header else []
+    time = stamp[0] if stamp else None
+    parts = [part.name for part in time.fields] if time is not None else []
+    return (
+        "sec" in parts
+        and "nanosec" in parts
+        and all(field is not None and field.is_array and field.base for field in arrays)
+        and "name" in fields
+        and fields["name"].base == "string"
+    )
+
+
+def _copied(series: Series) -> Series:
+    return Series(series.names, series.t_ns, [values.copy() for values in series.values])

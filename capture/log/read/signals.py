@@ -1,0 +1,112 @@
+"""Joint signals: what every consumer of a session gets, one series a joint, each with own times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from ...common.arrays import FloatArray, IntArray
+from ...common.errors import DataError
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Samples of one quantity of one joint.
+
+    Attributes:
+        name: Joint name.
+        unit: Unit of the values.
+        t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
+        values: Shape (n,).
+    """
+
+    name: str
+    unit: str
+    t_ns: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class JointSignals:
+    """One quantity of several joints, head to tail; each joint has its own sampling times.
+
+    Attributes:
+        topic: Where it was read from.
+        field: ``position``, ``velocity`` or ``effort`` of the JointState.
+        unit: Unit of the values.
+        names: Joint names.
+        t_ns: Sampling times [Unix ns], one array of shape (n_j,) a joint. Joints that were sampled
+            together share one array.
+        values: One array of shape (n_j,) a joint; NaN samples are kept.
+    """
+
+    topic: str
+    field: str
+    unit: str
+    names: tuple[str, ...]
+    t_ns: tuple[IntArray, ...]
+    values: tuple[FloatArray, ...]
+
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        """Name to its first place."""
+        return {name: j for j, name in reversed([*enumerate(self.names)])}
+
+    def signal(self, name: str) -> Signal:
+        """The samples of one joint.
+
+        Args:
+            name: Joint name.
+
+        Returns:
+            Its samples.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        j = self._place.get(name)
+        if j is None:
+            raise DataError(f"{self.topic} has no joint {name!r}; it has {', '.join(self.names)}")
+        return Signal(name, self.unit, self.t_ns[j], self.values[j])
+
+    def select(self, names: Iterable[str]) -> JointSignals:
+        """The same quantity of some joints.
+
+        Args:
+            names: Joint names, in the order wanted.
+
+        Returns:
+            Their samples.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        chosen = [self.signal(name) for name in names]
+        return JointSignals(
+            self.topic,
+            self.field,
+            self.unit,
+            tuple(signal.name for signal in chosen),
+            tuple(signal.t_ns for signal in chosen),
+            tuple(signal.values for signal in chosen),
+        )
+
+    def frame(self) -> pd.DataFrame:
+        """All samples in long form.
+
+        Returns:
+            Columns ``joint`` (categorical, in chain order), ``t_ns`` and the field's name with its
+            unit, e.g. ``position [rad]``; one row a sample.
+        """
+        counts = [len(t) for t in self.t_ns]
+        joint = np.repeat(np.array(self.names, dtype=object), counts)
+        order = pd.CategoricalDtype(categories=list(self.names), ordered=True)
+        frame = pd.DataFrame(index=pd.RangeIndex(len(joint)))
+        frame["joint"] = pd.Series(joint, dtype=order)
+        frame["t_ns"] = np.concatenate([*self.t_ns, np.empty(0, dtype=np.int64)])
+        frame[f"{self.field} [{self.unit}]"] = np.concatenate([*self.values, np.empty(0)])
+        return frame

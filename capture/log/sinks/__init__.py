@@ -1,0 +1,1 @@
+"""Where messages are written: a file, a file and its write-ahead log, or a ring in memory."""

@@ -1,0 +1,205 @@
+"""The thread that brings finished chunks to the disk and then releases the write-ahead log."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+
+from mcap.records import Metadata
+
+from ...common.errors import LogWriteError
+from ..file.part_names import PART_RECORD
+from ..mcap.mcap_writer import McapWriter
+from ..wal.ballast import FULL, Ballast
+from ..wal.wal import WriteAheadLog
+from .mcap_sink import write_description
+from .part_stream import PartStream
+
+_PATIENCE_S = 2.0  # file systems give deleted space back when they get round to it
+_PAUSE_S = 0.1
+_MOST_UNSYNCED = 32 << 20
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """Bytes of a part, and the last message that is wholly in it with them."""
+
+    part: PartStream
+    pieces: list[bytes]
+    covered: int
+
+
+@dataclass(frozen=True)
+class _Finish:
+    """The end of a part; from here on its writer belongs to the thread."""
+
+    part: PartStream
+    writer: McapWriter
+    last: tuple[Metadata, ...]
+    covered: int
+
+
+class DiskThread:
+    """Writes, hashes and syncs what it is given, in order."""
+
+    def __init__(self, wal: WriteAheadLog, ballast: Ballast) -> None:
+        """Start the thread.
+
+        Args:
+            wal: Released as far as the files have its messages.
+            ballast: Freed when the disk is full.
+        """
+        self._wal = wal
+        self._ballast = ballast
+        self._queue: SimpleQueue[_Bytes | _Finish | None] = SimpleQueue()
+        self._failure: LogWriteError | None = None
+        self._shortage: LogWriteError | None = None
+        self._queued = 0  # counted by the recorder's thread,
+        self._ends = 0  # and by this one
+        self._written = 0
+        self._hash = ""
+        self._unsynced = 0
+        self._covered = 0
+        self._thread = threading.Thread(target=self._work, name=f"disk {wal.folder}", daemon=True)
+        self._thread.start()
+
+    @property
+    def failure(self) -> LogWriteError | None:
+        """Why nothing is written any more: what is not in the files is in the write-ahead log."""
+        return self._failure
+
+    @property
+    def trouble(self) -> LogWriteError | None:
+        """Why recording must end: the failure, or a disk so full that the ballast had to go."""
+        return self._failure or self._shortage
+
+    @property
+    def backlog(self) -> int:
+        """Bytes given and not yet written."""
+        return self.bytes_given - self._written
+
+    @property
+    def bytes_given(self) -> int:
+        """Bytes of all parts so far, written or not."""
+        return self._queued + self._ends
+
+    def write(self, part: PartStream, covered: int) -> None:
+        """Hand over what a part has queued.
+
+        Args:
+            part: The part.
+            covered: Position of the last message that is in it then.
+        """
+        pieces = part.take()
+        self._queued += sum(map(len, pieces))
+        self._queue.put(_Bytes(part, pieces, covered))
+
+    def finish(
+        self, part: PartStream, writer: McapWriter, last: tuple[Metadata, ...], covered: int
+    ) -> None:
+        """Hand over a part to be finalised.
+
+        Args:
+            part: The part.
+            writer: Its writer; not to be used any more.
+            last: Metadata that belong at its end.
+            covered: Position of its last message.
+        """
+        pieces = part.take()
+        self._queued += sum(map(len, pieces))
+        self._queue.put(_Bytes(part, pieces, 0))
+        self._queue.put(_Finish(part, writer, last, covered))
+
+    def close(self) -> None:
+        """Do all that was handed over, and end; safe to call twice."""
+        self._queue.put(None)
+        self._thread.join()
+
+    # -- in the thread ---------------------------------------------------------------------
+
+    def _work(self) -> None:
+        path = self._wal.folder
+        try:
+            while (item := self._queue.get()) is not None:
+                path = item.part.path
+                if self._failure is not None:
+                    continue  # not a byte behind a gap
+                if isinstance(item, _Bytes):
+                    self._write(item)
+                else:
+                    self._finish(item)
+        except BaseException as error:  # without this thread nothing would be written any more
+            self._failure = LogWriteError(path, f"can't be written: {error!r}")
+            raise
+
+    def _write(self, item: _Bytes) -> None:
+        try:
+            self._put(item.part, item.pieces)
+            self._covered = max(self._covered, item.covered)
+            self._unsynced += sum(map(len, item.pieces))
+            if self._queue.empty() or self._unsynced > _MOST_UNSYNCED:
+                self._sync(item.part)
+        except OSError as error:
+            self._fail(item.part.path, error)
+
+    def _sync(self, part: PartStream) -> None:
+        part.sync()
+        self._unsynced = 0
+        self._wal.release(self._covered)
+
+    def _finish(self, item: _Finish) -> None:
+        part = item.part
+        last = item.last
+        if self._hash:
+            last = (*last, Metadata(PART_RECORD, {"previous_sha256": self._hash}))
+        try:
+            for record in last:
+                write_description(item.writer, record)
+            item.writer.finish()
+            pieces = part.take()
+            self._ends += sum(map(len, pieces))
+            self._put(part, pieces)
+            self._covered = max(self._covered, item.covered)
+            self._sync(part)
+        except OSError as error:
+            self._fail(part.path, error)
+            part.close()
+            return
+        self._hash = part.close()
+
+    def _put(self, part: PartStream, pieces: list[bytes]) -> None:
+        for piece in pieces:
+            left = memoryview(piece)
+            deadline = time.monotonic() + _PATIENCE_S
+            while left:
+                try:
+                    written = part.put(left)
+                except OSError as error:
+                    if error.errno not in FULL or not self._make_room(part.path, error, deadline):
+                        raise
+                    continue
+                left = left[written:]
+                self._written += written
+
+    def _make_room(self, path: Path, error: OSError, deadline: float) -> bool:
+        """Free the ballast, or wait for freed space to come back; False when it doesn't."""
+        if self._ballast.free():
+            self._shortage = LogWriteError(
+                path, f"{error.strerror}: recording must end; free some space or write elsewhere"
+            )
+            return True
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(_PAUSE_S)
+        return True
+
+    def _fail(self, path: Path, error: OSError) -> None:
+        if isinstance(error, LogWriteError):
+            self._failure = error
+            return
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        self._failure = LogWriteError(path, f"can't be written: {reason}")

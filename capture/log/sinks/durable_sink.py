@@ -1,0 +1,371 @@
+"""The recorder's sink: an MCAP file, or several, with a write-ahead log beside them.
+
+A message is in the write-ahead log before :meth:`DurableSink.write` returns, so the death of the
+process loses none. The MCAP file gets whole chunks; a thread of its own writes, hashes and syncs
+them, and then lets the write-ahead log forget them. When all is well at the end the write-ahead
+log goes; when it is left, ``Session`` and ``undulog log recover`` put the two together.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from mcap.records import Header, Metadata
+
+from ...common.errors import DataError, LogWriteError, OutputExistsError, UndulogError
+from ..file.part_names import PART_RECORD, later_parts, part_path
+from ..mcap.mcap_writer import McapWriter
+from ..wal.ballast import Ballast
+from ..wal.wal import WriteAheadLog, wal_folder
+from .chunk_groups import chunk_group
+from .disk_thread import DiskThread
+from .mcap_sink import PROFILE, library_name, write_description, write_error
+from .part_stream import FileDeletedError, PartStream
+from .sink import Description
+
+CHUNK_SIZE = 1 << 19
+"""Bytes of messages in a chunk: as small as costs nothing in compression, since one is compressed
+and indexed on the recorder's own thread."""
+
+_NEVER_NS = 1 << 63
+
+
+class DurableSink:
+    """Keeps what was accepted through kills, full disks and lost power.
+
+    One thread defines, writes, splits and closes; the properties may be read from any.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        force: bool = False,
+        segment_size: int = 16 << 20,
+        split_size: int | None = None,
+        split_ns: int | None = None,
+        flush_interval_s: float = 10.0,
+        sync_interval_s: float = 1.0,
+        ballast: int = 8 << 20,
+        last_words: int = 0,
+    ) -> None:
+        """Create the first part and the write-ahead log.
+
+        Args:
+            path: The first part, e.g. ``run.mcap``; the next is ``run_0002.mcap``.
+            force: Replace existing files, and what a former recorder left in its write-ahead log.
+            segment_size: Bytes of a segment of the write-ahead log; two are reserved at any time.
+            split_size: Bytes of a part at which the next one begins; None for never. A part is
+                longer by the chunks that are open then.
+            split_ns: Log time of a part [ns]; None for never.
+            flush_interval_s: Longest time that a message waits for its chunk to be full [s], and
+                twice the shortest that it may have to; the file lags behind by that, while the
+                write-ahead log has everything.
+            sync_interval_s: What power loss costs at most, about [s].
+            ballast: Bytes kept in reserve for finalising on a full disk.
+            last_words: Bytes of messages that are accepted even when the ballast had to go, for
+                what has yet to be brought to a safe end; well below the ballast. The caller
+                looks at :attr:`shortage`.
+
+        Raises:
+            OutputExistsError: If a file or a write-ahead log is there and ``force`` is not given.
+            LogWriteError: If there is no room, a file can't be created, or another recorder
+                writes it.
+            DataError: If a size or time makes no sense.
+        """
+        limits = [value for value in (split_size, split_ns) if value is not None]
+        if min(limits, default=1) < 1 or not flush_interval_s > 0 or min(ballast, last_words) < 0:
+            raise DataError("sizes and times of a recording are positive")
+        self.path = Path(path)
+        self._force = force
+        self._split_size = split_size
+        self._split_ns = split_ns
+        self._split_at_ns = _NEVER_NS if split_ns is None else 0
+        self._half_interval_s = flush_interval_s / 2
+        self._due = time.monotonic() + self._half_interval_s
+        self._mark = 0  # messages that the part had one half of the interval ago
+        self._known: list[Description] = []
+        self._messages: int = 0
+        self._last_words = last_words
+        self._refused: LogWriteError | None = None
+        self._part_began: int = 0
+        self._split_trouble: UndulogError | None = None
+        self._open = True
+        if not force:
+            _refuse_existing(self.path)
+        self._wal = WriteAheadLog(
+            wal_folder(self.path),
+            segment_size=segment_size,
+            sync_interval_s=sync_interval_s,
+            force=force,
+        )
+        kept: Ballast | None = None
+        try:
+            self._wal.define(Header(PROFILE, library_name()))
+            kept = self._ballast = Ballast(self._wal.folder, ballast)
+            self._part = PartStream(self.path, 1, force=force)
+        except (LogWriteError, OutputExistsError):
+            if kept is not None:
+                kept.free()
+            self._wal.release(0)
+            self._wal.close()
+            raise
+        self._disk = DiskThread(self._wal, self._ballast)
+        self._writer = self._new_writer()
+
+    # -- facts -----------------------------------------------------------------------------
+
+    @property
+    def messages(self) -> int:
+        """Messages accepted, over all parts."""
+        return self._messages
+
+    @property
+    def part(self) -> int:
+        """Number of the part that is being written, from 1."""
+        return self._part.number
+
+    @property
+    def part_path(self) -> Path:
+        """File of the part that is being written."""
+        return self._part.path
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes of MCAP so far, over all parts; the open chunks are not in it."""
+        return self._disk.bytes_given
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._disk.backlog
+
+    @property
+    def split_trouble(self) -> UndulogError | None:
+        """Why the last split that was due didn't happen: the part that is open goes on."""
+        return self._split_trouble
+
+    @property
+    def unsynced(self) -> int:
+        """Messages that power loss would cost at the moment."""
+        return self._wal.position - self._wal.synced
+
+    @property
+    def shortage(self) -> LogWriteError | None:
+        """Why recording must end soon, or has ended: no space, or a disk that fails."""
+        return self._disk.trouble or self._refused or self._wal.shortage
+
+    # -- writing ---------------------------------------------------------------------------
+
+    def define(self, record: Description) -> None:
+        """Take what explains later messages; every later part repeats it.
+
+        Args:
+            record: A schema, channel, attachment or metadata record.
+
+        Raises:
+            LogWriteError: If it can't be kept.
+            DataError: If the id of a schema or channel is not the next one.
+        """
+        self._refuse_closed()
+        self._wal.define(record)
+        write_description(self._writer, record)
+        self._known.append(record)
+        self._hand_over()
+
+    def write(
+        self,
+        channel_id: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int,
+        payload: bytes,
+    ) -> None:
+        """See :meth:`MessageSink.write`; from then on the death of the process doesn't lose it.
+
+        Raises:
+            LogWriteError: If it can't be kept: the disk is full or fails. It was not accepted;
+                all before it were.
+            DataError: If a number is out of range.
+        """
+        if self._disk.trouble is not None or self._refused is not None or not self._open:
+            self._refuse(len(payload))
+        if log_time_ns >= self._split_at_ns:
+            self._split_by_time(log_time_ns)
+        try:
+            self._wal.append(channel_id, log_time_ns, publish_time_ns, sequence, payload)
+        except LogWriteError as error:
+            self._refused = error  # for good: a gap in what was accepted would be worse
+            raise
+        part = self._part
+        size = part.size
+        self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
+        self._messages += 1
+        if part.size != size:
+            self._chunk_done()
+        if time.monotonic() >= self._due:
+            self._flush()
+
+    def tick(self) -> None:
+        """Look at the clock, for sessions in which nothing may come for long; about once a second.
+
+        Raises:
+            LogWriteError: If the session is closed.
+        """
+        self._refuse_closed()
+        if time.monotonic() >= self._due:
+            self._flush()
+
+    def split(self) -> Path:
+        """Begin the next part; the former is finalised in the background.
+
+        Returns:
+            The file of the part that is being written now: the same as before where it has no
+            message yet.
+
+        Raises:
+            OutputExistsError: If the next file is there and ``force`` was not given; the recording
+                goes on in the part that it is in.
+            LogWriteError: If it can't be created; likewise.
+        """
+        self._refuse_closed()
+        if self._messages == self._part_began:
+            return self._part.path
+        former, writer = self._part, self._writer
+        number = former.number + 1
+        following = PartStream(part_path(self.path, number), number, force=self._force)
+        begin = Metadata(PART_RECORD, {"part": str(number), "previous": former.path.name})
+        try:
+            after = {"after": str(self._messages)}  # for recovery: where the part begins
+            self._wal.define(Metadata(PART_RECORD, {**begin.metadata, **after}))
+        except LogWriteError:
+            following.discard()
+            raise
+        end = Metadata(PART_RECORD, {"part": str(former.number), "next": following.path.name})
+        self._disk.finish(former, writer, (end,), self._wal.position)
+        self._part, self._part_began = following, self._messages
+        self._writer = self._new_writer()
+        for record in (*self._known, begin):
+            write_description(self._writer, record)
+        self._hand_over()
+        self._mark = 0
+        return following.path
+
+    def close(self, last: tuple[Metadata, ...]) -> None:
+        """Finalise; safe to call twice.
+
+        Args:
+            last: Metadata that belong at the end.
+
+        Raises:
+            LogWriteError: If not everything reached the file. It is not lost: the write-ahead log
+                is kept then, and the error says where.
+        """
+        if not self._open:
+            return
+        self._open = False
+        trouble: LogWriteError | None = None
+        try:
+            for record in last:
+                self._wal.define(record)
+        except LogWriteError as error:  # the file has them, if it can be finalised
+            trouble = error
+        number = self._part.number
+        if number > 1:
+            end = Metadata(PART_RECORD, {"part": str(number), "parts": str(number)})
+            last = (*last, end)
+        whole = self._messages == self._wal.position  # not so after an interrupt in between
+        self._disk.finish(self._part, self._writer, last, self._wal.position if whole else 0)
+        self._disk.close()
+        self._ballast.free()
+        trouble = self._disk.failure or (None if whole else trouble)
+        if trouble is None and not whole:
+            trouble = LogWriteError(self._part.path, "the last message was interrupted")
+        try:
+            self._wal.close()
+        except LogWriteError as error:
+            trouble = trouble or error
+        if isinstance(trouble, FileDeletedError):
+            raise FileDeletedError(
+                trouble.path, f"{_reason(trouble)}; only what {self._wal.folder} still has is left"
+            ) from trouble
+        if trouble is not None:
+            raise LogWriteError(
+                trouble.path,
+                f"{_reason(trouble)}; all {self._wal.position} messages are kept, the last of them "
+                f"in {self._wal.folder}: free some space, then 'undulog log recover {self.path}'",
+            ) from trouble
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _new_writer(self) -> McapWriter:
+        writer = McapWriter(self._part, CHUNK_SIZE, chunk_group)
+        writer.start(profile=PROFILE, library=library_name())
+        return writer
+
+    def _hand_over(self) -> None:
+        """Let the disk's thread have what is queued, none of it messages."""
+        self._disk.write(self._part, 0)
+
+    def _chunk_done(self) -> None:
+        self._disk.write(self._part, self._part_began + self._writer.settled)
+        if self._split_size is not None and self._part.size >= self._split_size:
+            self._try_split()
+
+    def _flush(self) -> None:
+        """Write the chunks that were begun before the last time: busy ones are not cut short."""
+        size = self._part.size
+        self._writer.settle(self._mark)
+        self._mark = self._writer.messages
+        self._due = time.monotonic() + self._half_interval_s
+        if self._part.size != size:
+            self._chunk_done()
+
+    def _split_by_time(self, log_time_ns: int) -> None:
+        """Begin the next part if this message is the first behind a boundary."""
+        step = self._split_ns or _NEVER_NS
+        if not self._split_at_ns:  # the first message: boundaries are counted from it
+            self._split_at_ns = log_time_ns + step
+            return
+        self._split_at_ns += ((log_time_ns - self._split_at_ns) // step + 1) * step
+        self._try_split()
+
+    def _try_split(self) -> None:
+        """Split, unless that fails: what is recorded matters more than in which file."""
+        try:
+            self.split()
+            self._split_trouble = None
+        except (LogWriteError, OutputExistsError) as error:
+            self._split_trouble = error
+
+    def _refuse_closed(self) -> None:
+        if not self._open:
+            raise LogWriteError(self.path, "the session is closed")
+
+    def _refuse(self, size: int) -> None:
+        """Refuse a message, unless its bytes are among the last words."""
+        self._refuse_closed()
+        if self._disk.failure is None and self._refused is None and size <= self._last_words:
+            self._last_words -= size
+            return
+        trouble = self._disk.trouble or self._refused
+        if trouble is not None:
+            raise type(trouble)(trouble.path, _reason(trouble))
+
+
+def _reason(error: LogWriteError) -> str:
+    """An error's sentence without its file."""
+    return str(error).removeprefix(f"{error.path}: ")
+
+
+def _refuse_existing(path: Path) -> None:
+    """Refuse a session of which a file is there already."""
+    if path.exists():
+        raise OutputExistsError(path)
+    try:
+        later = later_parts(path)
+    except OSError as error:
+        raise write_error(path, error) from error
+    if later:
+        raise OutputExistsError(later[0])

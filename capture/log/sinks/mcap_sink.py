@@ -1,0 +1,180 @@
+"""A session file without a write-ahead log: for what can be made again (twin, imports)."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.records import Attachment, Channel, Metadata, Schema
+
+from ...common.errors import DataError, LogWriteError, OutputExistsError
+from ..mcap.mcap_writer import McapWriter
+from .chunk_groups import chunk_group
+from .sink import Description
+
+PROFILE = "ros2"
+"""MCAP profile of a log to the contract."""
+
+
+class McapSink:
+    """Writes one MCAP file; it is finalised by :meth:`close`."""
+
+    def __init__(self, path: Path | str, *, force: bool = False) -> None:
+        """Create the file.
+
+        Args:
+            path: The file to create.
+            force: Replace an existing file.
+
+        Raises:
+            OutputExistsError: If the file is there and ``force`` is not given.
+            LogWriteError: If it can't be created or written.
+        """
+        self.path = Path(path)
+        self._open = True
+        self._stream = create_file(self.path, force=force)
+        self._writer = McapWriter(_Guarded(self._stream, self.path), group_of=chunk_group)
+        self._writer.start(profile=PROFILE, library=library_name())
+
+    def define(self, record: Description) -> None:
+        """Write what explains later messages.
+
+        Args:
+            record: A schema, channel, attachment or metadata record.
+
+        Raises:
+            DataError: If the id of a schema or channel is not the next one.
+            LogWriteError: If the file can't be written.
+        """
+        write_description(self._writer, record)
+
+    def write(
+        self,
+        channel_id: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int,
+        payload: bytes,
+    ) -> None:
+        """See :meth:`MessageSink.write`."""
+        self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
+
+    def close(self, last: tuple[Metadata, ...]) -> None:
+        """Write the summary and close; safe to call twice.
+
+        Args:
+            last: Metadata that belong at the end.
+
+        Raises:
+            LogWriteError: If the summary can't be written.
+        """
+        if not self._open:
+            return
+        self._open = False
+        try:
+            for record in last:
+                write_description(self._writer, record)
+            self._writer.finish()
+            self._stream.flush()
+        except OSError as error:
+            with suppress(OSError):  # closing would say the same again
+                self._stream.close()
+            raise write_error(self.path, error) from error
+        self._stream.close()
+
+
+def library_name() -> str:
+    """What a file says of the library that wrote it."""
+    return f"undulog/{version('undulog')}"
+
+
+def write_description(writer: McapWriter, record: Description) -> None:
+    """Write a record that explains messages.
+
+    Args:
+        writer: Where to.
+        record: A schema, channel, attachment or metadata record.
+
+    Raises:
+        DataError: If the id of a schema or channel is not the next one: the library numbers them
+            itself.
+        LogWriteError: If the file can't be written.
+    """
+    match record:
+        case Schema():
+            given = writer.register_schema(record.name, record.encoding, record.data)
+            _same_id(f"schema {record.name}", record.id, given)
+        case Channel():
+            given = writer.register_channel(
+                record.topic, record.message_encoding, record.schema_id, dict(record.metadata)
+            )
+            _same_id(f"channel {record.topic}", record.id, given)
+        case Attachment():
+            writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+        case Metadata():
+            writer.add_metadata(record.name, dict(record.metadata))
+
+
+def write_error(path: Path, error: OSError) -> LogWriteError:
+    """An error of the operating system as ours.
+
+    Args:
+        path: The file that can't be written.
+        error: What was raised.
+
+    Returns:
+        The error to raise; the same one where it is ours already.
+    """
+    if isinstance(error, LogWriteError):
+        return error
+    return LogWriteError(path, f"can't be written: {error.strerror or error}")
+
+
+def create_file(path: Path, *, force: bool) -> BinaryIO:
+    """Create a file to write.
+
+    Args:
+        path: The file.
+        force: Replace an existing one.
+
+    Returns:
+        The open file.
+
+    Raises:
+        OutputExistsError: If it is there and ``force`` is not given.
+        LogWriteError: If it can't be created.
+    """
+    try:
+        return path.open("wb" if force else "xb")
+    except FileExistsError as error:
+        raise OutputExistsError(path) from error
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+class _Guarded:
+    """A binary stream whose failures name the file."""
+
+    def __init__(self, stream: BinaryIO, path: Path) -> None:
+        self._stream, self._path = stream, path
+
+    def write(self, data: bytes) -> int:
+        try:
+            return self._stream.write(data)
+        except OSError as error:
+            raise write_error(self._path, error) from error
+
+    def tell(self) -> int:
+        return self._stream.tell()
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+
+def _same_id(what: str, wanted: int, given: int) -> None:
+    if wanted != given:
+        raise DataError(f"{what} has the id {wanted}; the next one is {given}")

@@ -1,0 +1,1 @@
+"""The session writer and its channels."""

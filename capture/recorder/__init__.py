@@ -1,0 +1,1 @@
+"""The recorder: sources in, a session out."""

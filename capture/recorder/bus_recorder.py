@@ -1,0 +1,278 @@
+"""One bus of a recording: its raw frames at once, and what they mean a little later.
+
+A raw frame is safe as soon as it is written; decoding can wait, since it can be done again from
+the raw frames at any time. So a burst fills the queue of frames to decode and delays nothing else.
+Frames that can't be decoded, for a reason that nobody foresaw, are tried again in smaller pieces;
+single frames that still fail are kept raw only.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from ..bus.decoded_topics import DecodedTopics, Message
+from ..bus.decoding import BusDecoder, FrameTally
+from ..common.errors import LogWriteError
+from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd, in_one
+from ..log.write.channels import FrameChannel
+from ..log.write.writer import SessionWriter
+from ..robot.model import Robot
+from .source_clock import SourceClock
+
+_FRAMES_PER_MESSAGE = 4096
+_FRAMES_PER_SLICE = 1024
+_FEWEST = 256  # with fewer, each frame costs more
+_LONG_NS = 8_000_000  # processor time of a slice: half as many frames next time
+_SHORT_NS = 3_000_000  # twice as many
+_PIECES = 8
+_MOST_FAILURES = 16  # single frames in a row; then the rest of the slice is not tried
+
+
+class BusRecorder:
+    """Writes the frames of one source."""
+
+    def __init__(
+        self,
+        name: str,
+        writer: SessionWriter,
+        clock: SourceClock,
+        robot: Robot | None,
+        *,
+        directions: bool,
+    ) -> None:
+        """Open the bus.
+
+        Args:
+            name: Name of the source.
+            writer: The session.
+            clock: Maps the device's times onto the session's clock.
+            robot: Whose bus this is: its frames are decoded. None: they are only kept.
+            directions: Whether the frames tell sent from received.
+
+        Raises:
+            DataError: If the robot has no bus map.
+        """
+        self._name, self._writer = name, writer
+        self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
+        self._raw_fd: FrameChannel | None = None
+        self._clock = clock
+        self._decoder = BusDecoder(robot, directions=directions) if robot is not None else None
+        self._topics = (
+            DecodedTopics(writer, robot, self._decoder)
+            if robot is not None and self._decoder is not None
+            else None
+        )
+        self._fresh: list[FrameArray] = []
+        self._waiting: deque[FrameArray] = deque()
+        self._again: deque[FrameArray] = deque()  # pieces of a slice that failed
+        self._failures = 0
+        self._faults: Counter[str] = Counter()
+        self._messages: deque[Message] = deque()  # of the slice before, yet to be written
+        self._slice_size = _FEWEST
+        self._took_ns = 0  # of the last slice
+        self.tally = FrameTally()
+        self.backlog = 0
+
+    @property
+    def behind(self) -> bool:
+        """Whether decoded messages are to be written, or frames to be decoded for a whole slice."""
+        return bool(self._messages or self._again) or self.backlog >= self._slice_size
+
+    @property
+    def decodes(self) -> bool:
+        """Whether the frames are decoded, too."""
+        return self._decoder is not None
+
+    def add(self, frames: FrameArray) -> None:
+        """Take frames; they are not written yet.
+
+        Args:
+            frames: Records of :data:`.FRAME_DTYPE` or, CAN FD frames, of
+                :data:`.capture.log.messages.frames.FD_FRAME_DTYPE`, shape (n,).
+        """
+        self._fresh.append(frames)
+
+    def keep(self, frames: FrameArray, now_ns: Callable[[], int]) -> None:
+        """Write classic frames that are not to be decoded, after those taken before.
+
+        Args:
+            frames: Records of :data:`.FRAME_DTYPE`, shape (n,), e.g. commands
+                that the session has anyway.
+            now_ns: The session's clock.
+
+        Raises:
+            LogWriteError: If they can't be written.
+        """
+        self.write_raw(now_ns)
+        for batch in _batches([frames]):
+            self._raw.write(now_ns(), batch)
+
+    def write_raw(self, now_ns: Callable[[], int]) -> None:
+        """Write the frames taken since the last call.
+
+        Args:
+            now_ns: The session's clock.
+
+        Raises:
+            LogWriteError: If they can't be written.
+        """
+        if not self._fresh:
+            return
+        fresh, self._fresh = self._fresh, []
+        fd = [frames for frames in fresh if holds_fd(frames)]
+        if not fd:
+            for batch in _batches(fresh):
+                self._raw.write(now_ns(), batch)
+                self._wait(batch)
+            return
+        if self._raw_fd is None:
+            self._raw_fd = self._writer.fd_frames(FD_TOPIC_PREFIX + self._name)
+        for batch in _batches([frames for frames in fresh if not holds_fd(frames)]):
+            self._raw.write(now_ns(), batch)
+        for batch in _batches(fd):
+            self._raw_fd.write(now_ns(), batch)
+        # Sources hand out the kinds one after the other; on the bus they took turns.
+        both = in_one(fresh)
+        self._wait(both[np.lexsort((both["t_device_ns"], both["t_host_ns"]))])
+
+    def _wait(self, frames: FrameArray) -> None:
+        self._waiting.append(frames)
+        self.backlog += len(frames)
+
+    def decode(self, now_ns: Callable[[], int], until_ns: int, *, rest: bool = True) -> None:
+        """Decode what waits, slice by slice, and write what was decoded.
+
+        Args:
+            now_ns: The session's clock.
+            until_ns: No message is written after this time [Unix ns], and no slice is begun that
+                would last longer; but one slice at least, so that it goes on.
+            rest: Also decode fewer frames than make a whole slice: these cost more each.
+
+        Raises:
+            LogWriteError: If the messages can't be written.
+        """
+        now, idle = now_ns(), True
+        while True:
+            while self._messages and now < until_ns:
+                self._write(self._messages.popleft(), now)
+                now, idle = now_ns(), False
+            expected_ns = 0 if idle else self._took_ns
+            nothing = not self._again and not self._waiting
+            if self._messages or nothing or now + expected_ns >= until_ns:
+                return
+            if not rest and not self._again and self.backlog < self._slice_size:
+                return
+            self._decode_slice()
+            now, idle = now_ns(), False
+
+    def _decode_slice(self) -> None:
+        begun_ns = time.thread_time_ns()
+        frames = self._again.popleft() if self._again else self._mapped()
+        if self._decoder is not None and self._topics is not None:
+            try:
+                samples, tally = self._decoder.decode(frames)
+                messages = self._topics.add(samples)
+            except LogWriteError:
+                raise
+            except Exception as error:  # noqa: BLE001 - reported; the other frames are decoded
+                self._topics.forget()
+                self._try_again(frames, repr(error))
+                return
+            self._failures = 0
+            self.tally.add(tally)
+            self._hold(messages)
+        self._took_ns = time.thread_time_ns() - begun_ns
+        if self._took_ns > _LONG_NS:
+            self._slice_size = max(self._slice_size // 2, _FEWEST)
+        elif self._took_ns < _SHORT_NS:
+            self._slice_size = min(self._slice_size * 2, _FRAMES_PER_SLICE)
+
+    def take_faults(self) -> list[str]:
+        """Failures to decode since the last call, one sentence for each kind."""
+        faults, self._faults = self._faults, Counter()
+        return [
+            f"decoding failed with {fault} and goes on; {count} frames are kept raw only"
+            for fault, count in faults.items()
+        ]
+
+    def _mapped(self) -> FrameArray:
+        """The next frames to decode, at their times on the session's clock."""
+        frames = self._slice()
+        try:
+            frames["t_host_ns"] = self._clock.add(frames["t_device_ns"], frames["t_host_ns"])
+        except Exception as error:  # noqa: BLE001 - reported; the arrivals' times stay
+            self._clock.restart()
+            self._faults[repr(error)] += 0
+        return frames
+
+    def _try_again(self, frames: FrameArray, fault: str) -> None:
+        """Decode frames that failed once more, in pieces; a single one is given up."""
+        self._faults[fault] += 0
+        if len(frames) > 1:
+            size = -(-len(frames) // _PIECES)
+            pieces = [frames[start : start + size] for start in range(0, len(frames), size)]
+            self._again.extendleft(reversed(pieces))
+            return
+        self._failures += 1
+        self._faults[fault] += 1
+        if self._failures >= _MOST_FAILURES:
+            self._faults[fault] += sum(map(len, self._again))
+            self._again.clear()
+            self._failures = 0
+
+    def _slice(self) -> FrameArray:
+        """The next frames to decode: few enough for one tick."""
+        slices, room = list[FrameArray](), self._slice_size
+        while self._waiting and room:
+            batch = self._waiting.popleft()
+            if len(batch) > room:
+                self._waiting.appendleft(batch[room:])
+                batch = batch[:room]
+            slices.append(batch)
+            room -= len(batch)
+        self.backlog -= self._slice_size - room
+        return in_one(slices)
+
+    def finish(self, now_ns: Callable[[], int]) -> None:
+        """Write everything that is left.
+
+        Args:
+            now_ns: The session's clock.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        self.write_raw(now_ns)
+        self.decode(now_ns, 1 << 63)
+        if self._topics is None:
+            return
+        try:
+            self._hold(self._topics.finish())
+        except Exception as error:  # noqa: BLE001 - reported; the raw frames are safe
+            self._faults[repr(error)] += 0
+        self.decode(now_ns, 1 << 63)
+
+    def _write(self, message: Message, now_ns: int) -> None:
+        try:
+            message.write(now_ns)
+        except LogWriteError:
+            raise
+        except Exception as error:  # noqa: BLE001 - reported; the other messages are written
+            self._faults[f"{error!r} on {message.topic}"] += 0
+
+    def _hold(self, messages: list[Message]) -> None:
+        messages.sort(key=lambda message: message.sampled_ns)
+        self._messages.extend(messages)
+
+
+def _batches(fresh: list[FrameArray]) -> Iterator[FrameArray]:
+    """Frames of one kind, few enough for a message each."""
+    if not fresh:
+        return
+    frames = fresh[0] if len(fresh) == 1 else np.concatenate(fresh)
+    for start in range(0, len(frames), _FRAMES_PER_MESSAGE):
+        yield frames[start : start + _FRAMES_PER_MESSAGE]

@@ -1,0 +1,328 @@
+"""Feeds whoever watches, at no cost to the recording: what nobody takes is dropped.
+
+The recorder must not talk to a viewer itself: one that is frozen makes a send wait for ever. So
+the feed sends datagrams (:mod:`.capture.recorder.live_wire`) to a Unix socket that a relay process
+reads, and never waits: what the socket doesn't take stays in a bounded queue, and what the queue
+doesn't hold is dropped, oldest first. Nothing is sent, and next to nothing is done, while there is
+no relay.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.records import Channel
+
+from ..log.sinks.sink import Description
+from .live_wire import (
+    HEAD_SIZE,
+    MAX_DATAGRAM,
+    MAX_MESSAGE,
+    RECORD_SIZE,
+    DatagramHead,
+    Kind,
+    pack_datagram,
+    pack_message,
+)
+from .live_words import LiveWords, Queued
+
+RENEW_NS = 2_000_000_000
+"""How often a relay is told all definitions again, and the path is looked up again [ns]."""
+RETRY_NS = 500_000_000
+"""How often a relay is looked for where there was none [ns]."""
+
+_BUDGET_NS = 300_000
+_FILL_NS = 20_000_000
+_FILL = 16 << 10
+_DATAGRAM = 32 << 10
+_END_TRIES = 20
+_END_PAUSE_S = 0.005
+_NEVER_NS = 1 << 63
+
+
+@dataclass
+class LiveCounts:
+    """What became of the messages.
+
+    Attributes:
+        sent: Sent to a relay.
+        dropped: Dropped because the relay was too slow, or gone while they waited.
+        thinned: Left out because their channel speaks more often than is shown.
+        too_big: Left out because they don't fit a datagram, definitions included.
+        connections: How often a relay was found.
+    """
+
+    sent: int = 0
+    dropped: int = 0
+    thinned: int = 0
+    too_big: int = 0
+    connections: int = 0
+
+
+class _Packed(NamedTuple):
+    """A datagram that the socket hasn't taken yet, and how many messages it has."""
+
+    data: bytes
+    messages: int
+
+
+class LiveFeed:
+    """The recorder's end; one thread calls it, and no call waits."""
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        max_messages: int = 4096,
+        max_bytes: int = 2 << 20,
+        max_rate_hz: float = 200.0,
+        raw_frames: bool = False,
+    ) -> None:
+        """Remember where the relay will be; it may come, go and come again.
+
+        Args:
+            path: The relay's socket.
+            max_messages: How many messages wait at most, beside those of one datagram.
+            max_bytes: How many bytes wait at most, beside one datagram.
+            max_rate_hz: Most messages a second that are sent of a channel of samples; events are
+                never left out.
+            raw_frames: Whether raw frames, ``/can/...``, are sent too.
+        """
+        self.path = Path(path)
+        self.counts = LiveCounts()
+        self._max_messages, self._max_bytes = max_messages, max_bytes
+        self._words = LiveWords(period_ns=round(1e9 / max_rate_hz), raw_frames=raw_frames)
+        self._feed_id = int.from_bytes(os.urandom(8), "little")
+        self._socket: socket.socket | None = None
+        self._periods = self._words.periods
+        self._due: dict[int, int] = {}  # empty while nobody watches
+        self._states = self._words.states
+        self._queue: deque[Queued] = deque()
+        self._queued_bytes = 0
+        self._to_tell: deque[_Packed] = deque()
+        self._waiting: _Packed | None = None
+        self._full = False
+        self._now_ns = time.monotonic_ns()
+        self._renew_at_ns = 0
+        self._send_at_ns = 0
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a relay."""
+        return self._socket is not None
+
+    @property
+    def queued(self) -> int:
+        """How many messages wait."""
+        return len(self._queue) + (self._waiting.messages if self._waiting is not None else 0)
+
+    def define(self, record: Description) -> None:
+        """Take what explains messages; kept, and told to every relay that comes.
+
+        Args:
+            record: Schemas before their channels. Of metadata only ``undulog`` is told, of
+                attachments only the robot's description and its bus databases.
+        """
+        packed = self._words.pack(record)
+        if packed is None:
+            return
+        if len(packed) > MAX_DATAGRAM - HEAD_SIZE:
+            self.counts.too_big += 1
+            return
+        self._words.keep(record, packed)
+        if self._socket is not None:
+            if isinstance(record, Channel) and record.id in self._words.periods:
+                self._due[record.id] = 0
+            self._to_tell.append(self._told([packed]))
+
+    def offer(
+        self,
+        channel_id: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int,
+        payload: bytes,
+    ) -> None:
+        """Take one message, if anybody watches.
+
+        Args:
+            channel_id: Its channel.
+            log_time_ns: When it was recorded [Unix ns].
+            publish_time_ns: When it was sampled [Unix ns].
+            sequence: The channel's own counter.
+            payload: Its bytes.
+        """
+        due = self._due.get(channel_id)
+        if channel_id in self._states:
+            self._states[channel_id] = (
+                channel_id,
+                sequence,
+                log_time_ns,
+                publish_time_ns,
+                self._now_ns,
+                payload,
+            )
+        if due is None:
+            return
+        if log_time_ns < due:
+            self.counts.thinned += 1
+            return
+        size = len(payload)
+        if size > MAX_MESSAGE:
+            self.counts.too_big += 1
+            return
+        period = self._periods[channel_id]
+        if period:  # a late message doesn't push back those after it
+            self._due[channel_id] = max(due, log_time_ns - period) + period
+        self._queue.append(
+            (channel_id, sequence, log_time_ns, publish_time_ns, self._now_ns, payload)
+        )
+        self._queued_bytes += size + RECORD_SIZE
+        if self._queued_bytes > self._max_bytes or len(self._queue) > self._max_messages:
+            self._drop_oldest()
+
+    def pump(self) -> None:
+        """Send what the socket takes, for 0.3 ms at most; call it once a tick."""
+        now_ns = self._now_ns = time.monotonic_ns()
+        if now_ns >= self._renew_at_ns:
+            self._renew(now_ns)
+        if self._socket is None or not self._ripe(now_ns):
+            return
+        until_ns = now_ns + _BUDGET_NS
+        self._send_at_ns = now_ns + _FILL_NS
+        while self._send_one():
+            if time.monotonic_ns() >= until_ns:
+                return
+
+    def close(self) -> None:
+        """Send what is left and the end, if the relay takes it within 0.1 s; safe to call twice."""
+        for _ in range(_END_TRIES):
+            while self._send_one():
+                pass
+            if not self.connected or (self._is_empty and self._taken(self._end())):
+                break
+            time.sleep(_END_PAUSE_S)
+        self._lose(time.monotonic_ns())
+        self._renew_at_ns = _NEVER_NS
+
+    # -- what is told ----------------------------------------------------------------------
+
+    def _told(self, records: list[bytes]) -> _Packed:
+        return _Packed(pack_datagram(self._head(Kind.DEFINITIONS, 0), records), 0)
+
+    def _end(self) -> _Packed:
+        return _Packed(pack_datagram(self._head(Kind.END, 0), ()), 0)
+
+    def _head(self, kind: Kind, messages: int) -> DatagramHead:
+        return DatagramHead(kind, messages, self._feed_id, self.counts.dropped)
+
+    # -- the queue -------------------------------------------------------------------------
+
+    @property
+    def _is_empty(self) -> bool:
+        """Whether nothing waits; an end that the socket didn't take is made anew."""
+        messages_wait = self._waiting is not None and self._waiting.messages > 0
+        return not (self._queue or self._to_tell or messages_wait)
+
+    def _drop_oldest(self) -> None:
+        if self._waiting is not None and self._waiting.messages:
+            self.counts.dropped += self._waiting.messages
+            self._waiting = None
+        while self._queued_bytes > self._max_bytes or len(self._queue) > self._max_messages:
+            self._queued_bytes -= len(self._queue.popleft()[-1]) + RECORD_SIZE
+            self.counts.dropped += 1
+
+    def _ripe(self, now_ns: int) -> bool:
+        """Whether to send: a datagram is left to fill, and a full socket to itself, for 20 ms."""
+        if now_ns < self._send_at_ns:
+            return not self._full and (bool(self._to_tell) or self._queued_bytes >= _FILL)
+        return bool(self._queue or self._to_tell or self._waiting is not None)
+
+    def _next(self) -> _Packed | None:
+        """The next datagram: what waits, then definitions, then the oldest messages."""
+        if self._waiting is not None:
+            return self._waiting
+        if self._to_tell:
+            return self._to_tell.popleft()
+        if not self._queue:
+            return None
+        records: list[bytes] = []
+        size = 0
+        while self._queue:
+            length = len(self._queue[0][-1]) + RECORD_SIZE
+            if records and size + length > _DATAGRAM:
+                break
+            records.append(pack_message(self._queue.popleft()))
+            size += length
+        self._queued_bytes -= size
+        head = self._head(Kind.MESSAGES, len(records))
+        return _Packed(pack_datagram(head, records), len(records))
+
+    # -- the socket ------------------------------------------------------------------------
+
+    def _send_one(self) -> bool:
+        """Send one datagram; False where there is none, or the socket takes none."""
+        packed = self._next()
+        return packed is not None and self._taken(packed)
+
+    def _taken(self, packed: _Packed) -> bool:
+        if self._socket is None:
+            return False
+        try:
+            self._socket.send(packed.data)
+        except OSError as error:
+            if error.errno in {errno.EAGAIN, errno.ENOBUFS, errno.ENOMEM}:
+                self._waiting, self._full = packed, True
+                return False
+            if error.errno == errno.EMSGSIZE:
+                self._waiting = None
+                self.counts.too_big += max(packed.messages, 1)
+                return True
+            self.counts.dropped += packed.messages  # it has gone
+            self._waiting = None
+            self._lose(self._now_ns)
+            return False
+        self._waiting, self._full = None, False
+        self.counts.sent += packed.messages
+        return True
+
+    def _renew(self, now_ns: int) -> None:
+        """Find the relay that is there now, be it a new one, and tell it all definitions."""
+        link, found = self._socket, False
+        if link is None:
+            link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            link.setblocking(False)
+            found = True
+        try:
+            link.connect(str(self.path))
+        except OSError:  # none there, or it has gone: look again later
+            self._socket = link
+            self._lose(now_ns)
+            return
+        self._socket = link
+        self._renew_at_ns = now_ns + RENEW_NS
+        if found:
+            self.counts.connections += 1
+            self._due = dict.fromkeys(self._periods, 0)
+        if not self._to_tell:
+            self._to_tell.extend(self._told(group) for group in self._words.groups(_DATAGRAM))
+
+    def _lose(self, now_ns: int) -> None:
+        """There is no relay any more: forget what was meant for it."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        self.counts.dropped += self.queued
+        self._waiting, self._full = None, False
+        self._queue.clear()
+        self._queued_bytes = 0
+        self._to_tell.clear()
+        self._due = {}
+        self._renew_at_ns = now_ns + RETRY_NS

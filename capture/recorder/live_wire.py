@@ -1,0 +1,199 @@
+"""Datagrams of the live feed: what the recorder tells whoever watches.
+
+A datagram is a head and then whole records, so that each can be read without any other::
+
+    head   = magic (4), version u8, kind u8, messages u16, feed id u64, dropped u64
+    record = kind u8, pad (1), channel u16, sequence u32, length u32, log time u64,
+             publish time u64, offered u64, payload (length bytes)
+
+All numbers are little-endian. ``kind`` of a record is the opcode of the MCAP record that it would
+be (https://mcap.dev/spec); the payload of a definition is that record's body, compressed with zlib.
+A datagram of definitions ends with the last messages of topics that speak only on change: they
+still hold, and one who comes later would not know.
+
+``offered`` is the monotonic clock of the machine when the message was taken, so that a reader on
+the same machine knows how late it is.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
+from ..common.errors import DataError
+from ..log.sinks.sink import Description
+from ..log.wal.wal_format import Definition, pack_definition, unpack_definition
+
+MAX_DATAGRAM = 64 << 10
+"""No datagram is longer [byte]."""
+
+_MAGIC = b"ULIV"
+_VERSION = 1
+_HEAD = struct.Struct("<4sBBHQQ")
+_RECORD = struct.Struct("<BxHIIQQQ")
+_MAX_DEFINITION = 16 << 20
+
+HEAD_SIZE = _HEAD.size
+RECORD_SIZE = _RECORD.size
+MAX_MESSAGE = MAX_DATAGRAM - HEAD_SIZE - RECORD_SIZE
+"""Longest payload of a message [byte]."""
+
+
+class Kind(IntEnum):
+    """What a datagram holds."""
+
+    MESSAGES = 0
+    DEFINITIONS = 1
+    END = 2
+
+
+class LiveMessage(NamedTuple):
+    """One message of the feed.
+
+    Attributes:
+        channel_id: Its channel.
+        sequence: The channel's own counter.
+        log_time_ns: When it was recorded [Unix ns].
+        publish_time_ns: When it was sampled [Unix ns].
+        offered_ns: When the feed took it, on the machine's monotonic clock [ns].
+        payload: Its bytes.
+    """
+
+    channel_id: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    offered_ns: int
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class DatagramHead:
+    """What stands before the records.
+
+    Attributes:
+        kind: What the datagram holds.
+        messages: How many messages it has.
+        feed_id: Random, one a recording: another one says that the recorder was started anew.
+        dropped: Messages that the feed has dropped so far.
+    """
+
+    kind: Kind
+    messages: int
+    feed_id: int
+    dropped: int
+
+
+def pack_datagram(head: DatagramHead, records: Iterable[bytes]) -> bytes:
+    """A datagram.
+
+    Args:
+        head: What stands before the records.
+        records: As :func:`pack_message` and :func:`pack_description` give them.
+
+    Returns:
+        Its bytes.
+    """
+    packed = _HEAD.pack(_MAGIC, _VERSION, head.kind, head.messages, head.feed_id, head.dropped)
+    return b"".join([packed, *records])
+
+
+def pack_message(message: LiveMessage | tuple[int, int, int, int, int, bytes]) -> bytes:
+    """A message as a record.
+
+    Args:
+        message: The message, or a tuple of the same fields.
+
+    Returns:
+        Its bytes.
+    """
+    channel_id, sequence, log_ns, publish_ns, offered_ns, payload = message
+    length = len(payload)
+    return (
+        _RECORD.pack(Opcode.MESSAGE, channel_id, sequence, length, log_ns, publish_ns, offered_ns)
+        + payload
+    )
+
+
+def pack_description(record: Description) -> bytes:
+    """What explains messages, as a record.
+
+    Args:
+        record: E.g. a channel.
+
+    Returns:
+        Its bytes.
+    """
+    kind, body = pack_definition(record)
+    payload = zlib.compress(body)
+    return _RECORD.pack(kind, 0, 0, len(payload), 0, 0, 0) + payload
+
+
+def read_head(data: bytes) -> DatagramHead:
+    """The head of a datagram.
+
+    Args:
+        data: The datagram.
+
+    Returns:
+        Its head.
+
+    Raises:
+        DataError: If it is none of ours, or of another version.
+    """
+    if len(data) < HEAD_SIZE:
+        raise DataError(f"a datagram of {len(data)} bytes is too short for the live feed")
+    magic, version, kind, messages, feed_id, dropped = _HEAD.unpack_from(data)
+    if magic != _MAGIC or version != _VERSION or kind not in Kind.__members__.values():
+        raise DataError("a datagram is not of this version's live feed")
+    return DatagramHead(Kind(kind), messages, feed_id, dropped)
+
+
+def read_records(data: bytes) -> list[LiveMessage | Definition]:
+    """The records of a datagram.
+
+    Args:
+        data: The datagram, its head checked.
+
+    Returns:
+        Messages and definitions, in order.
+
+    Raises:
+        DataError: If it is cut short or a definition can't be read.
+    """
+    found: list[LiveMessage | Definition] = []
+    at = HEAD_SIZE
+    while at < len(data):
+        start = at + RECORD_SIZE
+        if start > len(data):
+            raise DataError("a datagram of the live feed is cut short")
+        kind, channel_id, sequence, length, log_ns, publish_ns, offered_ns = _RECORD.unpack_from(
+            data, at
+        )
+        at = start + length
+        if at > len(data):
+            raise DataError("a datagram of the live feed is cut short")
+        payload = data[start:at]
+        if kind == Opcode.MESSAGE:
+            found.append(LiveMessage(channel_id, sequence, log_ns, publish_ns, offered_ns, payload))
+        else:
+            found.append(_description(kind, payload))
+    return found
+
+
+def _description(kind: int, payload: bytes) -> Definition:
+    unpacker = zlib.decompressobj()
+    try:
+        body = unpacker.decompress(payload, _MAX_DEFINITION)
+        if not unpacker.eof:
+            raise DataError("a definition of the live feed is too long or cut short")
+        return unpack_definition(kind, body)
+    except (zlib.error, McapError, KeyError, ValueError, OverflowError) as error:
+        raise DataError(f"a definition of the live feed can't be read: {error}") from error

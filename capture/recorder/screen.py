@@ -1,0 +1,304 @@
+"""A recording on one screen: the answer first, then what it is made of.
+
+State is said in words; colour only helps (blue, yellow and a reversed red: told apart by any eye).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from textwrap import wrap
+
+from rich.text import Text
+
+from ..common.amounts import format_size
+from ..common.console import plain
+from ..common.text_table import Cells, Column, cut, fit, table
+from ..log.health.health import has_rhythm
+from ..log.messages.diagnostics import ERROR, OK
+from .snapshot import EventLine, RecorderSnapshot, SourceSnapshot, TopicSnapshot
+from .statuses import group_of, source_state
+
+STYLES = {"good": "bold cyan", "degraded": "bold yellow", "bad": "bold white on red"}
+"""Of verdicts."""
+
+_LEVELS = {"warn": "yellow", "error": "bold white on red", "fatal": "bold white on red"}
+_MUTED = "bright_black"
+_EVENTS = 4
+_REASONS = 3
+_SHOWN_ALONE = 3
+_NS = 1_000_000_000
+_DASH = "-"
+
+
+SOURCE_COLUMNS = (
+    Column("source", 10, left=True),
+    Column("state", 16, left=True),
+    Column("frames/s", 8),
+    Column("lost", 6),
+    Column("unread", 6),
+    Column("load", 5),
+    Column("drift/ppm", 9),
+    Column("jitter/ms", 9),
+    Column("frames", 11, wide=True),
+    Column("bus errors", 10, wide=True),
+    Column("reconnects", 10, wide=True),
+)
+TOPIC_COLUMNS = (
+    Column("topic", 16, left=True),
+    Column("msgs/s", 8),
+    Column("age/s", 6),
+    Column("gaps", 5),
+    Column("missing", 7),
+    Column("jitter", 6),
+    Column("lost", 6),
+    Column("messages", 10, wide=True),
+    Column("joints", 20, left=True, wide=True),
+)
+
+
+def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = None) -> Text:
+    """Draw a recording.
+
+    Args:
+        snapshot: The recording.
+        width: Characters in a line; no line is longer.
+        height: Lines on the screen; topics that don't fit are counted. None for no end.
+
+    Returns:
+        The screen's lines.
+    """
+    head = [*_headline(snapshot, width), *_verdict(snapshot, width)]
+    sources = table(SOURCE_COLUMNS, [_source_cells(each) for each in snapshot.sources], width)
+    events = [_event(event, snapshot, width) for event in snapshot.events[-_EVENTS:]]
+    if events:
+        events = [Text(), Text("latest events", style="bold"), *events]
+    rows = [_topic_cells(name, topics) for name, topics in _rows(snapshot.topics)]
+    room = len(rows)
+    if height is not None:
+        used = len(head) + 1 + len(sources) + 2 + len(events) + 1
+        room = max(height - used, 0)
+    hidden = 0
+    if len(rows) > room:
+        hidden = len(rows) - max(room - 1, 0)
+        rows = rows[: max(room - 1, 0)]
+    topics = table(TOPIC_COLUMNS, rows, width) if rows else []
+    if hidden:
+        topics.append(Text(f"and {hidden} more", style=_MUTED))
+    lines = [*head, Text(), *sources, *([Text(), *topics] if topics else []), *events]
+    return Text("\n").join(lines)
+
+
+def plain_line(snapshot: RecorderSnapshot) -> str:
+    """The recording in one line, for what is no terminal.
+
+    Args:
+        snapshot: The recording.
+
+    Returns:
+        Time, verdict, size, the sources, the heaviest reason.
+    """
+    parts = [
+        f"{clock_time(snapshot.elapsed_s)} {snapshot.verdict}",
+        f"{snapshot.messages:,} messages, {format_size(snapshot.size)}",
+    ]
+    for source in snapshot.sources:
+        _, state = source_state(source)
+        rate = f", {source.rate_hz:.0f} frames/s" if source.rate_hz is not None else ""
+        parts.append(f"{source.name} {state}{rate}")
+    if snapshot.free is not None:
+        parts.append(_room(snapshot))
+    if snapshot.trouble is not None:
+        parts.append(snapshot.trouble)
+    if snapshot.reasons:
+        parts.append(snapshot.reasons[0] + _more(len(snapshot.reasons) - 1))
+    return plain("; ".join(parts))
+
+
+def event_line(event: EventLine) -> str:
+    """An event in one line, for what is no terminal.
+
+    Args:
+        event: The event.
+    """
+    return plain(f"{event.level}: {event.name}: {event.text}")
+
+
+def clock_time(time_s: float) -> str:
+    """A duration as a clock shows it.
+
+    Args:
+        time_s: [s].
+
+    Returns:
+        E.g. ``1:02:03``.
+    """
+    minutes, seconds = divmod(int(time_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}"
+
+
+def time_left(time_s: float) -> str:
+    """A duration in the one or two units that matter.
+
+    Args:
+        time_s: [s].
+
+    Returns:
+        E.g. ``3 h 20 min``.
+    """
+    minutes = int(time_s // 60)
+    if minutes < 1:
+        return f"{int(time_s)} s"
+    if minutes < 60:
+        return f"{minutes} min"
+    hours, minutes = divmod(minutes, 60)
+    if hours < 10:
+        return f"{hours} h {minutes} min"
+    return f"{hours} h" if hours < 48 else f"{hours // 24} d"
+
+
+# -- the parts ---------------------------------------------------------------------------------
+
+
+def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
+    what = f"{snapshot.state} {_shorter(snapshot.path, width - 30)}"
+    robot = f"  {snapshot.robot}" if snapshot.robot else ""
+    time = clock_time(snapshot.elapsed_s)
+    first = Text(no_wrap=True)
+    first.append(fit(what + robot, width - len(time) - 1), "bold")
+    first.append(" " + time, "bold")
+    facts = [format_size(snapshot.size)]
+    if snapshot.byte_rate is not None:
+        facts[0] += f" (+{format_size(int(snapshot.byte_rate))}/s)"
+    if snapshot.part is not None:
+        facts.append(f"part {snapshot.part}")
+    facts.append(f"{snapshot.messages:,} messages")
+    if snapshot.free is not None:
+        facts.append(_room(snapshot))
+    second = Text(cut(" | ".join(facts), width))
+    lines = [first, second]
+    if snapshot.trouble is not None:
+        lines.append(Text(cut(snapshot.trouble, width), style=_LEVELS["error"]))
+    return lines
+
+
+def _room(snapshot: RecorderSnapshot) -> str:
+    left_s = snapshot.time_left_s
+    room = f"{format_size(snapshot.free or 0)} free"
+    return room if left_s is None else f"{room}, full in {time_left(left_s)}"
+
+
+def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
+    line = Text(no_wrap=True)
+    line.append(f" {snapshot.verdict.upper()} ", STYLES[snapshot.verdict])
+    count = len(snapshot.reasons)
+    why = "nothing found so far" if not count else f"so far, {count} reason{'s' * (count != 1)}"
+    late = ""
+    if snapshot.tick_p99_s is not None:
+        late = f" | tick p99 {snapshot.tick_p99_s * 1e3:.1f} ms"
+    if snapshot.backlog:
+        late += f" | {snapshot.backlog} frames to decode"
+    line.append(cut(f" {why}{late}", width - len(snapshot.verdict) - 2))
+    lines = [line]
+    for reason in snapshot.reasons[:_REASONS]:
+        folded = wrap(cut(reason, 4 * width), width - 4, max_lines=2, placeholder=" …")
+        lines += [Text(("    " if k else "  ") + part) for k, part in enumerate(folded)]
+    if count > _REASONS:
+        lines.append(Text(f"  and {count - _REASONS} more", style=_MUTED))
+    return lines
+
+
+def _event(event: EventLine, snapshot: RecorderSnapshot, width: int) -> Text:
+    ago_s = max(snapshot.now_ns - event.t_ns, 0) / _NS
+    at = clock_time(max(snapshot.elapsed_s - ago_s, 0.0))
+    line = Text(f"{at} ", no_wrap=True)
+    line.append(event.level, _LEVELS.get(event.level, ""))
+    line.append(cut(f" {event.name}: {event.text}", width - len(at) - 1 - len(event.level)))
+    return line
+
+
+def _rows(topics: Sequence[TopicSnapshot]) -> list[tuple[str, list[TopicSnapshot]]]:
+    """Topics by name; many sensors of one kind are one row, what has no rhythm is left out."""
+    groups: dict[str, list[TopicSnapshot]] = {}
+    for topic in topics:
+        if not has_rhythm(topic.topic):
+            continue
+        group = group_of(topic.topic)
+        alone = group == "joints" or topic.topic.count("/") < 2
+        groups.setdefault(topic.topic if alone else f"/{group}", []).append(topic)
+    rows: list[tuple[str, list[TopicSnapshot]]] = []
+    for name, members in groups.items():
+        if len(members) <= _SHOWN_ALONE:
+            rows += [(member.topic, [member]) for member in members]
+        else:
+            rows.append((f"{name}/ ({len(members)})", members))
+    return rows
+
+
+def _source_cells(source: SourceSnapshot) -> Cells:
+    level, state = source_state(source)
+    clock = source.clock
+    drift = jitter = _DASH
+    if clock is not None and clock.own_clock:
+        jitter = f"{clock.jitter_s * 1e3:.2f}"
+        drift = "..." if clock.drift_ppm is None else f"{clock.drift_ppm:+.1f}"
+    style = {OK: "", ERROR: _LEVELS["error"]}.get(level, _LEVELS["warn"])
+    return [
+        (source.name, ""),
+        (state.replace("connected, lost", "on, lost"), style),
+        (_DASH if source.age_s is None else _rate(source.rate_hz), ""),
+        _counted(source.dropped),
+        _counted(source.malformed),
+        (_DASH if source.load is None else f"{source.load[1]:.0%}", ""),
+        (drift, ""),
+        (jitter, ""),
+        (_DASH if source.frames is None else f"{source.frames:,}", ""),
+        _counted(source.error_frames),
+        _counted(source.reconnects),
+    ]
+
+
+def _topic_cells(name: str, topics: list[TopicSnapshot]) -> Cells:
+    """One row; of several topics the sums, and the worst of what has no sum."""
+    rates = [topic.rate_hz for topic in topics if topic.rate_hz is not None]
+    steady = [topic for topic in topics if topic.gaps is not None]
+    jitters = [topic.jitter for topic in steady if topic.jitter is not None]
+    counted = [topic.dropped for topic in topics if topic.dropped is not None]
+    at_limit = sorted({joint for topic in topics for joint in topic.at_limit})
+    frozen = sorted({joint for topic in topics for joint in topic.frozen})
+    said = [
+        *([f"{len(frozen)} frozen"] if frozen else []),
+        *([f"{len(at_limit)} at limits"] if at_limit else []),
+        *([f"{nan} NaN"] if (nan := sum(topic.nan for topic in topics)) else []),
+    ]
+    return [
+        (name, ""),
+        (_rate(sum(rates) if rates else None), ""),
+        (f"{max(topic.age_s for topic in topics):.1f}", ""),
+        _counted(sum(topic.gaps or 0 for topic in steady) if steady else None),
+        _counted(sum(topic.missing or 0 for topic in steady) if steady else None),
+        (f"{max(jitters):.0%}" if jitters else _DASH, ""),
+        _counted(sum(counted) if counted else None),
+        (f"{sum(topic.count for topic in topics):,}", ""),
+        (", ".join(said) or _DASH, _LEVELS["warn"] if said else ""),
+    ]
+
+
+def _rate(rate_hz: float | None) -> str:
+    if rate_hz is None:
+        return "..."
+    return f"{rate_hz:.0f}" if rate_hz >= 99.95 else f"{rate_hz:.1f}"
+
+
+def _counted(count: int | None) -> tuple[str, str]:
+    """A count of something that should not be, marked where it is."""
+    return (_DASH, _MUTED) if count is None else (str(count), _LEVELS["warn"] if count else "")
+
+
+def _shorter(path: str, width: int) -> str:
+    """The end of a path, which tells more than its beginning."""
+    return path if len(path) <= max(width, 8) else "…" + path[1 - max(width, 8) :]
+
+
+def _more(count: int) -> str:
+    return f" (and {count} more)" if count > 0 else ""

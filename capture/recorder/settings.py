@@ -1,0 +1,296 @@
+"""What a recording is to do: from the command line, the environment and a file, in that order.
+
+The command line beats the environment (``UNDULOG_RECORD_RING=30s``), which beats the file, which
+beats the defaults. All three use the same names and the same spelling of values, and a name that
+nobody knows is a fault wherever it stands: a mistyped setting never passes for a default. Values
+that another layer overrides are checked all the same.
+
+A file::
+
+    [record]
+    sources = ["can:socketcan:can0", "twin:flat"]
+    robot = "snake25"               # a shipped robot, or a TOML file beside this one
+    bus = "can0"                    # the source that is the robot's bus, where there are several
+    output = "run-{time}.mcap"      # {time}: UTC of the start, 20260131T235900Z
+    force = false                   # replace an existing output
+    duration = "1h30min"            # end by itself; never by default
+    split_size = "1GB"              # a new part after this size
+    split_time = "10min"            # and after this time
+    ring = "30s"                    # keep the last 30 s in memory, write them when marked
+    floor = "500MB"                 # end in good order when less disk is free
+    socket = "/run/undulog/a.sock"  # where status, mark, split and stop come in
+    live = false                    # show it in Rerun
+    operator = "who"
+    notes = "wet sand"
+    fast = false                    # a twin as fast as it can
+    quiet = false                   # nothing on the terminal
+    metadata = { place = "tank 2" } # further facts for the session
+
+Required are ``sources`` and ``output``.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+from ..common.amounts import SIZE_UNITS
+from ..common.errors import DataError, SettingsError
+from ..common.input_file import is_file, read_input
+from ..common.strict_table import Faults, listed, read_toml, shown
+from .setting_values import PARSERS
+
+ENVIRONMENT_PREFIX = "UNDULOG_RECORD_"
+"""Begins the name of every environment variable that is a setting."""
+
+FILE_VARIABLE = f"{ENVIRONMENT_PREFIX}SETTINGS"
+"""Names the file where the command line doesn't."""
+
+DEFAULT_FLOOR = 500 * SIZE_UNITS["MB"]
+"""A recording ends in good order when less disk is free [B]."""
+
+_NONE: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """Everything that ``undulog record`` takes.
+
+    Attributes:
+        sources: Addresses of the sources, at least one.
+        output: The session to write, ``.mcap``.
+        robot: A shipped robot or a robot TOML; None where a source brings it.
+        bus: Name of the source that is the robot's bus; None where that is clear.
+        force: Replace an existing output.
+        duration_s: End by itself after this time [s]; None for never.
+        split_size: A new part after this size [B]; None for no limit.
+        split_time_s: A new part after this time [s]; None for no limit.
+        ring_s: Keep so much in memory and write it when marked [s]; None to write everything.
+        floor: End in good order when less disk is free [B].
+        socket: The control socket; None for the usual place.
+        live: Show the recording in Rerun.
+        operator: Who records.
+        notes: Free text for the session.
+        metadata: Further facts for the session.
+        fast: A twin runs as fast as it can.
+        quiet: Nothing on the terminal.
+        origin: Where each setting comes from: ``command line``, ``environment``, the file's path,
+            or ``default``.
+    """
+
+    sources: tuple[str, ...]
+    output: Path
+    robot: str | None = None
+    bus: str | None = None
+    force: bool = False
+    duration_s: float | None = None
+    split_size: int | None = None
+    split_time_s: float | None = None
+    ring_s: float | None = None
+    floor: int = DEFAULT_FLOOR
+    socket: Path | None = None
+    live: bool = False
+    operator: str = ""
+    notes: str = ""
+    metadata: Mapping[str, str] = field(default_factory=lambda: _NONE)
+    fast: bool = False
+    quiet: bool = False
+    origin: Mapping[str, str] = field(default_factory=lambda: _NONE, compare=False)
+
+    def as_json(self) -> dict[str, dict[str, Any]]:
+        """Every setting with its value and where that comes from.
+
+        Returns:
+            Name to ``value`` (plain JSON) and ``origin``.
+        """
+        return {
+            name: {"value": _plain(getattr(self, _attribute(name))), "origin": self.origin[name]}
+            for name in PARSERS
+            if name in self.origin
+        }
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """One place where settings come from; an absent or None value isn't given there."""
+
+    origin: str
+    values: Mapping[str, object]
+    spell: Callable[[str], str]
+
+
+def resolve(
+    cli: Mapping[str, object],
+    environ: Mapping[str, str],
+    file: Path | None = None,
+    *,
+    now_ns: int | None = None,
+) -> RecordSettings:
+    """Put the layers together.
+
+    Args:
+        cli: Options as the command line has them, by the names of the file (``split_size``, not
+            ``split_size_bytes``); None for what was not given.
+        environ: The environment.
+        file: The settings file; ``UNDULOG_RECORD_SETTINGS`` names it where this is None.
+        now_ns: Unix time for ``{time}`` in the output [ns]; that of the call if None.
+
+    Returns:
+        The settings.
+
+    Raises:
+        InputFileError: If the file isn't there or can't be read.
+        SettingsError: If there are faults; lists all of them, of all layers.
+        TypeError: If ``cli`` has a name that no setting has.
+    """
+    if unknown := sorted(set(cli) - set(PARSERS)):
+        raise TypeError(f"no such settings: {', '.join(unknown)}")
+    faults = Faults()
+    layers = [_command_line(cli), _environment(environ, faults)]
+    if file is None and environ.get(FILE_VARIABLE):
+        file = Path(environ[FILE_VARIABLE])
+    if file is not None:
+        layers.append(_file(file, faults))
+    values: dict[str, Any] = {}
+    origin: dict[str, str] = {}
+    given: dict[str, tuple[_Layer, object]] = {}
+    for name, parse in PARSERS.items():
+        for layer in layers:
+            raw = layer.values.get(name)
+            if raw is None:
+                continue
+            value = _parsed(layer, name, raw, parse, faults)
+            if name not in origin:
+                origin[name] = layer.origin
+                given[name] = layer, raw
+                if value is not None:
+                    values[_attribute(name)] = value
+        origin.setdefault(name, "default")
+    _check_together(given, faults)
+    if found := faults.all():
+        raise SettingsError(found)
+    if file is not None and origin["robot"] == _origin(file):
+        values["robot"] = _beside(file, values["robot"])
+    values["output"] = _timed(values["output"], time.time_ns() if now_ns is None else now_ns)
+    return RecordSettings(**values, origin=MappingProxyType(origin))
+
+
+def _command_line(cli: Mapping[str, object]) -> _Layer:
+    # An option that can be repeated is an empty tuple when it was not given.
+    given = {name: None if value == () else value for name, value in cli.items()}
+
+    def spell(name: str) -> str:
+        return "SOURCE" if name == "sources" else f"--{name.replace('_', '-')}"
+
+    return _Layer("command line", given, spell)
+
+
+def _environment(environ: Mapping[str, str], faults: Faults) -> _Layer:
+    def spell(name: str) -> str:
+        return f"{ENVIRONMENT_PREFIX}{name.upper()}"
+
+    known = {spell(name): name for name in PARSERS}
+    values: dict[str, object] = {}
+    for variable, text in environ.items():
+        if not variable.startswith(ENVIRONMENT_PREFIX) or variable == FILE_VARIABLE:
+            continue
+        if variable in known:
+            values[known[variable]] = text
+        else:
+            faults.add(variable, "an unknown variable", listed([*known, FILE_VARIABLE], variable))
+    return _Layer("environment", values, spell)
+
+
+def _file(path: Path, faults: Faults) -> _Layer:
+    try:
+        tables = read_toml(read_input(path).decode("utf-8"))
+    except UnicodeDecodeError as error:
+        faults.add(f"{path}: byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
+        tables = {}
+    except ValueError as error:  # no TOML
+        faults.add(f"{path}: syntax", str(error), "TOML 1.0")
+        tables = {}
+    for name in tables:
+        if name != "record":
+            faults.add(f"{path}: {name}", "an unknown key", "one table, [record]")
+    table = tables.get("record", {})
+    if not isinstance(table, dict):
+        faults.add(f"{path}: record", shown(table), "a table")
+        table = {}
+    values = cast("dict[str, object]", table)
+    for name in values:
+        if name not in PARSERS:
+            faults.add(f"{path}: record.{name}", "an unknown key", listed(PARSERS, name))
+    return _Layer(_origin(path), values, lambda name: f"{path}: record.{name}")
+
+
+def _origin(file: Path) -> str:
+    return str(file.absolute())  # so that no file passes for another layer
+
+
+def _parsed(
+    layer: _Layer, name: str, raw: object, parse: Callable[[object], Any], faults: Faults
+) -> Any:
+    """The value; None after a fault."""
+    try:
+        return parse(raw)
+    except DataError as error:
+        faults.add(layer.spell(name), _shown(raw), str(error))
+        return None
+
+
+def _check_together(given: Mapping[str, tuple[_Layer, object]], faults: Faults) -> None:
+    """What is missing, and what excludes each other."""
+    for name, valid in (
+        ("sources", "at least one, e.g. can:socketcan:can0"),
+        ("output", "a file, e.g. --output run.mcap"),
+    ):
+        if name not in given:
+            faults.add(name, "nothing", valid)
+    if "ring" not in given:
+        return
+    for name in ("split_size", "split_time"):
+        if name in given:
+            layer, raw = given[name]
+            faults.add(
+                layer.spell(name), _shown(raw), "leave it out: a ring writes only what is marked"
+            )
+
+
+def _shown(raw: object) -> str:
+    if isinstance(raw, Path):
+        return shown(str(raw))
+    if isinstance(raw, tuple):
+        return shown(list(cast("tuple[object, ...]", raw)))
+    return shown(raw)
+
+
+def _beside(file: Path, robot: str) -> str:
+    """A robot's file beside the settings, where there is one."""
+    there = file.parent / robot
+    return str(there) if is_file(there) else robot
+
+
+def _timed(output: Path, now_ns: int) -> Path:
+    start = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
+    return Path(os.fspath(output).replace("{time}", f"{start:%Y%m%dT%H%M%SZ}"))
+
+
+def _attribute(name: str) -> str:
+    return f"{name}_s" if name in ("duration", "split_time", "ring") else name
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple):
+        return list(cast("tuple[object, ...]", value))
+    if isinstance(value, Mapping):
+        return dict(cast("Mapping[str, object]", value))
+    return value

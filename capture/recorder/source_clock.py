@@ -1,0 +1,329 @@
+"""A device's clock against the session's: when a sample was taken, rather than when it came.
+
+Method: the line below all delays, :mod:`.capture.recorder.envelope`. What no arrival times can tell
+is the least delay itself: mapped times are late by it, the same for all samples of a source.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import BoolArray, IntArray
+from ..sources.contract import DEVICE_TIMES_END_NS
+from .envelope import BUCKET_NS, PRIOR, SAME_DEVICE, Envelope
+
+JUMP_NS = 100_000_000
+"""A device time that goes back by more than this, or comes this much before it can have been, was
+set or restarted: no bus shuffles its frames so far."""
+
+_START_JUMP_NS = 1_000_000_000.0
+"""The same before the rate is known, when a backlog may still be running off."""
+
+SILENCE_NS = 120_000_000_000
+"""After a silence this long the offset is measured anew and only the rate is kept: a quartz wanders
+by more over it than the line is good for."""
+
+_WANDER = 2e-6  # of a rate over a silence
+
+_NS = 1_000_000_000
+_BINS_PER_OCTAVE = 8
+_BINS = 64 * _BINS_PER_OCTAVE
+_DELAYS = 4096
+
+
+@dataclass(frozen=True)
+class ClockEstimate:
+    """What is known of a source's clock.
+
+    Attributes:
+        own_clock: Whether the source has a clock of its own; without one the times are the host's.
+        offset_ns: Host minus device time at the last sample [ns]; None without an own clock.
+        drift_ppm: How much faster the device's clock runs than the host's [ppm], over the last
+            minute; None where it isn't known yet.
+        drift_uncertainty_ppm: Its standard deviation [ppm].
+        jitter_s: Standard deviation of arrival minus mapped time [s].
+        delay_p99_s: 99 % point of arrival minus mapped time [s], within 9 %.
+        samples: Samples mapped.
+        resets: How often the device's clock was set or restarted.
+        out_of_range: Samples whose device time is impossible.
+    """
+
+    own_clock: bool
+    offset_ns: int | None
+    drift_ppm: float | None
+    drift_uncertainty_ppm: float | None
+    jitter_s: float
+    delay_p99_s: float
+    samples: int
+    resets: int
+    out_of_range: int = 0
+
+    def as_metadata(self, name: str) -> dict[str, str]:
+        """Key-values for the session's metadata record ``undulog.clock``.
+
+        Args:
+            name: The source's name.
+
+        Returns:
+            Keys ``NAME.offset_ns`` and so on; what isn't known is left out.
+        """
+        return {f"{name}.{key}": value for key, value in self.facts().items()}
+
+    def facts(self) -> dict[str, str]:
+        """The same, without the name of a source."""
+        facts: dict[str, str] = {
+            "samples": str(self.samples),
+            "resets": str(self.resets),
+            "jitter_s": f"{self.jitter_s:.3g}",
+            "delay_p99_s": f"{self.delay_p99_s:.3g}",
+        }
+        if self.out_of_range:
+            facts["out_of_range"] = str(self.out_of_range)
+        if self.offset_ns is not None:
+            facts["offset_ns"] = str(self.offset_ns)
+        if self.drift_ppm is not None and self.drift_uncertainty_ppm is not None:
+            facts["drift_ppm"] = f"{self.drift_ppm:.3f}"
+            facts["drift_uncertainty_ppm"] = f"{self.drift_uncertainty_ppm:.2g}"
+        return facts
+
+
+class SourceClock:
+    """Maps one source's device times to the session's clock, as the samples come.
+
+    Mapped times never lie after the arrival, and go back only where the device's own do, by as
+    much: a sample that took longer than its neighbours comes late and keeps its time. Where the
+    estimate falls, times run at half speed until they meet it, so that samples stay apart.
+    """
+
+    def __init__(self) -> None:
+        """Start without samples."""
+        self._envelope = Envelope()
+        self._own = False
+        self._device = self._host = 0  # of the last sample
+        self._possible_ns = 0  # arrival of the last sample whose device time is possible
+        self._front = 0  # the latest device time so far
+        self._pair: tuple[int, int] | None = None
+        self._last = -(2**62)  # the last mapped time
+        self._floor = -(2**62)  # what the next may not fall below, at half speed
+        self._origin = (0, 0)  # device time, host minus device time
+        self._bucket_ends = 0
+        self._samples = self._resets = self._out_of_range = 0
+        self._events: list[str] = []
+        self._delays: list[IntArray] = []
+        self._waiting = 0
+        self._moments = (0.0, 0.0)
+        self._bins = np.zeros(_BINS, np.int64)
+
+    def add(self, t_device_ns: IntArray, t_host_ns: IntArray) -> IntArray:
+        """Take samples and map them.
+
+        Args:
+            t_device_ns: On the device's own clock, in the order they came, shape (n,); equal to
+                ``t_host_ns`` where a sample has no time of its own. Times that are not in
+                [0, :data:`~.capture.sources.contract.DEVICE_TIMES_END_NS`) are no device's: such
+                samples take the time of the one before, or of their arrival where none came
+                within 100 ms, and leave the estimate as it is.
+            t_host_ns: Arrival on the session's clock [Unix ns], not decreasing, shape (n,).
+
+        Returns:
+            Sampling times on the session's clock [Unix ns], shape (n,).
+        """
+        device = np.asarray(t_device_ns).astype(np.int64)
+        host = np.asarray(t_host_ns).astype(np.int64)
+        if not len(host):
+            return host
+        self._samples += len(host)
+        odd = device.view(np.uint64) >= DEVICE_TIMES_END_NS
+        if odd.any():
+            self._replace(device, host, odd)
+        else:
+            self._possible_ns = int(host[-1])
+        without = device == host
+        if without.all():
+            self._pair = int(device[-1]), int(host[-1])
+            mapped = self._in_order(host)
+        elif without.any():
+            mapped = self._mixed(device, host, without)
+        else:
+            mapped = self._map(device, host)
+        self._delays.append(host - mapped)
+        self._waiting += len(host)
+        if self._waiting >= _DELAYS:
+            self._count_delays()
+        return mapped
+
+    def pair(self) -> tuple[int, int] | None:
+        """Device and host time of the latest sample [ns], raw; None before the first."""
+        return self._pair
+
+    def take_events(self) -> list[str]:
+        """What happened to the clock since the last call, one sentence each."""
+        events, self._events = self._events, []
+        return events
+
+    def restart(self) -> None:
+        """Begin a new estimate with the next sample, after a failure."""
+        self._own, self._delays, self._waiting = False, [], 0
+        self._resets += 1
+
+    def result(self) -> ClockEstimate:
+        """What is known of the clock so far."""
+        self._count_delays()
+        line, known = self._envelope.line, self._own and self._envelope.settled
+        offset = drift = unsure = None
+        if self._own:
+            x = self._device - self._origin[0]
+            offset = self._origin[1] + round(line.offset_ns + line.rate * x)
+        if known:
+            drift, unsure = (1.0 / (1.0 + line.rate) - 1.0) * 1e6, line.uncertainty * 1e6
+        count = max(self._samples, 1)
+        mean = self._moments[0] / count
+        reached = np.cumsum(self._bins)
+        most = int(reached[-1])
+        place = int(np.searchsorted(reached, 0.99 * most)) if most else 0
+        return ClockEstimate(
+            own_clock=self._own,
+            offset_ns=offset,
+            drift_ppm=drift,
+            drift_uncertainty_ppm=unsure,
+            jitter_s=max(self._moments[1] / count - mean**2, 0.0) ** 0.5 / _NS,
+            delay_p99_s=2.0 ** (place / _BINS_PER_OCTAVE) / _NS if place else 0.0,
+            samples=self._samples,
+            resets=self._resets,
+            out_of_range=self._out_of_range,
+        )
+
+    # -- mapping ---------------------------------------------------------------------------
+
+    def _replace(self, device: IntArray, host: IntArray, odd: BoolArray) -> None:
+        """Put the last possible device time in place of each impossible one, or the arrival's."""
+        self._out_of_range += int(odd.sum())
+        last = np.maximum.accumulate(np.where(odd, -1, np.arange(len(device))))
+        if not self._own and not odd.all():
+            last = np.maximum(last, int(odd.argmin()))  # before the first, the one that follows
+        t_ns = np.where(last < 0, self._device, device[last])
+        came_ns = np.where(last < 0, self._possible_ns, host[last])
+        near = ((last >= 0) | self._own) & (host - came_ns <= JUMP_NS)
+        device[odd] = np.where(near, t_ns, host)[odd]
+        self._possible_ns = int(came_ns[-1])
+
+    def _in_order(self, t_ns: IntArray) -> IntArray:
+        """Times that are the host's own."""
+        mapped = np.maximum(np.maximum.accumulate(t_ns), self._last)
+        self._last = int(mapped[-1])
+        return mapped
+
+    def _mixed(self, device: IntArray, host: IntArray, without: BoolArray) -> IntArray:
+        """Some samples have the device's time and some have none, e.g. echoes of what was sent."""
+        cuts = np.flatnonzero(np.diff(without)) + 1
+        parts: list[IntArray] = []
+        starts: list[int] = [0, *cuts.tolist()]
+        for start, stop in itertools.pairwise([*starts, len(host)]):
+            one, other = device[start:stop], host[start:stop]
+            parts.append(self._in_order(other) if without[start] else self._map(one, other))
+        return np.concatenate(parts)
+
+    def _map(self, device: IntArray, host: IntArray) -> IntArray:
+        """Samples with device times, cut where half a second ends or the clock jumps."""
+        if not self._own:
+            self._own = True
+            self._restart(int(device[0]), int(host[0]), Envelope())
+        elif host[0] - self._host > SILENCE_NS and self._envelope.settled:
+            self._after_silence(device, host)
+        parts: list[IntArray] = []
+        while len(host):
+            if host[0] >= self._bucket_ends:
+                self._envelope.close_bucket()
+                self._bucket_ends = int(host[0]) + BUCKET_NS
+            stop = len(host)
+            if host[-1] >= self._bucket_ends:
+                stop = int(np.searchsorted(host, self._bucket_ends))
+                stop = max(stop, 1)  # arrivals that go back are not trusted to be sorted
+            stop = self._take(device[:stop], host[:stop])
+            if stop:
+                parts.append(self._place(device[:stop], host[:stop]))
+                self._device, self._host = int(device[stop - 1]), int(host[stop - 1])
+                self._pair = self._device, self._host
+            device, host = device[stop:], host[stop:]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _take(self, device: IntArray, host: IntArray) -> int:
+        """Let the envelope know samples up to a jump; how many that are."""
+        stop = len(device)
+        front = np.maximum(np.maximum.accumulate(device), self._front)
+        back = device - front < -JUMP_NS
+        if back.any():
+            stop = int(back.argmax())
+            if stop == 0:
+                self._jump(int(device[0]), int(host[0]), "went back")
+                return self._take(device, host)
+        envelope, line = self._envelope, self._envelope.line
+        x = (device[:stop] - self._origin[0]).astype(np.float64)
+        y = ((host[:stop] - device[:stop]) - self._origin[1]).astype(np.float64)
+        height = y - line.offset_ns - line.rate * x
+        lowest = int(height.argmin())
+        if not envelope.empty:
+            jump = JUMP_NS if envelope.settled else _START_JUMP_NS
+            if height[lowest] < -jump:
+                stop = int((height < -jump).argmax())
+                if stop == 0:
+                    self._jump(int(device[0]), int(host[0]), "jumped ahead")
+                    return self._take(device, host)
+                lowest = int(height[:stop].argmin())
+        envelope.take(float(x[lowest]), float(y[lowest]))
+        return stop
+
+    def _after_silence(self, device: IntArray, host: IntArray) -> None:
+        """Begin a new envelope where the old one leads to, if the clock was not set meanwhile."""
+        line = self._envelope.line
+        elapsed_ns = int(host[0]) - self._host
+        lag_ns = elapsed_ns - (int(device[0]) - self._device) * (1.0 + line.rate)
+        if abs(lag_ns) > JUMP_NS + 5.0 * max(line.uncertainty, _WANDER) * elapsed_ns:
+            return  # it was: what takes the samples will find that
+        sigma = max(3.0 * line.uncertainty, _WANDER)
+        self._restart(int(device[0]), int(host[0]), Envelope(line.rate, sigma))
+
+    def _jump(self, device: int, host: int, what: str) -> None:
+        self._resets += 1
+        size_ns = abs((device - self._device) - (host - self._host))
+        self._events.append(
+            f"the device's clock {what} by {size_ns / _NS:.3f} s and is measured anew"
+        )
+        rate = self._envelope.line.rate if self._envelope.settled else 0.0
+        sigma = SAME_DEVICE if self._envelope.settled else PRIOR
+        self._restart(device, host, Envelope(rate, sigma))
+
+    def _restart(self, device: int, host: int, envelope: Envelope) -> None:
+        self._envelope = envelope
+        self._origin = device, host - device
+        self._device, self._front, self._host = device, device, host
+        self._bucket_ends = host + BUCKET_NS
+        self._floor = self._last - device // 2
+
+    def _place(self, device: IntArray, host: IntArray) -> IntArray:
+        """Map samples on the line, in the device's order and not after their arrival."""
+        line, own = self._envelope.line, device
+        device = np.maximum(np.maximum.accumulate(device), self._front)
+        x = device - self._origin[0]
+        lag = np.floor(line.offset_ns + line.rate * x).astype(np.int64)
+        mapped = device + (self._origin[1] + lag)
+        half = device >> 1
+        floor = np.maximum(mapped - half, self._floor)
+        mapped = np.minimum(np.maximum.accumulate(floor) + half, host)
+        mapped = np.maximum(np.maximum.accumulate(mapped), self._last)
+        self._last, self._front = int(mapped[-1]), int(device[-1])
+        self._floor = self._last - int(half[-1])
+        return mapped - (device - own)
+
+    def _count_delays(self) -> None:
+        if not self._delays:
+            return
+        delays = np.concatenate(self._delays).astype(np.float64)
+        self._delays, self._waiting = [], 0
+        total, squares = self._moments
+        self._moments = total + float(delays.sum()), squares + float(delays @ delays)
+        places = np.rint(np.log2(np.maximum(delays, 1.0)) * _BINS_PER_OCTAVE).astype(np.int64)
+        self._bins += np.bincount(places, minlength=_BINS)[:_BINS]

@@ -1,0 +1,180 @@
+"""A recording's state as the statuses of ``/diagnostics``, one message a second.
+
+``undulog log check`` reads the counts of the sources again from there; the names of their keys are
+those of :class:`.capture.log.health.source_health.SourceHealth`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ..log.health.health import GOOD_LOSS, VERDICTS, has_rhythm
+from ..log.health.source_health import ELAPSED, RECORDER, SOURCE_PREFIX
+from ..log.messages.diagnostics import ERROR, OK, STALE, WARN, DiagnosticStatus
+from ..log.messages.frames import FRAME_TOPIC_PREFIXES
+from .snapshot import RecorderSnapshot, SourceSnapshot, TopicSnapshot
+
+SLOW_TICK_S = 0.05
+"""Ticks of 5 ms whose 99 % point is over this: the computer can't keep up."""
+
+LOW_TIME_S = 600.0
+"""Disk for less than this is a warning."""
+
+NO_TIME_S = 60.0
+"""Disk for less than this is an error."""
+
+SILENT_S = 1.0
+"""A source without a frame for longer has gone stale; ``log check`` calls it a silence."""
+
+_REASONS = 8
+
+
+def statuses(snapshot: RecorderSnapshot) -> tuple[DiagnosticStatus, ...]:
+    """The statuses of one moment.
+
+    Args:
+        snapshot: The recording.
+
+    Returns:
+        The recorder, the session, each source, each group of topics.
+    """
+    groups: dict[str, list[TopicSnapshot]] = {}
+    for topic in snapshot.topics:
+        if has_rhythm(topic.topic):
+            groups.setdefault(group_of(topic.topic), []).append(topic)
+    return (
+        _recorder(snapshot),
+        _session(snapshot),
+        *(_source(source) for source in snapshot.sources),
+        *(_group(name, topics) for name, topics in sorted(groups.items())),
+    )
+
+
+def group_of(topic: str) -> str:
+    """Topics that are shown as one: all of the joints, all infrared sensors, each bus.
+
+    Args:
+        topic: E.g. ``/joint_states`` or ``/ir/07``.
+
+    Returns:
+        E.g. ``joints`` or ``ir``.
+    """
+    if topic.startswith("/joint_"):
+        return "joints"
+    if topic.startswith(FRAME_TOPIC_PREFIXES):
+        return topic.removeprefix("/")
+    return topic.removeprefix("/").split("/")[0]
+
+
+def _recorder(snapshot: RecorderSnapshot) -> DiagnosticStatus:
+    level, message = OK, snapshot.state
+    left_s = snapshot.time_left_s
+    if snapshot.tick_p99_s is not None and snapshot.tick_p99_s > SLOW_TICK_S:
+        level, message = WARN, "the computer can't keep up with the recorder's ticks"
+    if left_s is not None and left_s < LOW_TIME_S:
+        level = ERROR if left_s < NO_TIME_S else WARN
+        message = f"the disk is full in {left_s:.0f} s"
+    if snapshot.trouble is not None:
+        level, message = ERROR, snapshot.trouble
+    values = {
+        ELAPSED: f"{snapshot.elapsed_s:.3f}",
+        "state": snapshot.state,
+        "messages": str(snapshot.messages),
+        "size_bytes": str(snapshot.size),
+        "free_bytes": _number(snapshot.free),
+        "part": _number(snapshot.part),
+        "tick_p99_s": _number(snapshot.tick_p99_s),
+        "tick_max_s": _number(snapshot.tick_max_s),
+        "backlog_frames": str(snapshot.backlog),
+        "unsynced_messages": str(snapshot.unsynced),
+    }
+    return _status(level, RECORDER, message, "", values)
+
+
+def _session(snapshot: RecorderSnapshot) -> DiagnosticStatus:
+    message = snapshot.verdict
+    if snapshot.reasons:
+        message = f"{snapshot.verdict}: {snapshot.reasons[0]}"
+    values = {"verdict": snapshot.verdict, "reasons": str(len(snapshot.reasons))}
+    values |= {f"reason.{k + 1}": text for k, text in enumerate(snapshot.reasons[:_REASONS])}
+    level = (OK, WARN, ERROR)[VERDICTS.index(snapshot.verdict)]
+    return _status(level, "session", message, "", values)
+
+
+def _source(source: SourceSnapshot) -> DiagnosticStatus:
+    level, message = source_state(source)
+    values = {
+        "frames": _number(source.frames),
+        "rate_hz": _number(source.rate_hz),
+        "dropped": _number(source.dropped),
+        "malformed": str(source.malformed),
+        "error_frames": str(source.error_frames),
+        "reconnects": str(source.reconnects),
+        "load": _number(source.load[1] if source.load is not None else None),
+    }
+    if source.clock is not None:
+        values |= {f"clock_{key}": value for key, value in source.clock.facts().items()}
+    return _status(level, SOURCE_PREFIX + source.name, message, source.address, values)
+
+
+def source_state(source: SourceSnapshot) -> tuple[int, str]:
+    """What a source's state is called.
+
+    Args:
+        source: The source.
+
+    Returns:
+        Level of :mod:`.capture.log.messages.diagnostics` and a few words.
+    """
+    if source.finished:
+        return OK, "ended"
+    if not source.connected:
+        return ERROR, "not connected"
+    if source.age_s is not None and source.age_s > SILENT_S:
+        return STALE, f"silent for {source.age_s:.0f} s"
+    if source.dropped:
+        return WARN, f"connected, lost {source.dropped}"
+    return OK, "connected"
+
+
+def _group(name: str, topics: Sequence[TopicSnapshot]) -> DiagnosticStatus:
+    missing = sum(topic.missing or 0 for topic in topics)
+    dropped = sum(topic.dropped or 0 for topic in topics)
+    count = sum(topic.count for topic in topics)
+    jitters = [topic.jitter for topic in topics if topic.jitter is not None]
+    at_limit = sorted({joint for topic in topics for joint in topic.at_limit})
+    frozen = sorted({joint for topic in topics for joint in topic.frozen})
+    said = {
+        f"{missing} samples missing": missing > GOOD_LOSS * (count + missing),
+        f"{dropped} messages dropped": dropped > 0,
+        f"frozen: {', '.join(frozen)}": bool(frozen),
+        f"at their limits: {', '.join(at_limit)}": bool(at_limit),
+    }
+    wrong = [text for text, holds in said.items() if holds]
+    values = {
+        "topics": str(len(topics)),
+        "messages": str(count),
+        "rate_hz": _number(math.fsum(topic.rate_hz or 0.0 for topic in topics)),
+        "oldest_s": _number(max(topic.age_s for topic in topics)),
+        "gaps": str(sum(topic.gaps or 0 for topic in topics)),
+        "missing": str(missing),
+        "dropped": str(dropped),
+        "jitter": _number(max(jitters, default=None)),
+        "nan": str(sum(topic.nan for topic in topics)),
+    }
+    return _status(WARN if wrong else OK, f"topics {name}", "; ".join(wrong) or "ok", "", values)
+
+
+def _status(
+    level: int, name: str, message: str, hardware: str, values: dict[str, str]
+) -> DiagnosticStatus:
+    known = {key: value for key, value in values.items() if value}
+    return DiagnosticStatus(level, name, message, hardware, known)
+
+
+def _number(value: float | None) -> str:
+    """A number as text, empty where it isn't known."""
+    if value is None:
+        return ""
+    return str(value) if isinstance(value, int) else f"{value:.6g}"

@@ -1,0 +1,218 @@
+"""Where a recording is kept: a session on disk, in parts if wanted, or a ring in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from ..common.errors import LogWriteError
+from ..log.file.part_names import part_path
+from ..log.sinks.durable_sink import DurableSink
+from ..log.sinks.sink import MessageSink
+from .ring_storage import RingStorage
+from .settings import RecordSettings
+
+_NS = 1_000_000_000
+
+
+class Storage(Protocol):
+    """What the recording asks of the place it is kept in."""
+
+    @property
+    def sink(self) -> MessageSink:
+        """Where the records go."""
+        ...
+
+    @property
+    def path(self) -> Path:
+        """The file that is being written, or would be."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        ...
+
+    @property
+    def messages(self) -> int:
+        """Messages accepted."""
+        ...
+
+    @property
+    def part(self) -> int | None:
+        """Number of the part that is being written; None where there are none."""
+        ...
+
+    @property
+    def unsynced(self) -> int:
+        """Messages that power loss would cost."""
+        ...
+
+    @property
+    def shortage(self) -> LogWriteError | None:
+        """Why recording must end soon, or has ended."""
+        ...
+
+    def tick(self) -> None:
+        """Do what is due; called once a second.
+
+        Raises:
+            LogWriteError: If it can't be done.
+        """
+        ...
+
+    def take_events(self) -> tuple[tuple[str, str], ...]:
+        """What there is to say since the last call.
+
+        Returns:
+            Level (``info``, ``warn``, ``error``) and one sentence each.
+        """
+        ...
+
+    def mark(self, text: str = "") -> Mapping[str, Any]:
+        """Mark this moment.
+
+        Args:
+            text: Why.
+
+        Returns:
+            What there is to say of it.
+
+        Raises:
+            LogWriteError: If a file can't be created.
+        """
+        ...
+
+    def split(self) -> Mapping[str, Any]:
+        """Begin a new part.
+
+        Returns:
+            What there is to say of it.
+
+        Raises:
+            UsageError: If there are no parts.
+            LogWriteError: If the file can't be created.
+        """
+        ...
+
+    def files(self) -> tuple[Path, ...]:
+        """The files written, in order."""
+        ...
+
+
+class DiskStorage:
+    """A session on disk, its write-ahead log beside it."""
+
+    def __init__(self, settings: RecordSettings) -> None:
+        """Create the first file.
+
+        Args:
+            settings: Output and parts.
+
+        Raises:
+            OutputExistsError: If it is there and ``force`` is not given.
+            LogWriteError: If it can't be created.
+        """
+        split_s = settings.split_time_s
+        self.sink = DurableSink(
+            settings.output,
+            force=settings.force,
+            split_size=settings.split_size,
+            split_ns=None if split_s is None else round(split_s * _NS),
+        )
+        self._told = ""
+
+    @property
+    def path(self) -> Path:
+        """The part that is being written."""
+        return self.sink.part_path
+
+    @property
+    def size(self) -> int:
+        """Bytes of MCAP so far."""
+        return self.sink.bytes_written
+
+    @property
+    def messages(self) -> int:
+        """Messages accepted."""
+        return self.sink.messages
+
+    @property
+    def part(self) -> int | None:
+        """Number of the part that is being written."""
+        return self.sink.part
+
+    @property
+    def unsynced(self) -> int:
+        """Messages that power loss would cost."""
+        return self.sink.unsynced
+
+    @property
+    def shortage(self) -> LogWriteError | None:
+        """Why recording must end soon, or has ended."""
+        return self.sink.shortage
+
+    def tick(self) -> None:
+        """Flush what has waited for long.
+
+        Raises:
+            LogWriteError: If a part that is due can't be begun.
+        """
+        self.sink.tick()
+
+    def take_events(self) -> tuple[tuple[str, str], ...]:
+        """Parts that could not be begun, once each.
+
+        Returns:
+            Level and one sentence each.
+        """
+        trouble = self.sink.split_trouble
+        if trouble is None or str(trouble) == self._told:
+            return ()
+        self._told = str(trouble)
+        return (("error", f"the next part could not be begun, this one goes on: {trouble}"),)
+
+    def mark(self, text: str = "") -> Mapping[str, Any]:
+        """Nothing to do: everything is written, the mark with it.
+
+        Args:
+            text: Why.
+        """
+        del text
+        return {}
+
+    def split(self) -> Mapping[str, Any]:
+        """Begin the next part.
+
+        Returns:
+            Its number and file.
+
+        Raises:
+            LogWriteError: If it can't be created; the recording goes on in the one before.
+        """
+        path = self.sink.split()
+        return {"part": self.sink.part, "file": str(path)}
+
+    def files(self) -> tuple[Path, ...]:
+        """The parts, in order."""
+        first = self.sink.path
+        return (first, *(part_path(first, k) for k in range(2, self.sink.part + 1)))
+
+
+def open_storage(settings: RecordSettings) -> Storage:
+    """Create what the settings ask for.
+
+    Args:
+        settings: The settings.
+
+    Returns:
+        The storage.
+
+    Raises:
+        OutputExistsError: If the output is there and ``force`` is not given.
+        LogWriteError: If it can't be created.
+    """
+    if settings.ring_s is not None:
+        return RingStorage(settings.output, settings.ring_s)
+    return DiskStorage(settings)

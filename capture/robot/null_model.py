@@ -1,0 +1,264 @@
+"""Null model files: how identical modules would answer one gait, as a function of few parameters.
+
+Whoever has a model of the robot (the twin, or anything else) writes one; who analyses needs no
+model then. With x = ln(theta / theta_0) of the parameters that all modules share, and y the vector
+of ln(response / command), log gain minus j lag, of the m driven joints::
+
+    y(x) = y_0 + sum_k x_k slope_k + 1/2 sum_kl x_k x_l curvature_kl
+
+and a module j that deviates by z = ln(value / shared value) in one of its own parameters adds
+``z modules[kind][j]``. The file is JSON; complex arrays are pairs of ``log_gain`` and ``lag_rad``
+(positive when late).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from ..common.arrays import ComplexArray, FloatArray, frozen
+from ..common.errors import Fault, NullModelError
+from ..common.input_file import read_input
+from ..common.part_file import write_text
+from ..common.strict_table import Faults, Table
+
+FORMAT = "undulog null model 1"
+
+
+@dataclass(frozen=True)
+class SharedParameter:
+    """One entry of theta.
+
+    Attributes:
+        name: For example ``stall_torque``.
+        unit: SI.
+        value: theta_0, positive.
+        reach: The model holds for abs(x) up to this.
+    """
+
+    name: str
+    unit: str
+    value: float
+    reach: float
+
+
+@dataclass(frozen=True)
+class NullModel:
+    """A null model of m driven joints and K shared parameters; arrays are read-only.
+
+    Attributes:
+        robot: Name of the robot.
+        frequency_hz: Of the gait.
+        joints: Driven joints, head to tail.
+        command: Complex amplitudes of their commands, up to a common phase [rad], shape (m,).
+        parameters: theta.
+        covariance: Of x, what is known of theta beforehand, shape (K, K).
+        response: y_0, shape (m,).
+        slope: dy/dx, shape (K, m).
+        curvature: d2y/dx2, shape (K, K, m).
+        modules: Kind to dy/dz, row = module that deviates, column = joint that answers, (m, m).
+        error: Largest difference in y between this model and what it stands for, at parameters
+            within its reach that it was not made from.
+        made_by: What it was made from and with, in a sentence.
+    """
+
+    robot: str
+    frequency_hz: float
+    joints: tuple[str, ...]
+    command: ComplexArray
+    parameters: tuple[SharedParameter, ...]
+    covariance: FloatArray
+    response: ComplexArray
+    slope: ComplexArray
+    curvature: ComplexArray
+    modules: Mapping[str, ComplexArray]
+    error: float
+    made_by: str
+
+    @property
+    def reach(self) -> FloatArray:
+        """Largest abs(x) for which the model holds, shape (K,)."""
+        return np.array([one.reach for one in self.parameters])
+
+    def error_at(self, x: FloatArray) -> float:
+        """How far off the model is, in proportion to how far it is from where it was made.
+
+        What it leaves out is of third order only where the robot is smooth; friction is not.
+
+        Args:
+            x: ln(theta / theta_0), shape (K,).
+
+        Returns:
+            In y; ``error`` where a parameter is at the end of its reach, or beyond.
+        """
+        return self.error * min(float(np.max(np.abs(x) / self.reach, initial=0.0)), 1.0)
+
+    def at(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """The response of identical modules.
+
+        Args:
+            x: ln(theta / theta_0), shape (K,).
+
+        Returns:
+            y, shape (m,), and dy/dx, shape (K, m).
+        """
+        bend = np.einsum("klm,l->km", self.curvature, x)
+        return self.response + x @ (self.slope + bend / 2), self.slope + bend
+
+
+def write_null_model(path: Path, model: NullModel) -> None:
+    """Write a null model.
+
+    Args:
+        path: The file, replaced if it is there.
+        model: The model.
+
+    Raises:
+        LogWriteError: If it can't be written.
+    """
+    values = {
+        "format": FORMAT,
+        "robot": model.robot,
+        "gait": {
+            "frequency_hz": model.frequency_hz,
+            "joints": list(model.joints),
+            "amplitude_rad": np.abs(model.command).tolist(),
+            "phase_rad": np.angle(model.command).tolist(),
+        },
+        "parameters": [vars(one) for one in model.parameters],
+        "covariance": model.covariance.tolist(),
+        "response": _pair(model.response),
+        "slope": _pair(model.slope),
+        "curvature": _pair(model.curvature),
+        "modules": [{"kind": kind, **_pair(one)} for kind, one in model.modules.items()],
+        "error": model.error,
+        "made_by": model.made_by,
+    }
+    write_text(path, json.dumps(values, indent=1, allow_nan=False) + "\n")
+
+
+def read_null_model(path: Path) -> NullModel:
+    """Read a null model, strictly.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The model.
+
+    Raises:
+        InputFileError: If the file isn't there or can't be read.
+        NullModelError: If it has faults; lists all of them.
+    """
+    try:
+        values: Any = json.loads(read_input(path).decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise NullModelError(path, [Fault("syntax", str(error), "JSON in UTF-8")]) from error
+    if not isinstance(values, dict) or cast("dict[str, Any]", values).get("format") != FORMAT:
+        found = "no such format"
+        raise NullModelError(path, [Fault("format", found, f'"{FORMAT}"')])
+    faults = Faults()
+    top = Table(cast("dict[str, Any]", values), "", faults)
+    top.text("format")
+    gait = top.table("gait")
+    joints = gait.words("joints")
+    if not joints:
+        gait.fault("joints", "names of the driven joints, head to tail")
+    m = len(joints)
+    amplitude = _array(gait, "amplitude_rad", (m,))
+    phase = _array(gait, "phase_rad", (m,))
+    parameters = tuple(_parameter(*one, faults) for one in top.tables("parameters"))
+    k = len(parameters)
+    model = NullModel(
+        robot=top.text("robot"),
+        frequency_hz=gait.number("frequency_hz", above=0.0),
+        joints=joints,
+        command=frozen(np.asarray(amplitude * np.exp(1j * phase), dtype=np.complex128)),
+        parameters=parameters,
+        covariance=frozen(_covariance(top, k)),
+        response=_complex(top, "response", (m,)),
+        slope=_complex(top, "slope", (k, m)),
+        curvature=_complex(top, "curvature", (k, k, m)),
+        modules=dict(_module(*one, m, faults) for one in top.tables("modules")),
+        error=top.number("error", at_least=0.0),
+        made_by=top.text("made_by"),
+    )
+    if not model.modules:
+        top.fault("modules", "at least one kind of deviation, e.g. stall_torque")
+    gait.close()
+    top.close()
+    if found := faults.all():
+        raise NullModelError(path, found)
+    return model
+
+
+def _parameter(values: dict[str, Any], where: str, faults: Faults) -> SharedParameter:
+    table = Table(values, where, faults)
+    one = SharedParameter(
+        name=table.name("name"),
+        unit=table.text("unit"),
+        value=table.number("value", above=0.0),
+        reach=table.number("reach", above=0.0),
+    )
+    table.close()
+    return one
+
+
+def _module(values: dict[str, Any], where: str, m: int, faults: Faults) -> tuple[str, ComplexArray]:
+    table = Table(values, where, faults)
+    kind, effect = table.name("kind"), _parts(table, (m, m))
+    table.close()
+    return kind, effect
+
+
+def _covariance(top: Table, k: int) -> FloatArray:
+    covariance = _array(top, "covariance", (k, k))
+    if np.isfinite(covariance).all():
+        symmetric = np.allclose(covariance, covariance.T, rtol=1e-9)
+        if not symmetric or np.linalg.eigvalsh(covariance).min(initial=1.0) <= 0:
+            top.fault("covariance", "a symmetric, positive definite matrix", "another matrix")
+    return covariance
+
+
+def _complex(table: Table, key: str, shape: tuple[int, ...]) -> ComplexArray:
+    pair = table.table(key)
+    y = _parts(pair, shape)
+    pair.close()
+    return y
+
+
+def _parts(table: Table, shape: tuple[int, ...]) -> ComplexArray:
+    log_gain, lag_rad = (_array(table, name, shape) for name in ("log_gain", "lag_rad"))
+    return frozen(log_gain - 1j * lag_rad)
+
+
+def _pair(y: ComplexArray) -> dict[str, Any]:
+    return {"log_gain": y.real.tolist(), "lag_rad": (-y.imag).tolist()}
+
+
+def _array(table: Table, key: str, shape: tuple[int, ...]) -> FloatArray:
+    """Nested arrays of finite numbers; NaN after a fault."""
+    value = table.look(key)[1]
+    flat: list[float] = []
+    if not _fits(value, shape, flat):
+        size = " x ".join(map(str, shape))
+        table.fault(key, f"{size} finite numbers", None if value is None else "something else")
+        return np.full(shape, math.nan)
+    return np.array(flat, dtype=np.float64).reshape(shape)
+
+
+def _fits(value: object, shape: tuple[int, ...], flat: list[float]) -> bool:
+    """Whether a value is nested arrays of this shape; its numbers are appended."""
+    if not shape:
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        flat.append(float(cast("float", value)) if good else math.nan)
+        return math.isfinite(flat[-1])
+    if not isinstance(value, list) or len(cast("list[object]", value)) != shape[0]:
+        return False
+    return all(_fits(one, shape[1:], flat) for one in cast("list[object]", value))

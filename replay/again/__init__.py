@@ -1,1 +1,0 @@
-"""Run a recorded experiment again in the twin, and say what differs."""

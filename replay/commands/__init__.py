@@ -1,0 +1,1 @@
+"""The commands that view and replay sessions and fit the twin."""

@@ -1,0 +1,141 @@
+"""The verb ``view`` with ``--clip``."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.errors import MissingExtraError, UsageError
+from undulog.capture.common.interruption import interruptible
+
+if TYPE_CHECKING:
+    from ..film.film import Shot
+    from ..record.rrd import Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipOptions:
+    """What the command line says of a clip; None is what it doesn't say.
+
+    Attributes:
+        start: With `--clip`: where it begins, in seconds of the session.
+        end: With `--clip`: where it ends.
+        fps: With `--clip`: frames a second; 25 where nothing is said.
+        speed: With `--clip`: seconds of the session in a second of the clip, e.g. 0.25.
+        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 where nothing is said.
+    """
+
+    start: Annotated[float | None, Parameter(name="--from")] = None
+    end: Annotated[float | None, Parameter(name="--to")] = None
+    fps: Annotated[int | None, Parameter(name="--fps")] = None
+    speed: Annotated[float | None, Parameter(name="--speed")] = None
+    size: Annotated[str | None, Parameter(name="--size")] = None
+
+    @property
+    def given(self) -> list[str]:
+        """Names of the options that were given."""
+        named = {"from": self.start, "to": self.end, "fps": self.fps, "speed": self.speed}
+        return [
+            f"--{name}"
+            for name, value in (named | {"size": self.size}).items()
+            if value is not None
+        ]
+
+
+def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json: bool) -> None:
+    """Write a moving picture of a session's body.
+
+    Args:
+        file: The session.
+        clip: The clip, ``.gif`` or ``.mp4``.
+        options: How it is filmed.
+        force: Replace the clip if it is there.
+        json: Print the report as one JSON object.
+
+    Raises:
+        UsageError: If the options are wrong.
+        UndulogError: If the work fails.
+    """
+    try:
+        from ..film.files import check_film
+        from ..film.film import film, scene_only
+    except ModuleNotFoundError as error:
+        raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
+    from undulog.capture import Session
+
+    from ..draw.scene.body import body_title
+    from ..record.rrd import write_recording
+
+    refuse_existing(clip, force=force)
+    with (
+        interruptible() as stop,
+        tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
+        Session.open(file) as session,
+    ):
+        shot = _shot(options, session.duration_s, file)
+        check_film(clip.suffix.lower(), shot.size, shot.fps)
+        with progress(f"clip of {file.name}", total=len(shot.times_s)) as bar:
+            bar.update(0, note="recording")
+            recording = write_recording(session, Path(folder) / "clip.rrd", layout=scene_only)
+            frames = film(
+                recording.path,
+                shot,
+                clip,
+                legend=body_title(recording.content),
+                on_frame=bar.update,
+                stop=stop,
+            )
+    _report(clip, shot, frames, recording, json=json)
+
+
+def _shot(options: ClipOptions, duration_s: float, file: Path) -> Shot:
+    from ..film.film import Shot
+
+    end_s = duration_s if options.end is None else options.end
+    if end_s > duration_s:
+        raise UsageError(f"--to {end_s:g}: {file.name} ends at {duration_s:.3f} s")
+    shot = Shot(options.start or 0.0, end_s)
+    if options.fps is not None:
+        shot = replace(shot, fps=options.fps)
+    if options.speed is not None:
+        shot = replace(shot, speed=options.speed)
+    if options.size is not None:
+        shot = replace(shot, size=_size(options.size))
+    return shot
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if match is None:
+        raise UsageError(f"--size {text}: expected WIDTHxHEIGHT in pixels, e.g. 960x540")
+    return int(match[1]), int(match[2])
+
+
+def _report(clip: Path, shot: Shot, frames: int, recording: Recording, *, json: bool) -> None:
+    facts: dict[str, Any] = {
+        "path": str(clip),
+        "bytes": clip.stat().st_size,
+        "frames": frames,
+        "fps": shot.fps,
+        "duration_s": frames / shot.fps,
+        "from_s": shot.start_s,
+        "to_s": shot.end_s,
+        "speed": shot.speed,
+        "size": list(shot.size),
+        "warnings": list(recording.warnings),
+    }
+    if json:
+        emit_json(facts)
+        return
+    say(
+        f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {shot.size[0]}x{shot.size[1]}, "
+        f"{facts['bytes'] / 1e6:.2f} MB"
+    )
+    for warning in recording.warnings:
+        say(f"note: {warning}")

@@ -1,0 +1,119 @@
+"""The verb ``view`` with two or more sessions."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from undulog.capture.common.console import emit_json, progress, say
+from undulog.capture.common.interruption import interruptible
+
+from ..overlay import words
+from ..overlay.alignment import Align
+from ..overlay.side import names_of
+from ..overlay.together import bring_together, steps
+from ..overlay.write import Beside, Place
+from ..viewer import viewer
+from .view_overlay_options import BesideOptions
+
+
+def view_beside(
+    files: Sequence[Path],
+    options: BesideOptions,
+    *,
+    save: Path | None,
+    web: bool,
+    json: bool,
+) -> None:
+    """See sessions side by side.
+
+    Args:
+        files: Two or more sessions.
+        options: How they are aligned, placed and called.
+        save: Write the recording there instead of opening the viewer.
+        web: Serve it to a browser on this machine.
+        json: Print one JSON object.
+
+    Raises:
+        UsageError: If the names don't fit, or a session has no gait to be aligned by.
+    """
+    names = names_of(files, None if options.names is None else options.names.split(","))
+    how, place = Align(options.align or Align.TIME), Place(options.place or Place.START)
+    if save is None and not web:
+        viewer.require_display()
+    with ExitStack() as stack:
+        path = save or _in_passing(stack)
+        with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
+            beside = bring_together(
+                files,
+                path,
+                names=names,
+                how=how,
+                place=place,
+                on_step=bar.update,
+                stop=stop,
+            )
+        _report(beside, how, place, saved=save is not None, json=json)
+        if web:
+            viewer.serve(path, say)
+        elif save is None:
+            viewer.show(path)
+
+
+def _in_passing(stack: ExitStack) -> Path:
+    """Where a recording goes that is only looked at."""
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
+    return Path(folder) / "beside.rrd"
+
+
+def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool) -> None:
+    size = beside.path.stat().st_size
+    if json:
+        emit_json(_facts(beside, how, place, size))
+        return
+    first, *others = [one.side for one in beside.shown]
+    for other in others:
+        say(f"{words.answer(first, other, beside.found[other.name])}.")
+    if saved:
+        say(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
+    for warning in beside.warnings:
+        say(f"note: {warning}")
+
+
+def _facts(beside: Beside, how: Align, place: Place, size: int) -> dict[str, Any]:
+    return {
+        "path": str(beside.path),
+        "bytes": size,
+        "recording_id": beside.recording_id,
+        "align": str(how),
+        "place": str(place),
+        "sessions": [_session(beside, k) for k in range(len(beside.shown))],
+        "warnings": list(beside.warnings),
+    }
+
+
+def _session(beside: Beside, place: int) -> dict[str, Any]:
+    one, first = beside.shown[place], beside.shown[0].side
+    side = one.side
+    facts: dict[str, Any] = {
+        "name": side.name,
+        "path": str(side.path),
+        "session_id": side.session_id,
+        "duration_s": (side.end_ns - side.start_ns) * 1e-9,
+        "body": one.body,
+    }
+    if not place:
+        return facts
+    found, placed = beside.found[side.name], beside.placements.get(side.name)
+    return facts | {
+        "answer": words.answer(first, side, found),
+        "verdict": None if found.comparison is None else found.comparison.verdict,
+        "changed": [{"name": c.name, "a": c.a, "b": c.b} for c in found.changed],
+        "joints_compared": [name for series in one.differences for name in series.names],
+        "placed": None
+        if placed is None
+        else {"turn_rad": placed.turn, "x_m": placed.x, "y_m": placed.y},
+    }

@@ -1,0 +1,38 @@
+"""What the command line says of one session: which numbers, which tab, which topics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from ..content.content import Tab
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SingleOptions:
+    """How one session is shown; None where nothing is said.
+
+    Attributes:
+        result: With one session: show what was found before instead of analysing now, `.json` of
+            `undulog analyse`. Results of an experiment or a comparison that it is part of mark the
+            modules they name. May be given several times.
+        tab: With one session: the tab in front, `session` where nothing is said; the mean cycle's
+            plays at once.
+        command_topic: With one session: JointState topic of the commands, in a bag of another make.
+        response_topic: With one session: JointState topic of the responses.
+    """
+
+    result: Annotated[list[Path] | None, Parameter(negative=())] = None
+    tab: Tab | None = None
+    command_topic: str | None = None
+    response_topic: str | None = None
+
+    @property
+    def given(self) -> list[str]:
+        """Options that were given, as they are typed."""
+        said = [one.name for one in fields(self) if getattr(self, one.name) is not None]
+        return [f"--{name.replace('_', '-')}" for name in said]

@@ -1,0 +1,1 @@
+"""What a recording for Rerun contains, by name."""

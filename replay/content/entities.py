@@ -1,0 +1,200 @@
+"""The mean cycle as entities of its own on a timeline of its own.
+
+``ensemble_cycle`` runs from 0 to 360 degrees of the gait's phase, one number a degree, and the
+viewer loops it at the gait's own speed. Nothing of it is on the session's timelines but the body's
+first shape, so that its view isn't black there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from undulog.analysis.results.formats import decimals_for_values, number
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.palette import COMMANDED_RGB
+from undulog.capture.robot.model import Plane
+
+COMMANDED = "/joints/commanded"
+MEASURED = "/joints/measured"
+ERROR = "/joints/error"
+SCALARS = "Scalars:scalars"
+
+Color = tuple[int, int, int, int]
+
+GREY: Color = (*COMMANDED_RGB, 255)
+"""The grey of everything commanded."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """An entity with one plotted line a joint.
+
+    Attributes:
+        entity: Its path.
+        names: The lines' names.
+        component: The component that is plotted.
+    """
+
+    entity: str
+    names: tuple[str, ...]
+    component: str = SCALARS
+
+
+@dataclass(frozen=True)
+class Places:
+    """The joints that stand for head, middle and tail.
+
+    Attributes:
+        names: One to three joint names, head to tail.
+        plane: The plane they bend, or None where no robot says.
+    """
+
+    names: tuple[str, ...]
+    plane: Plane | None
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """``head``, ``middle`` and ``tail``, or the joints' names where there are fewer."""
+        return ("head", "middle", "tail") if len(self.names) == 3 else self.names
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a table of cycles holds.
+
+    Attributes:
+        key: Last part of its entity's path, with the unit.
+        name: Its name.
+        unit: The unit in which it is shown.
+    """
+
+    key: str
+    name: str
+    unit: str
+
+
+GAIN = Quantity("gain_minus_one_percent", "Gain − 1", "%")
+LAG = Quantity("lag_degrees", "Lag", "°")
+ENERGY = Quantity("energy_net_joule", "Net energy", "J/cycle")
+
+
+@dataclass(frozen=True)
+class CycleTable:
+    """One quantity of m joints that share their c cycles.
+
+    Attributes:
+        quantity: What it is.
+        names: The joints, head to tail.
+        start_s: Start of each cycle, from the session's start [s], shape (c,).
+        stop_s: Its end [s], shape (c,).
+        value: In the quantity's unit, NaN where the cycle tells nothing, shape (m, c).
+    """
+
+    quantity: Quantity
+    names: tuple[str, ...]
+    start_s: FloatArray
+    stop_s: FloatArray
+    value: FloatArray
+
+
+NAMED = (255, 95, 190, 255)
+"""Pink of a module that a test names: on none of the maps."""
+
+
+MAPS = "/maps"
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """One map.
+
+    Attributes:
+        table: What it shows.
+        places: Number of each joint along the body, the head's joint is 1.
+        low: Value at the low end of the colours.
+        high: Value at the high end.
+        signed: Whether zero is in the middle of the colours.
+    """
+
+    table: CycleTable
+    places: tuple[int, ...]
+    low: float
+    high: float
+    signed: bool
+
+    @property
+    def entity(self) -> str:
+        """Path of its entities."""
+        return f"{MAPS}/{self.table.quantity.key}"
+
+    @property
+    def title(self) -> str:
+        """Name with the range of the colours and the unit."""
+        quantity = self.table.quantity
+        unit = quantity.unit if quantity.unit == "°" else f" {quantity.unit}"
+        low, high = self.ends
+        span = f"±{high}{unit}" if self.signed else f"{low} to {high}{unit}"
+        return f"{quantity.name} map, {span}"
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """The range of the colours in words."""
+        digits = decimals_for_values([self.low, self.high], 3)
+        return number(self.low, digits), number(self.high, digits)
+
+
+MECHANICAL = "/power/mechanical"
+TOTAL = "/power/total"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One joint's bar.
+
+    Attributes:
+        joint: The joint's name.
+        place: Its number along the body, the head's joint is 1.
+        value: Height.
+        far: The end of its 95 % interval that is farther from the baseline, or None.
+    """
+
+    joint: str
+    place: int
+    value: float
+    far: float | None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One bar chart.
+
+    Attributes:
+        key: Last part of its entity's path.
+        title: What it shows, with unit.
+        bars: A bar for each joint whose value could be computed.
+    """
+
+    key: str
+    title: str
+    bars: tuple[Bar, ...]
+
+
+@dataclass(frozen=True)
+class MeanCycle:
+    """The mean cycle that was written.
+
+    Attributes:
+        period_s: Length of a cycle [s].
+        has_body: Whether the body was drawn.
+        has_places: Whether the joints that stand for the body were.
+        measured: Mean angles [degrees].
+        error: Mean measured minus mean commanded angle [degrees].
+        power: Mean mechanical power [W].
+    """
+
+    period_s: float
+    has_body: bool
+    has_places: bool
+    measured: tuple[Series, ...]
+    error: tuple[Series, ...]
+    power: tuple[Series, ...]

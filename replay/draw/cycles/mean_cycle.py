@@ -1,0 +1,318 @@
+"""The mean cycle as entities of its own on a timeline of its own.
+
+``ensemble_cycle`` runs from 0 to 360 degrees of the gait's phase, one number a degree, and the
+viewer loops it at the gait's own speed. Nothing of it is on the session's timelines but the body's
+first shape, so that its view isn't black there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.components import FillMode
+
+from undulog.analysis.results.analysis import Analysis
+from undulog.capture import Session
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.palette import joint_colors
+from undulog.capture.robot.model import Robot
+
+from ...content.entities import GREY, Color, MeanCycle, Places, Series
+from ...samples.quantities import mechanical_power, segment_power
+from ...samples.timeline import ENSEMBLE_CYCLE, Clock
+from ...samples.tracks import Track, read_columns
+from ..scene.body import capsule_columns, capsule_poses
+from ..scene.colors import power_colors
+from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
+
+ENSEMBLE = "/ensemble"
+BODY = f"{ENSEMBLE}/body"
+PLACES = f"{ENSEMBLE}/places"
+ABOUT = f"{ENSEMBLE}/about"
+
+MOST_S = 600.0
+"""The mean cycle is taken of so much at most [s], so that an hour needs no more memory."""
+
+_TOPICS = ("/joint_states", "/joint_commands")
+
+_WHITE = (255, 255, 255, 255)
+_FAINT = 110
+"""Opacity of the lines at the ends of an interval."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """What is averaged.
+
+    Attributes:
+        measured: Measured angles [rad].
+        commanded: Commanded angles [rad].
+        mechanical: Mechanical power of the joints [W].
+    """
+
+    measured: Sequence[Track]
+    commanded: Sequence[Track]
+    mechanical: Sequence[Track]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the session is drawn, and so its mean cycle.
+
+    Attributes:
+        robot: The robot, or None.
+        places: The joints that stand for the body, or None.
+        palette: Colour by joint name.
+        limit_w: Power at which a segment's colour is full [W], or None.
+    """
+
+    robot: Robot | None
+    places: Places | None
+    palette: Mapping[str, Color]
+    limit_w: float | None
+
+
+def averaged_ns(clock: Clock, analysis: Analysis | None) -> tuple[int, int]:
+    """Which part of a session is averaged at most.
+
+    Args:
+        clock: The session's timelines.
+        analysis: The session's analysis, or None.
+
+    Returns:
+        Start and end [Unix ns].
+    """
+    windows = () if analysis is None else analysis.gait.windows
+    start_ns = clock.start_ns + round(windows[0].start_s * 1e9) if windows else clock.start_ns
+    return start_ns, start_ns + round(MOST_S * 1e9)
+
+
+def read_channels(
+    session: Session, wanted: Mapping[str, Sequence[str]], part_ns: tuple[int, int]
+) -> Channels:
+    """Read what is averaged.
+
+    Args:
+        session: The session.
+        wanted: JointState topic to the fields that come.
+        part_ns: Start and end of the part that is averaged [Unix ns].
+
+    Returns:
+        The channels; none of a kind that the session doesn't have.
+    """
+    start_ns, stop_ns = part_ns
+    drawn = {topic: fields for topic, fields in wanted.items() if topic in _TOPICS}
+    columns = read_columns(session, drawn, start_ns=start_ns, stop_ns=stop_ns)
+    channels = Channels(
+        columns.get(("/joint_states", "position"), ()),
+        columns.get(("/joint_commands", "position"), ()),
+        mechanical_power(columns),
+    )
+    session.forget()
+    return channels
+
+
+def log_mean_cycle(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    channels: Channels,
+    look: Look,
+    *,
+    analysis: Analysis | None,
+    warnings: list[str],
+) -> MeanCycle | None:
+    """Average the cycles and write what comes out.
+
+    Args:
+        rec: The recording.
+        clock: The session's timelines; their rhythm is the phase, where one was logged.
+        channels: What is averaged.
+        look: How it is drawn.
+        analysis: The session's analysis, for its window and what is wrong with samples, or None.
+        warnings: Grows by a sentence where joints are left out.
+
+    Returns:
+        What was written; None where there is no phase, or no measured joint has a whole cycle.
+    """
+    pace = pace_of(
+        clock.rhythm,
+        analysis,
+        commanded=channels.commanded,
+        places=look.places,
+        start_ns=clock.start_ns,
+    )
+    if pace is None:
+        return None
+    pace = pace.shortened(pace.start_s + MOST_S, clock.start_ns)
+    false = falsified(analysis, pace.start_s, pace.stop_s)
+    if false:
+        warnings.append(
+            f"the mean cycle leaves out {', '.join(false)}: a sensor falsifies the angles"
+        )
+    moved = mean_cycles([one for one in channels.measured if one.name not in false], pace)
+    if moved is None:
+        return None
+    asked = mean_cycles(channels.commanded, pace)
+    power = mean_cycles(channels.mechanical, pace)
+    steady = analysis is None or analysis.gait.frequency_hz.value is not None
+    about = _about(pace, moved, steady=steady)
+    rec.log(ABOUT, rr.TextDocument(about, media_type="text/markdown"), static=True)
+    error: tuple[Series, ...] = ()
+    if asked is not None:
+        both = tuple(name for name in moved.names if name in asked.names)
+        difference = np.degrees(moved.ordered(both) - asked.ordered(both))
+        error = _log_joints(rec, f"{ENSEMBLE}/error", both, difference, look.palette)
+    angles = np.degrees(moved.value.T)
+    spent: tuple[Series, ...] = ()
+    if power is not None:
+        spent = _log_joints(rec, f"{ENSEMBLE}/power", power.names, power.value.T, look.palette)
+    return MeanCycle(
+        period_s=pace.period_s,
+        has_body=_log_body(rec, clock, look, (moved, asked, power)),
+        has_places=_log_places(rec, look, moved, asked),
+        measured=_log_joints(rec, f"{ENSEMBLE}/measured", moved.names, angles, look.palette),
+        error=error,
+        power=spent,
+    )
+
+
+def _times() -> list[rr.TimeColumn]:
+    return [rr.TimeColumn(ENSEMBLE_CYCLE, sequence=DEGREES)]
+
+
+def _about(pace: Pace, moved: MeanCycles, *, steady: bool) -> str:
+    fewest, most = int(moved.cycles.min()), int(moved.cycles.max())
+    count = f"{fewest} to {most} cycles" if fewest < most else f"{most} cycle{'s' * (most > 1)}"
+    zero = "at the crest of the first driven joint's command (no phase was logged)"
+    if pace.logged:
+        zero = "where the phase on `/gait` is a multiple of 360°"
+    interval = "One cycle has no scatter, so there is no interval."
+    if most > 1:
+        interval = "Thin lines are the 95 % interval of the mean."
+    if not steady:
+        interval += " No steady gait was found: what changes as it goes is mixed here."
+    return (
+        f"**To play it, choose `{ENSEMBLE_CYCLE}` in the time panel below** instead of "
+        "`session_time`: 0 to 360 degrees of the gait's phase, looped at the gait's own speed.\n\n"
+        f"Mean of {count}, {pace.start_s:.1f} to {pace.stop_s:.1f} s, of {pace.period_s:.3g} s "
+        f"each. Phase 0 is {zero}. {interval}\n\n"
+        "Each sample keeps its own time and phase: cycles are interpolated about a harmonic fit "
+        "and then averaged, samples are not folded. The body is drawn in the frame of its own "
+        "mean position and orientation; grey is commanded.\n"
+    )
+
+
+def _log_body(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    look: Look,
+    cycles: tuple[MeanCycles, MeanCycles | None, MeanCycles | None],
+) -> bool:
+    """Draw the body, measured and commanded; ``cycles`` are of those two and of power."""
+    robot = look.robot
+    moved, asked, power = cycles
+    if robot is None or robot.joint_names[0] not in moved.names:
+        return False
+    names = robot.joint_names
+    rec.log(BODY, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    shape = (DEGREES.size, len(robot.links), 4)
+    colors = np.broadcast_to(joint_colors(len(robot.links)), shape)
+    if power is not None and look.limit_w is not None:
+        colors = power_colors(segment_power(power.ordered(names)), look.limit_w)
+    solid = rr.Capsules3D.from_fields(fill_mode=FillMode.Solid)
+    _log_shapes(rec, clock, ("measured", solid), robot, (moved.ordered(names), colors))
+    centre, _ = body_frame(robot, moved.ordered(names))
+    above = np.nanmean(centre[:, 0], axis=0)
+    above[2] += 7.0 * robot.links[0].radius
+    label = rr.Points3D(
+        [above],
+        labels="head",
+        show_labels=True,
+        radii=rr.Radius.ui_points(0.5),
+        colors=_WHITE,
+    )
+    rec.log(f"{BODY}/head", label, static=True)
+    if asked is not None:
+        wire = rr.Capsules3D.from_fields(
+            fill_mode=FillMode.MajorWireframe, line_radii=rr.Radius.ui_points(0.5)
+        )
+        grey = np.broadcast_to(np.array(GREY, dtype=np.uint8), shape)
+        _log_shapes(rec, clock, ("commanded", wire), robot, (asked.ordered(names), grey))
+    return True
+
+
+def _log_shapes(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    kind: tuple[str, rr.Capsules3D],
+    robot: Robot,
+    drawn: tuple[FloatArray, NDArray[np.uint8]],
+) -> None:
+    """Draw the body at each phase by its angles and colours; the first on the session too."""
+    (name, look), (angles, colors) = kind, drawn
+    origin, quaternion = capsule_poses(robot, *body_frame(robot, angles))
+    whole, still = f"{BODY}/{name}", f"{BODY}/on_session_time/{name}"
+    for entity in (whole, still):
+        rec.log(entity, look, static=True)
+    rec.flush()  # else what comes first in the file is chance
+    rec.send_columns(whole, _times(), capsule_columns(robot, (origin, quaternion), colors))
+    first = capsule_columns(robot, (origin[:1], quaternion[:1]), colors[:1])
+    for _, times in clock.rows(np.array([clock.start_ns], dtype=np.int64)):
+        rec.send_columns(still, times, first)
+
+
+def _log_places(
+    rec: rr.RecordingStream, look: Look, moved: MeanCycles, asked: MeanCycles | None
+) -> bool:
+    drawn = False
+    places = look.places
+    pairs = () if places is None else zip(places.names, places.labels, strict=True)
+    for name, label in pairs:
+        path = f"{PLACES}/{rr.escape_entity_path_part(label)}"
+        if asked is not None and name in asked.names:
+            line = rr.SeriesLines(names="command", colors=GREY, widths=1.0)
+            _log_line(rec, f"{path}/commanded", line, asked.of(name)[0])
+        if name not in moved.names:
+            continue
+        drawn = True
+        mean, half = moved.of(name)
+        color = look.palette[name]
+        if np.isfinite(half).any():
+            line = rr.SeriesLines(names="95 % interval", colors=(*color[:3], _FAINT), widths=1.0)
+            _log_line(rec, f"{path}/low", line, mean - half)
+            _log_line(rec, f"{path}/high", line, mean + half)
+        title = name if label == name else f"{name} {label}"
+        line = rr.SeriesLines(names=title, colors=color, widths=2.0)
+        _log_line(rec, f"{path}/measured", line, mean)
+    return drawn
+
+
+def _log_line(
+    rec: rr.RecordingStream, entity: str, line: rr.SeriesLines, angle_rad: FloatArray
+) -> None:
+    rec.log(entity, line, static=True)
+    rec.flush()
+    rec.send_columns(entity, _times(), rr.Scalars.columns(scalars=np.degrees(angle_rad)))
+
+
+def _log_joints(
+    rec: rr.RecordingStream,
+    entity: str,
+    names: tuple[str, ...],
+    values: FloatArray,
+    palette: Mapping[str, Color],
+) -> tuple[Series, ...]:
+    """A line a joint; ``values`` of shape (p, k)."""
+    if not names:
+        return ()
+    colors = [palette.get(name, GREY) for name in names]
+    rec.log(entity, rr.SeriesLines(names=list(names), colors=colors), static=True)
+    rec.flush()
+    size = np.full(DEGREES.size, len(names))
+    columns = rr.Scalars.columns(scalars=values.ravel()).partition(size)
+    rec.send_columns(entity, _times(), columns)
+    return (Series(entity, names),)

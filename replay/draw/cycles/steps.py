@@ -1,0 +1,210 @@
+"""Gain, lag and energy of each joint in each cycle: steps in a plot, and rows of the heat maps.
+
+The numbers are the analysis's own: gain and lag by the logged phase over the whole session
+(``over_time`` of a result), or, where no phase was logged, of the steady gait (the report's maps);
+net energy over the cycles of the analysed window (``energy`` of a result). A value is written where
+its cycle starts and holds until the cycle ends, so a step lies over the samples that it was
+computed from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import rerun as rr
+from rerun.components import InterpolationMode
+
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.results.over_time import JointOverTime
+from undulog.analysis.session.cycles import LEAST_COVERED, CycleMaps
+from undulog.capture.common.arrays import FloatArray, IntArray
+
+from ...content.entities import ENERGY, GAIN, GREY, LAG, Color, CycleTable, Quantity, Series
+from ...samples.timeline import Clock
+from ...samples.tracks import Track
+from ...samples.tracks import tables as tables_of
+from ..plots.joints import log_rows, part_entity
+
+CYCLES = "/cycles"
+
+
+def cycle_tables(analysis: Analysis, steady: CycleMaps | None = None) -> tuple[CycleTable, ...]:
+    """What an analysis says of each cycle.
+
+    Args:
+        analysis: The session's analysis.
+        steady: Cycles of its steady gait, for a session whose phase was not logged.
+
+    Returns:
+        Tables of gain, lag and net energy; of one quantity several where planes have cycles of
+        their own, none where it has no value.
+    """
+    if analysis.over_time is not None:
+        response = _over_time(analysis.over_time.joints)
+    elif steady is not None:
+        stop_s = steady.start_s + steady.period_s
+        table = CycleTable(GAIN, steady.driven, steady.start_s, stop_s, 100.0 * (steady.gain - 1.0))
+        response = [table, replace(table, quantity=LAG, value=np.degrees(steady.lag_rad))]
+    else:
+        response = []
+    found = [*response, *_energy(analysis)]
+    return tuple(table for table in found if np.isfinite(table.value).any())
+
+
+def together(tables: Sequence[CycleTable]) -> CycleTable:
+    """Tables of one quantity as one, on the cycles of the one with most of them.
+
+    Args:
+        tables: At least one, of one quantity.
+
+    Returns:
+        The table; a joint with cycles of its own has in each row the value of that cycle of its
+        own which holds the middle of the row.
+    """
+    main = max(tables, key=lambda table: table.start_s.size)
+    middle = 0.5 * (main.start_s + main.stop_s)
+    rows: list[FloatArray] = []
+    for table in tables:
+        at = np.searchsorted(table.start_s, middle, side="right") - 1
+        own = np.maximum(at, 0)
+        inside = (at >= 0) & (middle < table.stop_s[own])
+        rows.append(np.where(inside, table.value[:, own], np.nan))
+    names = tuple(name for table in tables for name in table.names)
+    return replace(main, names=names, value=np.concatenate(rows))
+
+
+def mean_power(energy: CycleTable, quantity: Quantity) -> CycleTable:
+    """Mean power of each cycle from its net energy.
+
+    Args:
+        energy: Net energy [J].
+        quantity: What the power is called; its unit is mW.
+
+    Returns:
+        The table [mW].
+    """
+    milliwatt = 1e3 * energy.value / (energy.stop_s - energy.start_s)
+    return replace(energy, quantity=quantity, value=milliwatt)
+
+
+def log_cycles(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    tables: Sequence[CycleTable],
+    palette: Mapping[str, Color],
+) -> tuple[tuple[Quantity, tuple[Series, ...]], ...]:
+    """Write the steps.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        tables: The cycles.
+        palette: Colour by joint name.
+
+    Returns:
+        Each quantity with where it was written.
+    """
+    found: list[tuple[Quantity, tuple[Series, ...]]] = []
+    for quantity in dict.fromkeys(table.quantity for table in tables):
+        tracks = [
+            track
+            for table in tables
+            if table.quantity == quantity
+            for track in _steps(table, clock.start_ns)
+        ]
+        parts = tables_of(tracks)
+        series: list[Series] = []
+        for part in parts:
+            entity = f"{CYCLES}/{quantity.key}"
+            entity = entity if len(parts) == 1 else part_entity(entity, part.names[0])
+            look = rr.SeriesLines(
+                names=list(part.names),
+                colors=[palette.get(name, GREY) for name in part.names],
+                interpolation_mode=InterpolationMode.StepAfter,
+            )
+            rec.log(entity, look, static=True)
+            rec.flush()  # else what comes first in the file is chance
+            log_rows(rec, clock, entity, part.t_ns, part.values)
+            series.append(Series(entity, part.names))
+        found.append((quantity, tuple(series)))
+    return tuple(found)
+
+
+def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray]:
+    """When the cycles start and end.
+
+    Args:
+        table: The cycles.
+        start_ns: Unix time of the session's start [ns].
+
+    Returns:
+        Unix times [ns], each of shape (c,).
+    """
+    far_s = 4e9  # keeps the times of a damaged result within int64
+    start, stop = (
+        np.round(np.clip(t_s, -far_s, far_s) * 1e9).astype(np.int64)
+        for t_s in (table.start_s, table.stop_s)
+    )
+    return start_ns + start, start_ns + stop
+
+
+def _steps(table: CycleTable, start_ns: int) -> list[Track]:
+    """Values at the starts, and NaN at each end that no cycle follows."""
+    start, stop = cycle_times_ns(table, start_ns)
+    # A microsecond is the rounding of edges in seconds, not a pause.
+    ends = np.flatnonzero(np.append(start[1:] - stop[:-1] > 1000, True))
+    t_ns = np.insert(start, ends + 1, stop[ends])
+    values = np.insert(table.value, ends + 1, np.nan, axis=1)
+    return [Track(name, t_ns, row) for name, row in zip(table.names, values, strict=True)]
+
+
+def _over_time(joints: Sequence[JointOverTime]) -> list[CycleTable]:
+    together: dict[tuple[float, ...], list[JointOverTime]] = {}
+    for joint in joints:
+        if joint.start_s:
+            together.setdefault(joint.start_s, []).append(joint)
+    gains: list[CycleTable] = []
+    lags: list[CycleTable] = []
+    for start_s, group in together.items():
+        gain = np.array([joint.gain for joint in group], dtype=np.float64)
+        lag = np.array([joint.lag_rad for joint in group], dtype=np.float64)
+        table = CycleTable(
+            GAIN,
+            tuple(joint.name for joint in group),
+            np.array(start_s),
+            np.array(group[0].stop_s),
+            100.0 * (gain - 1.0),
+        )
+        gains.append(table)
+        lags.append(replace(table, quantity=LAG, value=np.degrees(_about_its_mean(lag))))
+    return [*gains, *lags]
+
+
+def _about_its_mean(lag_rad: FloatArray) -> FloatArray:
+    """Lags within pi of each joint's mean direction, so that no step is a mere turn, (m, c)."""
+    mean = np.angle(np.nansum(np.exp(1j * lag_rad), axis=1, keepdims=True))
+    turned: FloatArray = mean + np.angle(np.exp(1j * (lag_rad - mean)))
+    return turned
+
+
+def _energy(analysis: Analysis) -> list[CycleTable]:
+    """Net energies of the analysed window's cycles; none without a gait, or without samples."""
+    energy = analysis.energy
+    if energy is None or analysis.gait.frequency_hz.value is None:
+        return []
+    known = [joint for joint in energy.joints if joint.net_j is not None]
+    if not known:
+        return []
+    value = np.array([joint.net_j for joint in known], dtype=np.float64)
+    covered = np.array([joint.coverage for joint in known], dtype=np.float64)
+    return [
+        CycleTable(
+            ENERGY,
+            tuple(joint.name for joint in known),
+            np.array(energy.start_s),
+            np.array(energy.stop_s),
+            np.where(covered >= LEAST_COVERED, value, np.nan),
+        )
+    ]

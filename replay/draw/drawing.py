@@ -1,0 +1,336 @@
+"""What is drawn of a session, piece by piece: the same for a file and for a viewer that runs.
+
+Whoever draws decides the order: a file is written when everything is known, a viewer gets the
+beginning first. What is drawn by then says :attr:`Drawing.content`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import rerun as rr
+
+from undulog.capture import Session
+from undulog.capture.common.errors import DataError
+from undulog.capture.robot.kinematics import rotation_from_quaternion
+from undulog.capture.robot.model import Robot
+
+from ..content import entities
+from ..content.content import Content, Signal, Start, signal_title
+from ..content.layer import Layer, Named
+from ..samples.quantities import SIGNALS, topic_entity
+from ..samples.stretches import Span, Stretch
+from ..samples.survey import GAIT, Survey, survey
+from ..samples.timeline import Clock
+from ..samples.tracks import Track, drawn_topics, read_columns
+from . import facts
+from .cycles.heat_maps import heat_maps, log_maps
+from .cycles.mean_cycle import Look, averaged_ns, log_mean_cycle, read_channels
+from .cycles.response import charts, log_charts, log_current
+from .cycles.steps import cycle_tables, log_cycles
+from .plots import gait, joints
+from .plots.other_topics import log_others, log_words
+from .plots.write import Plots
+from .scene.body import body_title
+from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
+from .scene.stage import Scene
+
+_WHOLE = Span()
+
+
+@dataclass
+class Sources:
+    """What is known of the session before anything is drawn.
+
+    Attributes:
+        session: The session.
+        found: What it holds.
+        warnings: What is missing or was assumed, a sentence each; grows while it is drawn.
+    """
+
+    session: Session
+    found: Survey
+    warnings: list[str]
+
+    @classmethod
+    def of(cls, session: Session, found: Survey | None = None) -> Sources:
+        """Look through a session.
+
+        Args:
+            session: The session.
+            found: What it holds, where that is known; None to go through it.
+
+        Returns:
+            The sources.
+
+        Raises:
+            DataError: If the session holds nothing that can be drawn.
+        """
+        if not any(channel.count for channel in session.channels.values()):
+            raise DataError(f"{session.path}: the session holds no messages; nothing can be drawn")
+        found = survey(session, BODY_RATE_HZ) if found is None else found
+        missing: list[str] = []
+        if session.robot is None:
+            missing.append("no robot description in the session: the body can't be drawn")
+        if entities.MEASURED not in found.samples:
+            missing.append("no measured joint angles on /joint_states")
+        if left_out := drawn_topics(session)[1]:
+            missing.append(f"{left_out} more joint topics are not shown")
+        return cls(session, found, missing)
+
+    @property
+    def measured(self) -> tuple[Track, ...]:
+        """Some samples of each measured angle [rad]."""
+        return self.found.samples.get(entities.MEASURED, ())
+
+    @property
+    def commanded(self) -> tuple[Track, ...]:
+        """Some samples of each commanded angle [rad]."""
+        return self.found.samples.get(entities.COMMANDED, ())
+
+
+def clock_of(session: Session) -> Clock:
+    """The session's timelines.
+
+    Args:
+        session: The session.
+
+    Returns:
+        Its clock, with the phase of its gait where one was logged.
+    """
+    phases: tuple[Track, ...] = ()
+    if GAIT in session.channels:
+        phases = read_columns(session, {GAIT: ["position"]}).get((GAIT, "position"), ())
+    return Clock(session.start_ns, gait.rhythm_of(phases))
+
+
+class Drawing:
+    """A session on its way into a recording stream."""
+
+    def __init__(
+        self,
+        rec: rr.RecordingStream,
+        clock: Clock,
+        sources: Sources,
+        named: Sequence[Named] = (),
+        *,
+        trail: Span = _WHOLE,
+    ) -> None:
+        """Write how things look, and what doesn't move.
+
+        Args:
+            rec: The recording.
+            clock: Its timelines.
+            sources: The session.
+            named: Modules that tests name, to be marked.
+            trail: The part of the head's trail that is drawn.
+        """
+        self._rec, self._clock, self._sources = rec, clock, sources
+        self._named = [one.joint for one in named]
+        robot = sources.session.robot
+        moving = sources.measured or sources.commanded
+        self._palette = palette_of(robot, [track.name for track in moving])
+        self._places = joints.head_middle_tail(robot, sources.commanded or sources.measured)
+        self._plots = Plots(rec, clock, sources.found, self._places, self._palette)
+        self._head, self._scene = self._open_scene(trail)
+        self.content = self._written()
+        """What is drawn by now."""
+
+    @property
+    def limit_w(self) -> float | None:
+        """Power at which a segment's colour is full [W]; None where no body is drawn."""
+        return None if self._head is None else self._sources.found.power_limit_w
+
+    def write(self, stretch: Stretch) -> None:
+        """Draw a stretch.
+
+        Args:
+            stretch: Its samples.
+        """
+        self._plots.write(stretch)
+        if self._scene is not None:
+            self._scene.write(stretch)
+
+    def widen(self, sources: Sources, trail: Span) -> None:
+        """Go on with all of a session of which the beginning is drawn.
+
+        Args:
+            sources: The whole session.
+            trail: The part of the head's trail that isn't drawn yet.
+        """
+        self._sources = sources
+        self._head, self._scene = self._open_scene(trail)
+
+    def write_words(self) -> None:
+        """Write modes, events and remarks."""
+        rec, clock, session = self._rec, self._clock, self._sources.session
+        warnings = self._sources.warnings
+        modes = gait.log_mode(rec, clock, session, warnings)
+        events = gait.log_events(rec, clock, session, warnings)
+        words = log_words(rec, clock, session)
+        self.content = replace(self.content, modes=modes, has_events=events or words)
+
+    def write_others(self) -> None:
+        """Write what a bag of another make has beside joints."""
+        others = log_others(self._rec, self._clock, self._sources.session, self._sources.warnings)
+        self.content = replace(self.content, signals=(*self.content.signals, *others))
+
+    def write_response(self, layer: Layer) -> None:
+        """Write each joint's response: bars and maps.
+
+        Args:
+            layer: What is known of the session.
+        """
+        analysis = layer.analysis
+        if analysis is None:
+            return
+        found = charts(analysis)
+        tables = cycle_tables(analysis, layer.steady)
+        maps = heat_maps(analysis, tables, tuple(self._palette))
+        log_charts(self._rec, found, self._palette, self._named)
+        log_current(self._rec, self._clock, found, tables)
+        log_maps(self._rec, self._clock, maps, self._named)
+        self.content = replace(self.content, charts=found, maps=maps)
+
+    def write_cycles(self, layer: Layer) -> None:
+        """Write what is known cycle by cycle, and the mean of all cycles.
+
+        Args:
+            layer: What is known of the session.
+        """
+        analysis, sources = layer.analysis, self._sources
+        tables = cycle_tables(analysis, layer.steady) if analysis is not None else ()
+        cycles = log_cycles(self._rec, self._clock, tables, self._palette)
+        part_ns = averaged_ns(self._clock, analysis)
+        mean = log_mean_cycle(
+            self._rec,
+            self._clock,
+            read_channels(sources.session, sources.found.wanted, part_ns),
+            Look(sources.session.robot, self._places, self._palette, self.limit_w),
+            analysis=analysis,
+            warnings=sources.warnings,
+        )
+        self.content = replace(self.content, cycles=cycles, mean=mean)
+
+    def write_facts(
+        self, session: Session, layer: Layer, content: Content, *, awaited: bool = False
+    ) -> list[str]:
+        """Write the session in words; what was written before is replaced.
+
+        Args:
+            session: All of the session.
+            layer: What is known of it.
+            content: What the recording holds, or will.
+            awaited: Whether its numbers are still to come.
+
+        Returns:
+            What is missing or was assumed by now, a sentence each.
+        """
+        notes = [*layer.notes, *self._sources.warnings, *session.warnings]
+        told = list(dict.fromkeys(notes))
+        text = facts.markdown(
+            session,
+            layer.analysis,
+            notes=told,
+            colors=body_title(content),
+            content=content,
+            named=layer.named,
+            has_cycles=self._clock.rhythm is not None,
+            awaited=awaited,
+        )
+        facts.log_facts(self._rec, text)
+        return told
+
+    def _written(self) -> Content:
+        """What is there as soon as a stretch is."""
+        plots = self._plots
+        return Content(
+            robot=self._sources.session.robot,
+            start=None if self._head is None else start_of(self._head),
+            power_limit_w=self.limit_w,
+            places=self._places,
+            commanded=plots.series(entities.COMMANDED),
+            measured=plots.series(entities.MEASURED),
+            errors=plots.series(entities.ERROR),
+            has_power=any(one.startswith(entities.TOTAL) for one in self._sources.found.samples),
+            joint_power=plots.series(entities.MECHANICAL),
+            charts=(),
+            modes=0,
+            has_events=False,
+            signals=self._signals(),
+        )
+
+    def _open_scene(self, trail: Span) -> tuple[HeadPath | None, Scene | None]:
+        """The 3D scene, where there is a robot whose joints were measured."""
+        sources = self._sources
+        robot, measured = sources.session.robot, sources.measured
+        if robot is None or not measured:
+            return None, None
+        times = Track(measured[0].name, sources.found.drawing_ns, np.zeros(0))
+        head = read_head(sources.session, robot, [times], sources.warnings)
+        known = {one.name for one in measured}
+        missing = [name for name in robot.joint_names if name not in known]
+        if missing:
+            sources.warnings.append(
+                f"no angles of {', '.join(missing)}: the body is drawn up to the first of these"
+            )
+        scene = Scene(
+            self._rec,
+            self._clock,
+            sources.session,
+            robot,
+            head,
+            places=self._places,
+            palette=self._palette,
+            limit_w=sources.found.power_limit_w,
+            warnings=sources.warnings,
+            trail=trail,
+        )
+        scene.named = self._named
+        return head, scene
+
+    def _signals(self) -> tuple[Signal, ...]:
+        """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
+        found: list[Signal] = []
+        topics = {topic_entity(SIGNALS, one): one for one in self._sources.session.channels}
+        for entity, series in self._plots.signals.items():
+            topic = topics[entity]
+            unit = self._sources.session.channels[topic].metadata.get("unit", "rad")
+            of_joints = any(name in self._palette for one in series for name in one.names)
+            found.append(Signal(signal_title(topic, unit), series, of_joints))
+        return tuple(found)
+
+
+def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, entities.Color]:
+    """Colours of the robot's joints, or of those in the log where there is no robot.
+
+    Args:
+        robot: The robot, or None.
+        names: Joints in the log, head to tail.
+
+    Returns:
+        Colour by joint name; joints that the robot doesn't have are grey.
+    """
+    if robot is None:
+        return joints.joint_palette(names)
+    return dict.fromkeys(names, entities.GREY) | joints.joint_palette(robot.joint_names)
+
+
+def start_of(head: HeadPath) -> Start | None:
+    """Where the camera finds the robot.
+
+    Args:
+        head: The head's path.
+
+    Returns:
+        Its first known pose, or None where none is known.
+    """
+    known = np.flatnonzero(np.isfinite(head.position).all(axis=1))
+    if not known.size:
+        return None
+    x, y, z = head.position[known[0]].tolist()
+    forward = rotation_from_quaternion(head.quaternion[known[0]])[:, 0]
+    heading = float(np.arctan2(forward[1], forward[0]))
+    return Start((x, y, z), heading if np.isfinite(heading) else 0.0)

@@ -1,0 +1,171 @@
+"""The session in words: the answer first, what it is next, how it was drawn last."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+import rerun as rr
+
+from undulog.analysis.results.analysis import Analysis, GroupFacts
+from undulog.analysis.results.formats import utc
+from undulog.capture import Session
+from undulog.capture.common.console import plain
+
+from ..content.content import Content
+from ..content.layer import Named
+from ..samples.timeline import ENSEMBLE_CYCLE
+
+FACTS = "/session"
+
+_MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
+
+
+def escaped(text: str) -> str:
+    """Text with names from a log, as part of Markdown.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        One line of Markdown that shows it and marks nothing up.
+    """
+    return _MARKUP.sub(r"\\\1", plain(text))
+
+
+def code(text: str) -> str:
+    """A name from a log as code in Markdown, in a table too.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        A code span of one line; the text itself where it has a backtick.
+    """
+    return escaped(text) if "`" in text else f"`{plain(text)}`".replace("|", r"\|")
+
+
+def markdown(
+    session: Session,
+    analysis: Analysis | None,
+    *,
+    notes: Sequence[str],
+    colors: str,
+    content: Content,
+    named: Sequence[Named] = (),
+    has_cycles: bool,
+    awaited: bool = False,
+) -> str:
+    """What a reader needs beside the picture.
+
+    Args:
+        session: The session.
+        analysis: Its analysis, or None where there is none.
+        notes: What is missing or was assumed, a sentence each.
+        colors: What the body's colours mean.
+        content: What the recording holds.
+        named: Modules that tests name.
+        has_cycles: Whether there is a timeline of gait cycles.
+        awaited: Whether its analysis is still to come.
+
+    Returns:
+        Markdown.
+    """
+    facts = (
+        code(session.session_id),
+        _robot(session),
+        f"{session.duration_s:.1f} s",
+        utc(session.start_ns),
+        *_gait(analysis),
+        *_health(session.metadata),
+        *_versions(session.metadata),
+    )
+    parts = [f"**{escaped(_told_first(analysis, awaited=awaited))}**"]
+    if named:
+        told = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
+        parts.append(f"**Named, pink in the pictures:** {told}")
+    parts.append(" · ".join(facts))
+    told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
+    if told:
+        parts.append("\n".join(f"- {escaped(note)}" for note in told))
+    legend = _legend(colors, content, has_cycles=has_cycles)
+    if legend:
+        parts.append(legend)
+    return "\n\n".join(parts) + "\n"
+
+
+def _told_first(analysis: Analysis | None, *, awaited: bool) -> str:
+    if analysis is not None:
+        return analysis.answer.sentence
+    return "Being analysed: the answer comes in a moment." if awaited else "Not analysed."
+
+
+def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
+    """What lines, bars and timelines mean."""
+    words = [f"{colors}."] if content.start is not None else []
+    if content.commanded:
+        words.append("Grey is commanded.")
+    if content.charts:
+        words.append(
+            "Coloured bars: the analysed stretch, a whisker to the far end of the 95 % interval."
+        )
+    if content.charts and content.cycles:
+        words.append("White bars: the cycle at the cursor; energies are of one cycle.")
+    if has_cycles:
+        words.append("On `gait_cycle` one second is one cycle of the gait.")
+    if content.mean is not None:
+        words.append(
+            f"`{ENSEMBLE_CYCLE}` plays the mean cycle by degrees of phase (tab *Mean cycle*)."
+        )
+    return " ".join(words)
+
+
+def log_facts(rec: rr.RecordingStream, text: str) -> None:
+    """Write the session's facts.
+
+    Args:
+        rec: The recording.
+        text: Markdown.
+    """
+    rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def _robot(session: Session) -> str:
+    if session.robot is None:
+        return "no robot description"
+    count = len(session.robot.joints)
+    return f"{session.robot.name}, {count} joint{'s' if count != 1 else ''}"
+
+
+def _gait(analysis: Analysis | None) -> list[str]:
+    if analysis is None or analysis.gait.frequency_hz.value is None:
+        return []
+    text = f"{analysis.gait.frequency_hz.value:.3f} Hz"
+    if len(analysis.gait.groups) > 1:
+        return [_group(group) for group in analysis.gait.groups]
+    if analysis.gait.wave is not None:
+        text += f", wave {analysis.gait.wave}"
+    for plane, lag in analysis.gait.lag_per_joint_rad.items():
+        text += f", {math.degrees(lag):.1f}° a joint ({plane})"
+    return [text]
+
+
+def _group(group: GroupFacts) -> str:
+    """Frequency, number of joints and wave of one group."""
+    text = f"{group.frequency_hz.value:.3f} Hz ({len(group.joints)} joints)"
+    if group.wave is not None:
+        text += f", wave {group.wave}"
+    for plane, lag in group.lag_per_joint_rad.items():
+        text += f", {math.degrees(lag):.1f}° a joint ({plane})"
+    return text
+
+
+def _health(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    verdict = metadata.get("undulog.health", {}).get("verdict")
+    return [f"verdict {escaped(verdict)}"] if verdict else []
+
+
+def _versions(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    recorded = metadata.get("undulog", {}).get("undulog")
+    return [f"recorded by undulog {escaped(recorded)}"] if recorded else []

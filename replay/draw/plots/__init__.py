@@ -1,0 +1,1 @@
+"""Plots: angles, power, the gait, and topics of foreign logs."""

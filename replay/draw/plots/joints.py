@@ -1,0 +1,255 @@
+"""Joint angles: commanded, measured and the error between them.
+
+``/joints/commanded``, ``/joints/measured`` and ``/joints/error`` hold the angles of all joints in a
+row, in degrees, as the component ``Angle:degrees``. Joints that were sampled at times of their own
+get an entity each below these, named after the first joint of those sampled together. All values
+are 32-bit: the recording is for looking at, and the session keeps what was logged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+from rerun.encodings import Float32Batch
+
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.palette import joint_colors
+from undulog.capture.robot.model import Plane, Robot
+
+from ...content.entities import GREY, SCALARS, Color, Places, Series
+from ...samples.rounding import rounded
+from ...samples.sampling import mark_gaps
+from ...samples.timeline import Clock
+from ...samples.tracks import Table, Track, tables
+
+PLACES = "/joints/places"
+DEGREES = "Angle:degrees"
+PLACES_WIDTHS = {"commanded": 1.0, "measured": 2.0}
+"""Of the lines of head, middle and tail [points]."""
+
+_DESCRIPTORS = {
+    DEGREES: rr.ComponentDescriptor(DEGREES, archetype="Angle"),
+    # Without a type, which would have to be 64-bit: the viewer plots either.
+    SCALARS: rr.ComponentDescriptor(SCALARS, archetype="rerun.archetypes.Scalars"),
+}
+
+
+def joint_palette(names: Sequence[str]) -> dict[str, Color]:
+    """The colour that each joint keeps everywhere.
+
+    Args:
+        names: All joints, head to tail.
+
+    Returns:
+        sRGB and opacity by joint name.
+    """
+    if not names:
+        return {}
+    return {
+        name: (int(color[0]), int(color[1]), int(color[2]), int(color[3]))
+        for name, color in zip(names, joint_colors(len(names)), strict=True)
+    }
+
+
+def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | None:
+    """Choose the joints that stand for the whole body.
+
+    Args:
+        robot: The robot; without it all joints count as one plane.
+        moving: Angles by which the busiest plane is told: commands, or else measurements [rad].
+
+    Returns:
+        First, middle and last joint of the plane that moves most, or None without joints.
+    """
+    swing = {track.name: float(np.nanstd(track.values)) for track in moving}
+    if not swing:
+        return None
+    if robot is None:
+        names, plane = tuple(swing), None
+    else:
+        planes = {
+            plane: [joint.name for joint in robot.joints if joint.plane is plane] for plane in Plane
+        }
+        plane = max(Plane, key=lambda p: max((swing.get(n, -1.0) for n in planes[p]), default=-1.0))
+        names = tuple(name for name in planes[plane] if name in swing) or tuple(swing)
+    chosen = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
+    return Places(tuple(chosen), plane)
+
+
+def log_angles(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    entity: str,
+    tracks: Sequence[Track],
+    palette: Mapping[str, Color] | None = None,
+) -> tuple[Series, ...]:
+    """Write one kind of angle of all joints.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        entity: E.g. ``/joints/measured``.
+        tracks: The angles [rad].
+        palette: Colour by joint name; None for the grey of everything commanded.
+
+    Returns:
+        What was written; one series where all joints share their times.
+    """
+    return tuple(
+        log_table(rec, clock, path, table, palette, degrees=True)
+        for path, table in _placed(entity, tables(tracks))
+    )
+
+
+def log_scalars(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    entity: str,
+    tracks: Sequence[Track],
+    palette: Mapping[str, Color] | None = None,
+) -> tuple[Series, ...]:
+    """Write a quantity of all joints that needs no other unit.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        entity: Where to.
+        tracks: The values.
+        palette: Colour by joint name; None for grey.
+
+    Returns:
+        What was written.
+    """
+    return tuple(
+        log_table(rec, clock, path, table, palette, degrees=False)
+        for path, table in _placed(entity, tables(tracks))
+    )
+
+
+def places_titles(places: Places, kind: str) -> dict[str, str]:
+    """Names of the lines of head, middle and tail.
+
+    Args:
+        places: The joints.
+        kind: ``measured`` or ``commanded``.
+
+    Returns:
+        Line's name by joint name.
+    """
+    return {
+        name: name
+        if (title := label if kind == "measured" else "command") == name
+        else f"{name} {title}"
+        for name, label in zip(places.names, places.labels, strict=True)
+    }
+
+
+def _placed(entity: str, parts: Sequence[Table]) -> list[tuple[str, Table]]:
+    if len(parts) == 1:
+        return [(entity, parts[0])]
+    return [(part_entity(entity, part.names[0]), part) for part in parts]
+
+
+def part_entity(entity: str, first: str) -> str:
+    """Where joints go that were sampled at times of their own.
+
+    Args:
+        entity: E.g. ``/joints/measured``.
+        first: The first joint of those sampled together.
+
+    Returns:
+        The path of their entity.
+    """
+    return f"{entity}/{rr.escape_entity_path_part(first)}"
+
+
+def log_table(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    entity: str,
+    table: Table,
+    palette: Mapping[str, Color] | None,
+    *,
+    degrees: bool,
+) -> Series:
+    """Write joints that were sampled together.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        entity: Where to.
+        table: Their values.
+        palette: Colour by joint name; None for grey.
+        degrees: Whether the values are angles [rad], to be plotted in degrees.
+
+    Returns:
+        What was written.
+    """
+    component = DEGREES if degrees else SCALARS
+    log_look(rec, entity, table.names, palette)
+    t_ns, values = mark_gaps(table.t_ns, table.values)
+    log_rows(rec, clock, entity, t_ns, values, degrees=degrees, component=component)
+    return Series(entity, table.names, component)
+
+
+def log_look(
+    rec: rr.RecordingStream,
+    entity: str,
+    names: Sequence[str],
+    palette: Mapping[str, Color] | None,
+    *,
+    titles: Mapping[str, str] | None = None,
+    width: float | None = None,
+) -> None:
+    """Say how the lines of an entity are drawn.
+
+    Args:
+        rec: The recording.
+        entity: Which.
+        names: Joints, a line each.
+        palette: Colour by joint name; None for grey.
+        titles: Lines' names by joint name; None for the joints' own.
+        width: Of the lines [points]; None for the viewer's own.
+    """
+    look = rr.SeriesLines(
+        names=[name if titles is None else titles.get(name, name) for name in names],
+        colors=[GREY if palette is None else palette.get(name, GREY) for name in names],
+        widths=None if width is None else [width] * len(names),
+    )
+    rec.log(entity, look, static=True)
+
+
+def log_rows(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    entity: str,
+    t_ns: IntArray,
+    values: FloatArray,
+    *,
+    degrees: bool = False,
+    component: str = SCALARS,
+    steps: FloatArray | None = None,
+) -> None:
+    """Write rows of lines.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        entity: Where to.
+        t_ns: Their times [ns], shape (n,).
+        values: Shape (n, k); NaN ends a line.
+        degrees: Whether they are angles [rad], to be plotted in degrees.
+        component: ``Scalars:scalars``, or ``Angle:degrees`` for all joints' angles.
+        steps: What each line is rounded to, as it is plotted, shape (k,); None for nothing.
+    """
+    shown = np.rad2deg(values) if degrees else values
+    if steps is not None:
+        shown = rounded(shown, steps)
+    packed = shown.astype(np.float32)
+    for rows, times in clock.rows(t_ns):
+        batch = Float32Batch(packed[rows].ravel())
+        column = rr.ComponentColumn(_DESCRIPTORS[component], batch)
+        size = np.full(rows.stop - rows.start, values.shape[1])
+        rec.send_columns(entity, times, [column.partition(size)])

@@ -1,0 +1,202 @@
+"""The body in space: where the links were, and a wireframe where they should have been.
+
+Links are capsules, or meshes where they have one. Capsules are Rerun's: a cylinder along z from the
+entity's origin, with a half ball on each end. Positions are rounded to 2^-10 m and quaternions to
+2^-9, which moves nothing by more than 0.5 mm and a quarter of a degree, and colours have 32 shades
+each way: less than a screen shows, and a third of the file.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.components import FillMode
+
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.palette import joint_colors
+from undulog.capture.robot.model import Robot
+
+from ...content.content import Content
+from ...content.entities import GREY
+from ...samples.quantities import power_limit, segment_power
+from ...samples.timeline import Clock
+from .colors import power_colors
+from .meshes import log_poses, log_shapes, meshed
+from .motion import Motion
+
+MEASURED = "/world/snake/measured"
+COMMANDED = "/world/snake/commanded"
+
+ROUNDING = 2.0**-10
+"""Of positions [m]."""
+TURN_ROUNDING = 2.0**-9
+"""Of quaternions."""
+SHADES = 32
+"""Steps of power from none to full."""
+
+
+def capsule_shape(robot: Robot) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Cylinder lengths and radii that draw the links.
+
+    A cylinder is one radius shorter than its link, so that neighbouring balls overlap without
+    lying in each other and the segments stay countable.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Lengths of the cylinders and radii [m], each of shape (number of links,).
+    """
+    length = [max(link.length - link.radius, 0.1 * link.length) for link in robot.links]
+    radius = [link.radius for link in robot.links]
+    return np.array(length, dtype=np.float32), np.array(radius, dtype=np.float32)
+
+
+def capsule_poses(
+    robot: Robot, centre: FloatArray, rotation: FloatArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where the links' capsules start and how they are turned.
+
+    Args:
+        robot: The robot, m joints.
+        centre: Link centres [m], shape (n, m + 1, 3).
+        rotation: Link orientations, shape (n, m + 1, 3, 3).
+
+    Returns:
+        Capsule origins [m], shape (n, m + 1, 3), and quaternions x, y, z, w that turn z to the
+        link's forward axis the shortest way, shape (n, m + 1, 4), both rounded; NaN where a pose
+        is.
+    """
+    length, _ = capsule_shape(robot)
+    forward = rotation[..., 0]
+    origin = centre - 0.5 * length[:, None] * forward
+    return rounded_to(origin, ROUNDING), rounded_to(_turns(forward), TURN_ROUNDING)
+
+
+def _turns(forward: FloatArray) -> FloatArray:
+    """Quaternions that turn z to the given directions, about an axis in the plane of x and y.
+
+    A capsule looks the same however it is turned about its own axis.
+    """
+    cos = np.clip(forward[..., 2], -1.0, 1.0)
+    sideways = np.hypot(forward[..., 0], forward[..., 1])
+    half_sin, half_cos = np.sqrt((1.0 - cos) / 2.0), np.sqrt((1.0 + cos) / 2.0)
+    share = np.divide(half_sin, sideways, out=np.zeros_like(cos), where=sideways > 0.0)
+    x = np.where(sideways > 0.0, -forward[..., 1] * share, half_sin)
+    return np.stack([x, forward[..., 0] * share, np.zeros_like(cos) + 0.0 * cos, half_cos], -1)
+
+
+def capsule_columns(
+    robot: Robot,
+    poses: tuple[NDArray[np.float32], NDArray[np.float32]],
+    colors: NDArray[np.uint8],
+    drawn: NDArray[np.bool_] | bool = True,
+) -> rr.ComponentColumnList:
+    """Rows of capsules, without those whose pose isn't known.
+
+    Args:
+        robot: The robot, m joints.
+        poses: As :func:`capsule_poses` gives them, n rows.
+        colors: Shape (n, m + 1, 4) or one that broadcasts to it.
+        drawn: Which links are drawn as capsules, shape (m + 1,).
+
+    Returns:
+        Columns of n rows with at most m + 1 capsules each.
+    """
+    origin, quaternion = poses
+    known = np.isfinite(np.concatenate([origin, quaternion], axis=-1)).all(axis=-1) & drawn
+    length, radius = capsule_shape(robot)
+    return rr.Capsules3D.columns(
+        lengths=np.broadcast_to(length, known.shape)[known],
+        radii=np.broadcast_to(radius, known.shape)[known],
+        translations=origin[known],
+        quaternions=quaternion[known],
+        colors=np.broadcast_to(colors, (*known.shape, 4))[known],
+    ).partition(np.count_nonzero(known, axis=1))
+
+
+def log_body(
+    rec: rr.RecordingStream, clock: Clock, motion: Motion, *, limit_w: float | None = None
+) -> float | None:
+    """Draw the measured body, coloured by power per segment.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        motion: What moved.
+        limit_w: Power at which a segment's colour is full [W]; None takes it from the motion.
+
+    Returns:
+        Power at which a segment's colour is full [W], or None where no power is known and the
+        links wear the colours of their place along the body.
+    """
+    power = None if motion.power_w is None else segment_power(motion.power_w)
+    limit = None if power is None else limit_w or power_limit(power)
+    rec.log(MEASURED, rr.Capsules3D.from_fields(fill_mode=FillMode.Solid), static=True)
+    solid = meshed(motion.robot)
+    log_shapes(rec, motion.robot)
+    for rows, times in clock.rows(motion.t_ns):
+        if power is None or limit is None:
+            colors = joint_colors(len(motion.robot.links))
+        else:
+            shade = limit / SHADES
+            colors = power_colors(np.round(power[rows] / shade) * shade, limit)
+        links = motion.links(rows)
+        poses = capsule_poses(motion.robot, *links)
+        rec.send_columns(MEASURED, times, capsule_columns(motion.robot, poses, colors, ~solid))
+        log_poses(rec, motion.robot, times, links, colors)
+    return limit
+
+
+def log_ghost(rec: rr.RecordingStream, clock: Clock, motion: Motion, chosen: IntArray) -> None:
+    """Draw the commanded shape on the measured head, as a grey wireframe.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        motion: What moved; without commands nothing is drawn.
+        chosen: Which of its drawing times, shape (n,).
+    """
+    if motion.commands is None:
+        return
+    look = rr.Capsules3D.from_fields(
+        fill_mode=FillMode.MajorWireframe, line_radii=rr.Radius.ui_points(0.5)
+    )
+    rec.log(COMMANDED, look, static=True)
+    grey = np.array(GREY, dtype=np.uint8)
+    for part, times in clock.rows(motion.t_ns[chosen]):
+        rows = chosen[part]
+        poses = capsule_poses(motion.robot, *motion.links(rows, motion.commands[rows]))
+        rec.send_columns(COMMANDED, times, capsule_columns(motion.robot, poses, grey))
+
+
+def rounded_to(values: FloatArray, step: float) -> NDArray[np.float32]:
+    """Round to multiples of a power of two.
+
+    Args:
+        values: Any shape.
+        step: The power of two.
+
+    Returns:
+        The same shape, in 32 bits; at most half a step from the values.
+    """
+    return (np.round(values / step) * step).astype(np.float32)
+
+
+def body_title(content: Content) -> str:
+    """Name of the body's view, which is also the legend of its colours.
+
+    Args:
+        content: What the recording holds.
+
+    Returns:
+        A short title.
+    """
+    if content.power_limit_w is None:
+        return "Body, blue head to amber tail"
+    if content.live:  # the scale may still grow
+        return "Body: vermilion drives, cyan is driven"
+    limit = content.power_limit_w
+    value, unit = (limit * 1e3, "mW") if limit < 1.0 else (limit, "W")
+    return f"Body: vermilion drives, cyan is driven, full at ±{value:.3g} {unit} a segment"

@@ -1,0 +1,228 @@
+"""What moved: head pose, joint angles and power at the times at which the body is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from undulog.capture import Session
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Robot
+
+from ...samples.sampling import decimate, hold, interpolate, mark_gaps, ordered
+from ...samples.tracks import Track, resampled
+
+BODY_RATE_HZ = 50.0
+SPARSE_RATE_HZ = 25.0
+"""Of what moves beside the body: commanded shape, distance sensors, names."""
+
+POSE = [
+    *(f"pose.pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+]
+"""Position [m] and orientation of an Odometry."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The body at its drawing times.
+
+    Attributes:
+        robot: The robot, m joints.
+        t_ns: Drawing times [ns], shape (n,).
+        head_position: Centre of the head link [m], shape (n, 3).
+        head_quaternion: Its orientation x, y, z, w, shape (n, 4).
+        angles: Measured joint angles [rad], shape (n, m).
+        commands: Commanded joint angles [rad], shape (n, m), or None where none were logged.
+        power_w: Mechanical power of the joints [W], shape (n, m), or None where none is known.
+    """
+
+    robot: Robot
+    t_ns: IntArray
+    head_position: FloatArray
+    head_quaternion: FloatArray
+    angles: FloatArray
+    commands: FloatArray | None
+    power_w: FloatArray | None
+
+    def links(
+        self, rows: slice | IntArray, angles: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Where the links are.
+
+        Args:
+            rows: Which drawing times, k of them.
+            angles: Joint angles to use instead of the measured ones [rad], shape (k, m).
+
+        Returns:
+            Link centres [m], shape (k, m + 1, 3), and rotations, shape (k, m + 1, 3, 3); NaN
+            from the first link whose pose isn't known to the tail.
+        """
+        if angles is None:
+            centre, rotation = self._links
+            return centre[rows], rotation[rows]
+        turn = rotation_from_quaternion(self.head_quaternion[rows])
+        return link_poses(self.robot, self.head_position[rows], turn, angles)
+
+    @cached_property
+    def _links(self) -> tuple[FloatArray, FloatArray]:
+        """All links, as they were measured."""
+        turn = rotation_from_quaternion(self.head_quaternion)
+        return link_poses(self.robot, self.head_position, turn, self.angles)
+
+
+@dataclass(frozen=True)
+class HeadPath:
+    """Where the head was.
+
+    Attributes:
+        t_ns: Times [ns], shape (n,).
+        position: Centre of the head link [m], shape (n, 3).
+        quaternion: Orientation x, y, z, w, shape (n, 4).
+        tracked: False where no odometry was logged and the head is held at the origin.
+    """
+
+    t_ns: IntArray
+    position: FloatArray
+    quaternion: FloatArray
+    tracked: bool
+
+
+@dataclass(frozen=True)
+class Frames:
+    """When the body is drawn, and where its head was then.
+
+    Attributes:
+        head: The head's path at most 50 times a second, on its own sampling times; a row of NaN
+            in each gap.
+        sparse: Which of these rows, no more than 25 a second, are drawn of what moves beside the
+            body, shape (n,).
+    """
+
+    head: HeadPath
+    sparse: BoolArray
+
+    def between(self, rows: slice) -> Frames:
+        """Some of them.
+
+        Args:
+            rows: Which.
+
+        Returns:
+            These only.
+        """
+        head = self.head
+        part = HeadPath(head.t_ns[rows], head.position[rows], head.quaternion[rows], head.tracked)
+        return Frames(part, self.sparse[rows])
+
+
+def frames_of(head: HeadPath, end_ns: int) -> Frames:
+    """Choose when the body is drawn.
+
+    Args:
+        head: The head's path.
+        end_ns: The session's end [ns].
+
+    Returns:
+        The frames.
+    """
+    chosen = decimate(head.t_ns, BODY_RATE_HZ)
+    pose = np.concatenate([head.position, head.quaternion], axis=1)[chosen]
+    t_ns, pose = mark_gaps(head.t_ns[chosen], pose, end_ns)
+    sparse = np.zeros(t_ns.size, dtype=np.bool_)
+    sparse[decimate(t_ns, SPARSE_RATE_HZ)] = True
+    # A gap ends whatever is drawn.
+    sparse |= np.isnan(pose).any(axis=1)
+    return Frames(HeadPath(t_ns, pose[:, :3], pose[:, 3:], head.tracked), sparse)
+
+
+def read_head(
+    session: Session, robot: Robot, positions: Sequence[Track], warnings: list[str]
+) -> HeadPath:
+    """The head's pose from ``/odom``, or held at the origin.
+
+    Args:
+        session: The session.
+        robot: The robot.
+        positions: Measured joint angles, whose times serve where there is no odometry.
+        warnings: Grows by a sentence where something had to be assumed.
+
+    Returns:
+        The path at its own sampling times.
+    """
+    odometry = session.channels.get("/odom")
+    if odometry is None or not odometry.count:
+        warnings.append("no /odom in the session: the head is held at the origin")
+        return still_head(positions[0].t_ns)
+    _, first = next(session.messages("/odom"))
+    child, link = str(first.child_frame_id), robot.links[0].name
+    if child != link:
+        warnings.append(f"/odom is of {child or 'no frame'}; it is taken as the head link {link}")
+    (table,) = session.columns({}, {"/odom": POSE})[1].values()
+    return tracked_head(table.index.to_numpy(dtype=np.int64), table[POSE].to_numpy(np.float64))
+
+
+def still_head(t_ns: IntArray) -> HeadPath:
+    """The head at the origin, where nobody tracked it.
+
+    Args:
+        t_ns: Times [ns], shape (n,).
+
+    Returns:
+        The path.
+    """
+    still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (t_ns.size, 1))
+    return HeadPath(t_ns, still[:, :3], still[:, 3:], tracked=False)
+
+
+def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
+    """The head's path from odometry.
+
+    Args:
+        t_ns: Sampling times [ns], shape (n,).
+        pose: Columns as in :data:`POSE`, shape (n, 7).
+
+    Returns:
+        The path in the order of its times; NaN where there is no orientation.
+    """
+    t_ns, pose = ordered(t_ns, pose)
+    norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        quaternion = pose[:, 3:] / norm  # NaN where the tracker wrote zeros: no pose
+    return HeadPath(t_ns, pose[:, :3], quaternion, tracked=True)
+
+
+def assemble(
+    robot: Robot,
+    head: HeadPath,
+    *,
+    positions: Sequence[Track],
+    commands: Sequence[Track],
+    power: Sequence[Track],
+) -> Motion:
+    """Bring joints and power to the times at which the body is drawn.
+
+    Args:
+        robot: The robot, m joints.
+        head: Where its head was at these times.
+        positions: Measured angles [rad].
+        commands: Commanded angles [rad]; none where none were logged.
+        power: Mechanical power of the joints [W]; none where it isn't known.
+
+    Returns:
+        What moved; NaN in gaps.
+    """
+    names, t_ns = robot.joint_names, head.t_ns
+    return Motion(
+        robot=robot,
+        t_ns=t_ns,
+        head_position=head.position,
+        head_quaternion=head.quaternion,
+        angles=resampled(positions, names, t_ns, interpolate),
+        commands=resampled(commands, names, t_ns, hold) if commands else None,
+        power_w=resampled(power, names, t_ns, interpolate) if power else None,
+    )

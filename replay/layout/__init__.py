@@ -1,0 +1,1 @@
+"""Views and tabs of the viewer."""

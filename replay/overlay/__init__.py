@@ -1,0 +1,10 @@
+"""Sessions side by side: bodies overlaid, plots of all of them, and their differences.
+
+::
+
+    from pathlib import Path
+    from .together import bring_together
+
+    both = bring_together([Path("robot.mcap"), Path("twin.mcap")], Path("both.rrd"))
+    print(both.found["twin"].comparison, both.placements["twin"])
+"""

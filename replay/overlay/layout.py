@@ -1,0 +1,249 @@
+"""The layout: bodies overlaid on the left, plots of all and of the differences on the right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import rerun.blueprint as rrb
+from rerun.encodings import EntityPathLike
+
+from ..content.content import Content
+from ..content.entities import Series
+from ..draw.facts import FACTS as SESSION
+from ..draw.plots import gait
+from ..draw.scene import ranges
+from ..draw.scene.body import COMMANDED, MEASURED
+from ..draw.scene.markers import LABELS, MARKERS
+from ..draw.scene.trail import TRAIL, TRAIL_SECONDS
+from ..layout.views import AFTER_CURSOR_S, BEFORE_CURSOR_S, build_views
+from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
+from .alignment import Align
+from .bars import BARS, DIFFERENCES, Quantity
+from .lines import LINES, POWER
+from .side import Side
+from .words import FACTS
+
+APART = "/head_distance"
+"""Distance of the heads, below a session's own path."""
+
+_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)
+"""What is drawn of the first body only."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What was written of a session.
+
+    Attributes:
+        side: The session.
+        content: Its own recording's.
+        body: Whether its body is drawn.
+        lines: Whether its head, middle or tail was measured.
+        differences: Its angles minus the first session's; none of the first.
+        apart: Whether the distance of its head from the first one's was written.
+        bars: Quantities that differ from the first session's.
+    """
+
+    side: Side
+    content: Content
+    body: bool
+    lines: bool
+    differences: tuple[Series, ...] = ()
+    apart: bool = False
+    bars: tuple[Quantity, ...] = ()
+
+
+def build_blueprint(
+    shown: Sequence[Shown], bars: Sequence[Quantity], how: Align, title: str
+) -> rrb.Blueprint:
+    """Lay out what a side by side recording holds.
+
+    Args:
+        shown: What was written of each session, the first one first.
+        bars: Quantities whose bars stand next to each other.
+        how: What happens at once; decides which timeline it plays on.
+        title: Name of the bodies' view, its legend.
+
+    Returns:
+        The blueprint; it opens playing.
+    """
+    rows: list[rrb.Container | rrb.View] = []
+    heights: list[float] = []
+    for group, height in ((_both(shown), 1.25), (_differences(shown), 1.0)):
+        if group:
+            rows.append(_tabs(group))
+            heights.append(height)
+    if bars:
+        rows.append(rrb.Horizontal(*_bars(bars)))
+        heights.append(1.0)
+    differing = [
+        rrb.Horizontal(*_bar_differences(one), name=one.side.name) for one in shown[1:] if one.bars
+    ]
+    if differing:
+        rows.append(_tabs(differing))
+        heights.append(1.0)
+    words = _tabs(_words(shown))
+    bodies = [one for one in shown if one.body]
+    root: rrb.Container
+    if bodies:
+        left = rrb.Vertical(_scene(bodies, title), words, row_shares=[3.0, 1.5])
+        right = rrb.Vertical(*rows, row_shares=heights)
+        root = rrb.Horizontal(left, right, column_shares=[1.0, 1.0]) if rows else left
+    else:
+        root = rrb.Vertical(*rows, words, row_shares=[*heights, 1.4])
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(
+            state="collapsed", timeline=how.timeline, play_state="playing", loop_mode="all"
+        ),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def all_views(
+    shown: Sequence[Shown], bars: Sequence[Quantity], how: Align, title: str
+) -> rrb.Blueprint:
+    """Every view at once, none behind a tab: a layout to look for what isn't drawn.
+
+    Args:
+        shown: What was written of each session, the first one first.
+        bars: Quantities whose bars stand next to each other.
+        how: What happens at once.
+        title: Name of the bodies' view.
+
+    Returns:
+        The blueprint.
+    """
+    bodies = [one for one in shown if one.body]
+    views = [*([_scene(bodies, title)] if bodies else []), *_words(shown), *_both(shown)]
+    views += [*_differences(shown), *_bars(bars)]
+    for one in shown[1:]:
+        views += _bar_differences(one)
+    panel = rrb.TimePanel(state="collapsed", timeline=how.timeline)
+    return rrb.Blueprint(rrb.Grid(*views), panel, collapse_panels=True)
+
+
+def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
+    """The first body's own view of the world, with all bodies in it."""
+    first = bodies[0]
+    scene = build_views(first.content).scene
+    assert scene is not None  # noqa: S101 - its body is drawn
+    looks = cast("dict[str, Any]", scene.properties)
+    looks["EyeControls3D"].tracking_entity = f"{first.side.entity}{MEASURED}"
+    last_s = rrb.VisibleTimeRange(
+        SESSION_TIME,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_SECONDS),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    overrides: dict[EntityPathLike, Any] = {
+        f"{one.side.entity}{TRAIL}": rrb.VisibleTimeRanges([last_s]) for one in bodies
+    }
+    for one in bodies[1:]:
+        overrides |= {
+            f"{one.side.entity}{path}": rrb.EntityBehavior(visible=False) for path in _HIDDEN
+        }
+    return rrb.Spatial3DView(
+        name=title,
+        origin="/",
+        contents=[f"{one.side.entity}/world/**" for one in bodies],
+        background=looks["Background"],
+        line_grid=looks["LineGrid3D"],
+        eye_controls=looks["EyeControls3D"],
+        overrides=overrides,
+    )
+
+
+def _both(shown: Sequence[Shown]) -> list[rrb.View]:
+    found: list[rrb.View] = []
+    if any(one.lines for one in shown):
+        found.append(_plot("Head, middle, tail [°]", [f"{LINES}/**"]))
+    powers = [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]
+    if powers:
+        found.append(_plot("Mechanical power [W]", powers))
+    return found
+
+
+def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
+    """A view a plane and session, and how far the heads are apart."""
+    first, *others = shown
+    found: list[rrb.View] = []
+    for one in others:
+        bare = Content(
+            robot=first.side.robot,
+            start=None,
+            power_limit_w=None,
+            places=None,
+            commanded=(),
+            measured=one.differences,
+            errors=(),
+            has_power=False,
+            joint_power=(),
+            charts=(),
+            modes=0,
+            has_events=False,
+            signals=(),
+        )
+        for view in build_views(bare).angles:
+            plane = str(view.name).lower().replace("measured", "").strip()
+            view.name = f"{one.side.name} − {first.side.name}, {plane}".replace(", [", " [")
+            found.append(view)
+    apart = [f"{one.side.own}{APART}" for one in others if one.apart]
+    if apart:
+        found.append(_plot("Heads apart [m]", apart))
+    return found
+
+
+def _bars(quantities: Sequence[Quantity]) -> list[rrb.View]:
+    return [_chart(one.title, f"{BARS}/{one.key}/**") for one in quantities]
+
+
+def _bar_differences(one: Shown) -> list[rrb.View]:
+    return [
+        _chart(f"{one.side.name}: {q.difference}", f"{one.side.own}{DIFFERENCES}/{q.key}/**")
+        for q in one.bars
+    ]
+
+
+def _words(shown: Sequence[Shown]) -> list[rrb.View]:
+    found: list[rrb.View] = [rrb.TextDocumentView(name="Side by side", contents=[FACTS])]
+    found += [
+        rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])
+        for one in shown
+    ]
+    events = [f"{one.side.entity}{gait.EVENTS}" for one in shown if one.content.has_events]
+    if events:
+        found.append(rrb.TextLogView(name="Events", contents=events))
+    return found
+
+
+def _chart(title: str, contents: str) -> rrb.BarChartView:
+    legend = rrb.PlotLegend(visible=False)
+    return rrb.BarChartView(name=title, contents=[contents], plot_legend=legend)
+
+
+def _plot(title: str, contents: Sequence[str]) -> rrb.TimeSeriesView:
+    window = [
+        rrb.VisibleTimeRange(
+            timeline,
+            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-BEFORE_CURSOR_S),
+            end=rrb.TimeRangeBoundary.cursor_relative(seconds=AFTER_CURSOR_S),
+        )
+        for timeline in (SESSION_TIME, GAIT_CYCLE)
+    ]
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=list(contents),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        time_ranges=rrb.VisibleTimeRanges(window),
+    )
+
+
+def _tabs(
+    views: Sequence[rrb.View] | Sequence[rrb.Horizontal],
+) -> rrb.View | rrb.Horizontal | rrb.Tabs:
+    return views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0)

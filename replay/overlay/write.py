@@ -1,0 +1,312 @@
+"""Sessions side by side as one Rerun recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import LazyChunkStream
+
+from undulog.analysis.compare.compare import Choices, compare_seen
+from undulog.analysis.compare.side import Seen
+from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.part_file import check_stop, part_file
+
+from ..draw.plots.joints import log_scalars
+from ..draw.scene.body import body_title
+from ..record.rrd import Recording, open_recording, recording_id, require_whole, rerun_writes
+from ..samples.sampling import decimate
+from ..samples.tracks import Track
+from . import bars, dress, lines, words
+from .alignment import Align, Aligned
+from .difference import angle_differences, log_differences
+from .layout import APART, Shown, build_blueprint
+from .merge import chunks_of, send
+from .placement import Placement, head_distance, placement, told_placed
+from .words import Found
+
+ANGLES = "/angles"
+"""Differences of the measured angles, below a session's own path."""
+
+Layout = Callable[[Sequence[Shown], Sequence[bars.Quantity], Align, str], rrb.Blueprint]
+
+_APART_RATE_HZ = 25.0
+
+
+class Place(StrEnum):
+    """Where the bodies are drawn."""
+
+    START = "start"
+    """Where the first one starts."""
+
+    WORLD = "world"
+    """Where their sessions say that they were."""
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A session with what was made of it.
+
+    Attributes:
+        aligned: The session and its place on the timelines.
+        recording: Its own recording.
+        seen: What a comparison takes from it, or None where it can't be analysed.
+    """
+
+    aligned: Aligned
+    recording: Recording
+    seen: Seen | None
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What was written.
+
+    Attributes:
+        path: The .rrd file.
+        recording_id: Follows from the sessions' ids and names, and how they are aligned and placed.
+        shown: What it holds of each session.
+        found: What the comparison with the first session says, by the others' names.
+        placements: How bodies are moved, by name; those that aren't are left out.
+        warnings: What is missing or was assumed, a sentence each.
+    """
+
+    path: Path
+    recording_id: str
+    shown: tuple[Shown, ...]
+    found: Mapping[str, Found]
+    placements: Mapping[str, Placement]
+    warnings: tuple[str, ...]
+
+
+def write_beside(
+    sessions: Sequence[Converted],
+    path: Path,
+    how: Align,
+    *,
+    place: Place = Place.START,
+    stop: StopRequest | None = None,
+    layout: Layout = build_blueprint,
+) -> Beside:
+    """Bring converted sessions together.
+
+    Args:
+        sessions: Two or more; differences are from the first.
+        path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
+        how: What happens at once.
+        place: Where the bodies are drawn.
+        stop: Looked at now and then; once an end is asked for, nothing is written.
+        layout: Makes the blueprint from what was written.
+
+    Returns:
+        What was written.
+
+    Raises:
+        LogWriteError: If the file can't be written, or an end was asked for.
+    """
+    rr.set_strict_mode(True)
+    sides = [one.aligned.side for one in sessions]
+    told = [
+        f"{one.aligned.side.name}: {said}" for one in sessions for said in one.recording.warnings
+    ]
+    found = {one.aligned.side.name: _compare(sessions[0], one) for one in sessions[1:]}
+    several = len(found) > 1
+    told += [
+        f"{name} (B): {said}" if several else said
+        for name, one in found.items()
+        for said in one.notes
+    ]
+    placements = _placements(sessions, how, place, told)
+    names = [side.name for side in sides]
+    identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
+    with part_file(path) as draft, rerun_writes(path):
+        rec = open_recording(identity, in_file=True)
+        try:
+            rec.save(draft)
+            rec.send_recording_name(", ".join(names))
+            rec.send_recording_start_time_nanos(sides[0].start_ns)
+            check_stop(path, stop)
+            send(rec, [_chunks(one) for one in sessions])
+            check_stop(path, stop)
+            shown = _log(rec, sessions, found, placements, how)
+            quantities = bars.log_bars(
+                rec, [(one.aligned.side, one.seen) for one in sessions if one.seen is not None]
+            )
+            title = _title(shown)
+            text = words.markdown(
+                sides,
+                found,
+                how,
+                has_cycles=any(side.rhythm is not None for side in sides),
+                legend=_legend(shown, title),
+                notes=told,
+            )
+            document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+            rec.log(words.FACTS, document, static=True)
+            rec.send_blueprint(layout(shown, quantities, how, title))
+        finally:
+            rec.disconnect()
+        require_whole(draft, path)
+        check_stop(path, stop)
+    return Beside(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
+
+
+def _chunks(one: Converted) -> LazyChunkStream:
+    """A session's own recording under its name and on the common timelines."""
+    side, ruler = one.aligned.side, one.aligned.ruler
+    return chunks_of(
+        one.recording.path,
+        side.entity,
+        later_ns=side.start_ns - ruler.zero_ns,
+        more_cycles=ruler.cycles,
+    )
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A session and the first one.
+
+    Attributes:
+        rank: Which session it is, 1 for the second.
+        found: Their comparison.
+        placed: How its body is moved, or None.
+    """
+
+    rank: int
+    found: Found
+    placed: Placement | None
+
+
+def _compare(first: Converted, other: Converted) -> Found:
+    changed = words.changed_between(first.aligned.side, other.aligned.side)
+    for one in (first, other):
+        if one.seen is None:
+            return Found(
+                None, f"not compared, since {one.aligned.side.name} has no analysis", changed
+            )
+    assert first.seen is not None  # noqa: S101 - just looked
+    assert other.seen is not None  # noqa: S101
+    try:
+        comparison = compare_seen([first.seen], [other.seen], Choices(any_gait=True))
+    except UndulogError as error:
+        return Found(None, f"not compared: {error}", changed)
+    return Found(comparison, None, changed)
+
+
+def _placements(
+    sessions: Sequence[Converted], how: Align, place: Place, told: list[str]
+) -> dict[str, Placement]:
+    """How the other bodies are laid on the first one, with a sentence about each."""
+    bodies = [one.aligned for one in sessions if one.recording.content.start is not None]
+    found: dict[str, Placement] = {}
+    for one in bodies[1:] if place is Place.START else ():
+        placed = placement(bodies[0], one, how)
+        name, first = one.side.name, bodies[0].side.name
+        if placed is None:
+            told.append(
+                f"{name} and {first} have no body at a shared moment: each in its own world"
+            )
+        else:
+            found[name] = placed
+            told.append(told_placed(placed, name, first))
+    if len(bodies) > 1 and place is Place.WORLD:
+        told.append("every body is drawn where its own session says that it was")
+    return found
+
+
+def _log(
+    rec: rr.RecordingStream,
+    sessions: Sequence[Converted],
+    found: Mapping[str, Found],
+    placements: Mapping[str, Placement],
+    how: Align,
+) -> tuple[Shown, ...]:
+    """Write all that isn't in the sessions' own recordings."""
+    rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    first = sessions[0]
+    content = first.recording.content
+    drawn = lines.log_lines(rec, first.aligned, 0, content.places)
+    shown = [Shown(first.aligned.side, content, content.start is not None, drawn)]
+    for rank, one in enumerate(sessions[1:], start=1):
+        name = one.aligned.side.name
+        pair = _Pair(rank, found[name], placements.get(name))
+        shown.append(_log_other(rec, first, one, how, pair))
+    bodies = [k for k, one in enumerate(shown) if one.body]
+    for rank, k in enumerate(bodies):
+        _log_body(rec, sessions[k].aligned, rank, placements)
+    dress.log_ends(rec, [sessions[k].aligned for k in bodies])
+    powers = {k: one.side for k, one in enumerate(shown) if one.content.has_power}
+    lines.log_power_names(rec, powers)
+    return tuple(shown)
+
+
+def _log_other(
+    rec: rr.RecordingStream, first: Converted, one: Converted, how: Align, pair: _Pair
+) -> Shown:
+    a, b = first.aligned, one.aligned
+    content = one.recording.content
+    places = lines.places_in(b.side, first.recording.content.places, content.places)
+    comparison = pair.found.comparison
+    angles = angle_differences(a, b, how)
+    return Shown(
+        b.side,
+        content,
+        content.start is not None,
+        lines.log_lines(rec, b, pair.rank, places),
+        log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, first.recording.content.measured),
+        apart=_log_apart(rec, a, b, how, pair),
+        bars=() if comparison is None else bars.log_differences(rec, a.side, b.side, comparison),
+    )
+
+
+def _log_apart(rec: rr.RecordingStream, a: Aligned, b: Aligned, how: Align, pair: _Pair) -> bool:
+    """How far the heads are apart, where both were tracked."""
+    one, other = a.side.head, b.side.head
+    if one is None or other is None or not (one.tracked and other.tracked):
+        return False
+    t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
+    apart = head_distance(a, b, how, pair.placed or Placement(), t_ns)
+    known = bool(np.isfinite(apart).any())
+    if known:
+        name = f"{b.side.name}, {a.side.name}"
+        colors = {name: dress.tint(pair.rank)}
+        log_scalars(rec, a.clock, f"{b.side.own}{APART}", [Track(name, t_ns, apart)], colors)
+    return known
+
+
+def _log_body(
+    rec: rr.RecordingStream, one: Aligned, rank: int, placements: Mapping[str, Placement]
+) -> None:
+    side = one.side
+    if side.head is None or side.robot is None:
+        return
+    dress.log_name(rec, one, rank, side.head, side.robot)
+    if rank:
+        dress.log_look(rec, side.entity, rank, side.robot)
+    if side.name in placements:
+        dress.log_placement(rec, side.entity, placements[side.name])
+
+
+def _title(shown: Sequence[Shown]) -> str:
+    """Name of the bodies' view: who is who."""
+    first, *others = [one.side.name for one in shown if one.body] or [""]
+    if not others:
+        return f"{first}; the others have no body" if first else ""
+    return f"{first} solid, {' and '.join(others)} as wireframe"
+
+
+def _legend(shown: Sequence[Shown], title: str) -> str:
+    bodies = [one for one in shown if one.body]
+    if not bodies:
+        return "No session says enough to draw a body."
+    scale = body_title(bodies[0].content)
+    return (
+        f"{title}. {scale}. The grey wireframe and lines are commanded, of {shown[0].side.name}. "
+        f"In the plots {shown[0].side.name} is solid, the others are dashed."
+    )

@@ -1,1 +1,0 @@
-"""What is drawn in space: the body, what it sees and what stands around it."""

@@ -1,0 +1,1 @@
+"""The viewer process, with and without a window."""

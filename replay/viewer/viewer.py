@@ -1,0 +1,263 @@
+"""Rerun's own viewer as a process of ours, reachable from this machine only.
+
+Rerun's ``spawn`` and ``serve`` listen on all interfaces unless told; here every server is bound to
+127.0.0.1.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from urllib.parse import quote
+
+from undulog.capture.common.errors import MissingExtraError, UndulogError, UsageError
+from undulog.capture.common.interruption import StopRequest, interruptible
+
+LOOPBACK = "127.0.0.1"
+
+WHOLE_IN_MEMORY = "--server-memory-limit=75%"
+"""A server keeps the whole recording for browsers that come late, whatever memory that takes: by
+Rerun's own limit, 1 GiB, a session of some hours would lose its beginning."""
+
+_PASSING_ON = "--server-memory-limit=64MB"
+"""A window holds the recording itself: what its own server keeps beside that is there twice."""
+
+_START_S = 60.0
+_LOOK_S = 0.05
+_GRACE_S = 3.0
+
+
+def viewer_binary() -> Path:
+    """The viewer that came with the installed Rerun.
+
+    Returns:
+        Path of the executable.
+
+    Raises:
+        MissingExtraError: If Rerun is not installed.
+    """
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingExtraError("'undulog view'", "replay", "rerun")
+    folder = Path(spec.submodule_search_locations[0])
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    if bundled.exists():
+        return bundled
+    return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def require_display() -> None:
+    """Check that a window can be opened, before any work is done.
+
+    Raises:
+        UsageError: If this is a Linux machine without a display.
+    """
+    if sys.platform.startswith("linux") and not any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+    ):
+        raise UsageError(
+            "this machine has no display to open the viewer on; write the recording with "
+            "--save X.rrd and open it elsewhere, or serve it to a browser with --web"
+        )
+
+
+class Viewer:
+    """A viewer, or a server of one, as a process of ours that only this machine reaches."""
+
+    def __init__(self, arguments: Sequence[str], port: int | None = None) -> None:
+        """Start it.
+
+        Args:
+            arguments: Of the viewer's command line, its port and address left out.
+            port: Where it takes data; None for a free port.
+
+        Raises:
+            MissingExtraError: If Rerun is not installed.
+        """
+        binary = viewer_binary()
+        self._port = free_ports(1)[0] if port is None else port
+        self.address = f"rerun+http://{LOOPBACK}:{self._port}/proxy"
+        """Where a recording stream connects to."""
+        # The viewer leaves a folder behind when it is told to end; here it goes with ours.
+        self._scratch = tempfile.TemporaryDirectory(prefix="undulog-viewer-")
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
+        self._told_to_end = False
+        self._process = subprocess.Popen(  # noqa: S603  our own arguments
+            [
+                str(binary),
+                *("--bind", LOOPBACK, "--port", str(self._port)),
+                *arguments,
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            env={**os.environ, "TMPDIR": self._scratch.name},
+            process_group=0,  # a Ctrl-C ends it through us
+        )
+
+    def __enter__(self) -> Self:
+        """Nothing to do: it runs."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it."""
+        self.close()
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended, e.g. because its window was closed."""
+        return self._process.poll() is not None
+
+    def wait_until_it_listens(self) -> None:
+        """Wait until data can be sent to it.
+
+        Raises:
+            UndulogError: If it ends before, or doesn't start.
+        """
+        deadline = time.monotonic() + _START_S
+        while not _listens(self._port):
+            if self.ended:
+                self.check()
+                raise UndulogError("the Rerun viewer ended before it showed anything")
+            if time.monotonic() > deadline:
+                raise UndulogError(f"the Rerun viewer did not start within {_START_S:g} s")
+            time.sleep(_LOOK_S)
+
+    def wait(self, stop: StopRequest) -> None:
+        """Wait until it has ended, or an end is asked for.
+
+        Args:
+            stop: The request to look at.
+
+        Raises:
+            UndulogError: If it fails.
+        """
+        while not self.ended and not stop.requested:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_LOOK_S)
+        if not stop.requested:
+            self.check()
+
+    def check(self) -> None:
+        """Look whether it has failed.
+
+        Raises:
+            UndulogError: If it has ended, and neither by closing its window nor by us.
+        """
+        if self._told_to_end or not self._process.poll():
+            return
+        code = self._process.returncode
+        if code < 0:
+            raise UndulogError(f"the Rerun viewer was ended by signal {-code}")
+        self._said.seek(0)
+        said = self._said.read().decode(errors="replace").splitlines()
+        lines = [line for line in said if "Error" in line] or said[-3:]
+        reason = " ".join(line.strip() for line in lines) or f"exit code {code}"
+        raise UndulogError(f"the Rerun viewer failed: {reason}")
+
+    def close(self) -> None:
+        """End it, frozen or not; safe to call twice."""
+        self._told_to_end = self._told_to_end or not self.ended
+        if not self.ended:
+            self._process.terminate()
+            try:
+                self._process.wait(_GRACE_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+        self._process.wait()
+        self._scratch.cleanup()
+        self._said.close()
+
+
+def open_window(*options: str) -> Viewer:
+    """Open the native viewer, empty.
+
+    Args:
+        options: More of its command line.
+
+    Returns:
+        The viewer, which starts.
+    """
+    return Viewer(["--hide-welcome-screen", "--expect-data-soon", _PASSING_ON, *options])
+
+
+def open_server(*options: str) -> tuple[Viewer, str]:
+    """Serve the viewer to browsers on this machine.
+
+    Args:
+        options: More of its command line.
+
+    Returns:
+        The server, which starts, and the address that a browser opens.
+    """
+    page, data = free_ports(2)
+    source = quote(f"rerun+http://{LOOPBACK}:{data}/proxy", safe="")
+    server = Viewer(["--serve-web", "--web-viewer-port", str(page), *options], data)
+    return server, f"http://{LOOPBACK}:{page}/?url={source}"
+
+
+def show(recording: Path) -> None:
+    """Open a recording in the native viewer and wait until its window is closed.
+
+    Args:
+        recording: The .rrd file.
+
+    Raises:
+        UndulogError: If the viewer fails.
+    """
+    with interruptible() as stop, Viewer([str(recording)]) as viewer:
+        viewer.wait(stop)
+
+
+def serve(recording: Path, tell: Callable[[str], None]) -> None:
+    """Serve a recording to browsers on this machine until interrupted.
+
+    Args:
+        recording: The .rrd file.
+        tell: Called with the address to open.
+
+    Raises:
+        UndulogError: If the server fails.
+    """
+    with interruptible() as stop:
+        server, page = open_server(WHOLE_IN_MEMORY, str(recording))
+        with server:
+            tell(page)
+            server.wait(stop)
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of this machine that nobody listens on at the moment.
+
+    Args:
+        count: How many.
+
+    Returns:
+        Different ports.
+    """
+    with ExitStack() as stack:
+        held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
+        return [int(one.getsockname()[1]) for one in held]
+
+
+def _listens(port: int) -> bool:
+    try:
+        with socket.create_connection((LOOPBACK, port), timeout=1.0):
+            return True
+    except OSError:
+        return False

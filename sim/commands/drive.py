@@ -1,0 +1,159 @@
+"""The verb ``drive``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.errors import UsageError
+from undulog.capture.common.interruption import interruptible
+
+if TYPE_CHECKING:
+    from ..drive.driven import Driven
+    from ..scenario.scenario import Scenario
+    from ..twin.recording import Recording
+
+
+_TWIN = "twin"
+
+
+def drive(
+    what: str,
+    /,
+    *,
+    on: str,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    duration: float | None = None,
+    arm: bool = False,
+    robot: str | None = None,
+    recorder: Path | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Drive a gait, a plan or recorded commands on the twin or over a bus.
+
+    On the twin it runs faster than real time and is recorded like `undulog sim run`. Over a bus it
+    is a dry run: it runs in the twin and says what it would take. With `--arm` commands are sent,
+    100 times a second, behind a safety gate: it reads the pose, ramps to the first one, keeps to
+    the limits of the robot's file, and ends as that says on a fault, on Ctrl-C (twice: at once)
+    and when the console goes.
+
+    Example: `undulog drive flat --on 'can:socketcand:can0?port=29536' --arm -o driven.mcap`
+
+    Args:
+        what: Name of a shipped scenario, or a scenario's TOML file: its gait is driven. Or a plan,
+            a TOML file of segments. Or a session, `.mcap`: its commands are given again.
+        on: `twin` (the world that it was made for), `twin:SCENARIO`, or a bus,
+            `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
+        output: The session file to write, `.mcap`; a dry run needs none.
+        duration: How long to drive in seconds, instead of what the gait or plan says.
+        arm: Send the commands.
+        robot: The robot on the bus, a name or a TOML file; by default the one that it was made for.
+        recorder: Control socket of the recorder that is told the gait; by default the only one
+            that runs.
+        force: Replace the output if it is there.
+        json: Print one JSON object instead of text.
+    """
+    from ..drive.driven import find_driven
+    from ..scenario.scenario_file import load_scenario
+
+    if output is not None:
+        if output.suffix != ".mcap":
+            raise UsageError(
+                f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+            )
+        refuse_existing(output, force=force)
+    scheme, colon, rest = on.partition(":")
+    if scheme == _TWIN and colon and not rest:
+        raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
+    if scheme != _TWIN:
+        from undulog.capture import load_robot
+
+        from ..drive.over_bus import bus_address
+        from .drive_bus import drive_on_bus
+
+        bus_address(on)
+        described = load_robot(robot) if robot is not None else None
+        return drive_on_bus(
+            find_driven(what, robot=described),
+            on,
+            arm=arm,
+            robot=described,
+            duration_s=duration,
+            output=output,
+            recorder=recorder,
+            force=force,
+            as_json=json,
+        )
+    if arm or recorder is not None or robot is not None:
+        raise UsageError(
+            "--arm, --recorder and --robot are for a bus; a run of the twin records itself"
+        )
+    world = load_scenario(rest) if rest else None
+    driven = find_driven(what, world)
+    return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
+
+
+def _on_twin(
+    driven: Driven, scenario: Scenario, output: Path | None, *, force: bool, as_json: bool
+) -> int:
+    from ..drive.in_process import drive_twin
+
+    if output is None:
+        raise UsageError(
+            "a run of the twin is recorded: name the session with -o, e.g. -o run.mcap"
+        )
+    refuse_existing(output, force=force)
+    start = time.monotonic()
+    with interruptible() as stop, progress(driven.name, scenario.duration_s) as bar:
+        recording = drive_twin(
+            driven,
+            scenario,
+            output,
+            force=force,
+            stop=stop,
+            on_sample=lambda sample: bar.update(
+                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
+            ),
+        )
+    factor = recording.duration_s / (time.monotonic() - start)
+    if as_json:
+        emit_json(_reported(driven, scenario, recording, factor))
+    else:
+        say(*_told(driven, scenario, recording, factor))
+    return 0
+
+
+def _reported(
+    driven: Driven, scenario: Scenario, recording: Recording, factor: float
+) -> dict[str, Any]:
+    return {
+        "driven": driven.name,
+        "kind": driven.kind,
+        "on": f"{_TWIN}:{scenario.name}",
+        "robot": scenario.robot.name,
+        "path": str(recording.path),
+        "session_id": recording.session_id,
+        "duration_s": recording.duration_s,
+        "planned_duration_s": scenario.duration_s,
+        "complete": recording.complete,
+        "ticks": recording.sample_count,
+        "real_time_factor": factor,
+    }
+
+
+def _told(driven: Driven, scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+    if recording.complete:
+        first = f"{recording.path}: drove {driven.name} for {recording.duration_s:g} s"
+    else:
+        first = (
+            f"stopped at rest at {recording.duration_s:g} s of {scenario.duration_s:g} s; "
+            f"{recording.path} is complete up to there"
+        )
+    who = f"{driven.kind} on the twin of {scenario.robot.name} in {scenario.name}, "
+    who += f"{recording.sample_count} ticks, session {recording.session_id}"
+    return [first, who, f"simulated at {factor:.1f} x real time"]

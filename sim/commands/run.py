@@ -1,0 +1,194 @@
+"""The verbs ``sim list`` and ``sim run``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import wrap
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.errors import UsageError
+from undulog.capture.common.interruption import interruptible
+
+if TYPE_CHECKING:
+    from ..scenario.scenario import Scenario
+    from ..twin.recording import Recording
+
+
+_UNWRAPPED = 1000  # columns: one scenario a line, for grep and the like
+
+
+def list_scenarios(*, json: bool = False) -> None:
+    """List the shipped scenarios by robot: name, duration, and what each is about.
+
+    Example: `undulog sim list`
+
+    Args:
+        json: Print one JSON array instead of text.
+    """
+    from ..scenario.scenario_file import load_scenario, scenario_names
+
+    scenarios = [load_scenario(name) for name in scenario_names()]
+    if json:
+        emit_json([_described(scenario) for scenario in scenarios])
+        return
+    columns = get_terminal_size().columns if sys.stdout.isatty() else _UNWRAPPED
+    say(*_listed(scenarios, columns))
+
+
+def run(
+    scenario: str,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    duration: float | None = None,
+    seed: int | None = None,
+    change: Annotated[list[str] | None, Parameter(name="--set")] = None,
+    kernels: Literal["numpy", "numba", "auto"] = "numpy",
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Simulate a scenario and record it as a session, faster than real time.
+
+    The same scenario, seed and kernels give the same file, byte for byte. SIGINT and SIGTERM end
+    the run between two samples and leave a whole file.
+
+    Example: `undulog sim run weak-servo-pi3 -o weak.mcap`
+
+    Args:
+        scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
+        output: The session file to write, `.mcap`.
+        duration: Simulated length in seconds, instead of the scenario's.
+        seed: Seed of the sensor noise, instead of the scenario's.
+        change: `KEY=VALUE`, a key of the scenario file with dots and its value, e.g.
+            `world.slope=0.005` (rad); as often as wanted.
+        kernels: What computes the forces: `numba` is faster and rounds otherwise; `auto` takes it
+            where it is installed.
+        force: Replace the output if it is there.
+        json: Print one JSON object instead of text.
+    """
+    from ..scenario.engines import Kernels
+    from ..scenario.scenario_file import load_scenario, read_changes
+    from ..twin.recording import record
+
+    if output.suffix != ".mcap":
+        raise UsageError(
+            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+        )
+    chosen = load_scenario(scenario, read_changes(change or [])).changed(
+        duration_s=duration, seed=seed
+    )
+    refuse_existing(output, force=force)
+    compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
+    start = time.monotonic()
+    with interruptible() as stop, progress(chosen.name, chosen.duration_s) as bar:
+        recording = record(
+            chosen,
+            output,
+            force=force,
+            stop=stop,
+            kernels=Kernels.NUMBA if compiled else Kernels.NUMPY,
+            on_sample=lambda sample: bar.update(
+                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
+            ),
+        )
+    factor = recording.duration_s / (time.monotonic() - start)
+    if json:
+        emit_json(_reported(chosen, recording, factor))
+    else:
+        say(*_told(chosen, recording, factor))
+    return 0 if recording.complete else 1
+
+
+def _listed(scenarios: Sequence[Scenario], columns: int) -> list[str]:
+    """Lines that list scenarios, by robot, the descriptions wrapped to the terminal."""
+    name_width = max(len(one.name) for one in scenarios)
+    by_robot: dict[str, list[Scenario]] = {}
+    for one in scenarios:
+        by_robot.setdefault(one.robot.name, []).append(one)
+    lines = [f"{len(scenarios)} scenarios of {len(by_robot)} robots"]
+    for robot, chosen in sorted(by_robot.items(), key=lambda item: -len(item[1])):
+        lines += ["", f"{robot}, {len(chosen[0].robot.joints)} joints:"]
+        for one in chosen:
+            start = f"  {one.name:{name_width}} {one.duration_s:5g} s  "
+            wide = max(columns, len(start) + 40)
+            indent = " " * len(start)
+            lines += wrap(one.description, wide, initial_indent=start, subsequent_indent=indent)
+    return lines
+
+
+def _described(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "name": scenario.name,
+        "robot": scenario.robot.name,
+        "joints": len(scenario.robot.joints),
+        "duration_s": scenario.duration_s,
+        "settle_s": scenario.settle_s,
+        "description": scenario.description,
+    }
+
+
+def _closure(recording: Recording) -> float | None:
+    """Greater of the two residuals, as a share of the absolute mechanical work."""
+    energy = recording.energy
+    worst = max(abs(energy["mechanical_residual"]), abs(energy["electrical_residual"]))
+    return worst / energy["mechanical_abs"] if energy["mechanical_abs"] > 0 else None
+
+
+def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[str, Any]:
+    return {
+        "path": str(recording.path),
+        "session_id": recording.session_id,
+        "scenario": scenario.name,
+        "robot": scenario.robot.name,
+        "seed": scenario.seed,
+        "duration_s": recording.duration_s,
+        "planned_duration_s": scenario.duration_s,
+        "settle_s": scenario.settle_s,
+        "complete": recording.complete,
+        "samples": recording.sample_count,
+        "energy_j": recording.energy,
+        "energy_closure": _closure(recording),
+        "obstacle_contact_s": recording.contact_s,
+        "real_time_factor": factor,
+    }
+
+
+def _told(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+    energy, closure = recording.energy, _closure(recording)
+    if recording.complete:
+        first = f"{recording.path}: {recording.duration_s:g} s of {scenario.name}"
+    else:
+        first = (
+            f"stopped at {recording.duration_s:g} s of {scenario.duration_s:g} s; "
+            f"{recording.path} is complete up to there"
+        )
+    who = f"{scenario.robot.name}, {recording.sample_count} samples of "
+    who += f"{len(scenario.robot.joints)} joints, session {recording.session_id}"
+    work = f"mechanical work {energy['mechanical_net']:.3g} J net, "
+    work += (
+        f"{energy['mechanical_abs']:.3g} J absolute; electrical {energy['electrical_net']:.3g} J"
+    )
+    lines = [first, who, work]
+    if closure is not None:
+        lines.append(f"energy ledger closes within {100 * closure:.2g} % of the absolute work")
+    if scenario.world.obstacles:
+        lines.append(_touched(recording.contact_s))
+    lines.append(f"simulated at {factor:.1f} x real time")
+    return lines
+
+
+def _touched(contact_s: dict[str, float]) -> str:
+    """What to say of the links that touched obstacles."""
+    if not contact_s:
+        return "no link touched an obstacle"
+    longest = max(contact_s, key=contact_s.__getitem__)
+    links = "1 link" if len(contact_s) == 1 else f"{len(contact_s)} links"
+    return f"{links} touched obstacles, {longest} longest: {contact_s[longest]:.3g} s"

@@ -1,0 +1,256 @@
+"""The verb ``sim serve``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from undulog.capture.common.console import complain, say
+from undulog.capture.common.errors import UsageError
+
+if TYPE_CHECKING:
+    from undulog.capture.sources.contract import SourceEvent
+    from undulog.capture.sources.sender import FrameSender
+
+    from ..scenario.bus_faults import BusFault
+    from ..scenario.scenario import Scenario
+    from ..serve.bus import VirtualBus
+    from ..serve.robot import Served
+    from ..serve.socketcand_server import SocketcandServer
+
+
+_DEFAULT_HOST = "127.0.0.1"
+_HIGHEST_PORT = 65535
+
+
+def serve(
+    scenario: str,
+    /,
+    *,
+    socketcand: str | None = None,
+    unix: Path | None = None,
+    bus: str = "can0",
+    duration: float | None = None,
+    wait: bool = False,
+    lockstep: bool = False,
+    fast: bool = False,
+    fault: Annotated[tuple[str, ...], Parameter(name="--fault", show_default=False)] = (),
+    seed: int | None = None,
+    json: bool = False,
+) -> int:
+    """Be a robot on a bus: the twin, in real time, in a process of its own.
+
+    Clients reach the bus as one of a socketcand server on this computer; a recorder that listens at
+    a Unix socket gets its frames there, too. Frames are those of the robot's DBC, and so are the
+    commands that the robot takes; the scenario's gait is not looked at. It lives until Ctrl-C or
+    SIGTERM, both of which end it in good order.
+
+    Example: `undulog sim serve flat --socketcand 29536 --wait`
+
+    Then, in other terminals: `undulog record
+    'can:socketcand:can0?port=29536' --robot snake25 -o run.mcap`, and a controller.
+
+    Args:
+        scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
+        socketcand: Serve clients at this `[HOST:]PORT` of the loopback; port 0 for any.
+        unix: Send all frames to the recorder that listens at this path, once it is there.
+        bus: Name of the bus.
+        duration: Simulated seconds to live, rather than until it is stopped.
+        wait: Begin with the first command, so that nobody misses anything.
+        lockstep: Wait at each control tick until every servo has a command for it: the same
+            commands then give the same run, whatever the machine does meanwhile. Begins with the
+            first command, too.
+        fast: With lockstep: don't keep to real time.
+        fault: Something to go wrong, `KIND[:JOINT][:NUMBER][@FROM[+FOR]]`: `lost:joint07:0.1`,
+            `stuck:joint07@5`, `frozen:joint07@5`, `over-current:joint07:1.5@5`, `bus-off@5+2`,
+            `noise:0.001`, `delay:0.02`. May be repeated.
+        seed: Seed of noise and faults, instead of the scenario's.
+        json: Print one JSON object a line: first that it is ready and where, at the end how it
+            went.
+    """
+    from ..scenario.bus_faults import parse_faults
+    from ..scenario.scenario import LONGEST_S
+    from ..scenario.scenario_file import load_scenario
+
+    if socketcand is None and unix is None:
+        raise UsageError("nobody could reach this robot: give --socketcand PORT or --unix PATH")
+    if lockstep and socketcand is None:
+        raise UsageError("in lockstep the robot waits for commands: give --socketcand PORT")
+    if fast and not lockstep:
+        raise UsageError("only in lockstep can the robot be faster than real time")
+    chosen = load_scenario(scenario).changed(
+        duration_s=LONGEST_S if duration is None else duration, seed=seed
+    )
+    if chosen.robot.bus is None:
+        raise UsageError(
+            f"{chosen.robot.name} has no bus map, so there is nothing that it could say on a bus"
+        )
+    plan = _Plan(
+        chosen,
+        None if socketcand is None else parse_address(socketcand),
+        unix,
+        bus,
+        parse_faults(fault, chosen.robot),
+        lockstep=lockstep,
+        wait=wait or lockstep,
+        fast=fast,
+    )
+    report = _Report(plan, json=json)
+    return _run(plan, report)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What to serve, and where."""
+
+    scenario: Scenario
+    address: tuple[str, int] | None
+    unix: Path | None
+    bus: str
+    faults: tuple[BusFault, ...]
+    lockstep: bool
+    wait: bool
+    fast: bool
+
+
+def _run(plan: _Plan, report: _Report) -> int:
+    from undulog.capture.common.interruption import interruptible
+    from undulog.capture.sources.events import EventLog
+    from undulog.capture.sources.sender import FrameSender
+
+    from ..serve.bus import VirtualBus
+    from ..serve.pacing import Pacer
+    from ..serve.robot import PERIOD_NS, VirtualRobot
+    from ..serve.socketcand_server import SocketcandServer
+
+    events = EventLog(time.monotonic_ns)
+    sender = None if plan.unix is None else FrameSender(plan.unix)
+    server = None
+    if plan.address is not None:
+        server = SocketcandServer(*plan.address, plan.bus, events.say)
+    bus = VirtualBus(server, sender, events.say)
+    pacer = Pacer(PERIOD_NS, fast=plan.fast)
+    with interruptible() as stop:
+        try:
+            robot = VirtualRobot(
+                plan.scenario,
+                bus,
+                pacer,
+                faults=plan.faults,
+                lockstep=plan.lockstep,
+                wait=plan.wait,
+                say=events.say,
+                each_tick=lambda: report.events(events.take()),
+                stop=stop,
+            )
+            address = server.address if server else None
+            served = robot.run(lambda: report.ready(address, pacer.epoch_ns))
+        finally:
+            bus.close()
+            report.events(events.flush())
+    report.end(served, bus, server, sender)
+    return 0
+
+
+class _Report:
+    """What is printed: on stdout that it is ready and how it went, on stderr what happens."""
+
+    def __init__(self, plan: _Plan, *, json: bool) -> None:
+        self._plan, self._json = plan, json
+
+    def events(self, events: Iterable[SourceEvent]) -> None:
+        for event in events:
+            complain(f"{event.level}: {event.text}")
+
+    def ready(self, address: tuple[str, int] | None, epoch_ns: int) -> None:
+        plan = self._plan
+        facts = {
+            "event": "ready",
+            "robot": plan.scenario.robot.name,
+            "scenario": plan.scenario.name,
+            "bus": plan.bus,
+            "host": address[0] if address else None,
+            "port": address[1] if address else None,
+            "unix": str(plan.unix) if plan.unix is not None else None,
+            "waits": plan.wait,
+            "epoch_ns": None if plan.fast else epoch_ns,
+        }
+        places = [f"{address[0]}:{address[1]}"] if address else []
+        places += [str(plan.unix)] if plan.unix is not None else []
+        text = f"{plan.scenario.robot.name} is on {plan.bus} at {' and '.join(places)}"
+        self._say(facts, [text + ("; it waits for commands" if plan.wait else "")])
+
+    def end(
+        self,
+        served: Served,
+        bus: VirtualBus,
+        server: SocketcandServer | None,
+        sender: FrameSender | None,
+    ) -> None:
+        facts = {
+            "event": "end",
+            "duration_s": served.duration_s,
+            "complete": served.complete,
+            "start_s": served.start_ns * 1e-9,
+            **asdict(served.pace),
+            "frames": bus.sent,
+            "heard": bus.heard,
+            "commands": served.commands,
+            "lost": served.lost,
+            "hit": served.hit,
+            "dropped_clients": server.dropped if server else 0,
+            "unix_accepted": sender.accepted if sender else None,
+            "unix_refused": sender.refused if sender else None,
+        }
+        self._say(facts, _told(self._plan, served, bus, sender))
+
+    def _say(self, facts: dict[str, Any], lines: list[str]) -> None:
+        say(*([dumps(facts)] if self._json else lines))
+
+
+def _told(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:
+    pace = served.pace
+    first = f"{plan.scenario.robot.name} lived {served.duration_s:g} s of {plan.scenario.name}"
+    if plan.fast:
+        first += ", not in real time"
+    elif plan.lockstep:
+        first += f" in lockstep; its clock stood still for {pace.stood_still_s:.3g} s"
+    elif pace.overruns:
+        first += (
+            f" and fell behind real time: {pace.overruns} of {pace.ticks} ticks came a period or "
+            f"more late, {pace.worst_s:.3g} s at worst"
+        )
+        if pace.stood_still_s:
+            first += f"; its time stood still for {pace.stood_still_s:.3g} s"
+    else:
+        first += f" in real time, {1e3 * pace.worst_s:.2g} ms late at worst"
+    lines = [first, f"{bus.sent} frames sent, {served.commands} commands taken"]
+    if sender is not None:
+        lines.append(f"{sender.refused} frames found no recorder at {sender.path}")
+    if plan.faults or plan.scenario.faults:
+        lines.append(f"faults: {served.lost} replies lost, {served.hit} transmissions hit")
+    return lines
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Take ``[HOST:]PORT`` apart.
+
+    Args:
+        text: E.g. ``29536``, ``localhost:0`` or ``[::1]:29536``.
+
+    Returns:
+        Host, by default the loopback's address, and port.
+
+    Raises:
+        UsageError: If the port is none.
+    """
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and int(port) <= _HIGHEST_PORT):
+        raise UsageError(f"--socketcand {text}: expected [HOST:]PORT, e.g. 29536 or localhost:0")
+    return host.strip("[]") or _DEFAULT_HOST, int(port)

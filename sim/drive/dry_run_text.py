@@ -1,0 +1,196 @@
+"""A dry run in words, the answer first, and as one JSON object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..gate.limits import safety_example
+from .dry_run import DryRun, Verdict
+from .dry_run_table import joint_table
+
+if TYPE_CHECKING:
+    from .dry_run_tally import Demand, JointDemand
+
+
+_NAMED = 3
+_REMARKS = 6
+_SHOWN_AS = {  # of a demand: unit and how many of it are one of SI's
+    "range": ("°", math.degrees(1.0)),
+    "rate": ("°/s", math.degrees(1.0)),
+    "tracking error": ("°", math.degrees(1.0)),
+    "current": ("A", 1.0),
+    "torque": ("N m", 1.0),
+}
+
+
+def told(run: DryRun, width: int) -> Iterator[str]:
+    """Lines for a terminal.
+
+    Args:
+        run: How it went.
+        width: Characters in a line of the table.
+
+    Yields:
+        The answer, what it would take, the joints.
+    """
+    yield from _answer(run)
+    yield from _remarks(run)
+    yield (
+        f"{run.kind} in the twin of {run.robot} in {run.world}, {run.duration_s:g} s; nothing was "
+        "sent, and no bus opened"
+    )
+    yield _approach(run)
+    seconds = max(run.duration_s, 1e-9)
+    net, absolute, electrical = run.energy_j
+    yield (
+        f"energy: mechanical {net:.3g} J net and {absolute:.3g} J absolute, electrical "
+        f"{electrical:.3g} J; mean power {net / seconds:.3g} W and {electrical / seconds:.3g} W"
+    )
+    if run.path is not None:
+        yield f"session of the twin: {run.path}"
+    yield ""
+    yield from joint_table(run.joints, width)
+
+
+def _answer(run: DryRun) -> Iterator[str]:
+    what, near = f"{run.driven} on {run.robot}", _nearest(run)
+    match run.verdict:
+        case Verdict.RUNS:
+            yield f"{what} would run as it is; {near}"
+        case Verdict.CLAMPED:
+            yield f"{what} would run, clamped: {_clamps(run)}; {near}"
+        case Verdict.STOPS:
+            when = f"at {run.duration_s:.2f} s" if run.started else "on the way to the first pose"
+            why = run.fault.text if run.fault is not None else ""
+            yield f"{what} would stop {when}: {why}"
+        case Verdict.UNFINISHED:
+            yield (
+                f"{what}: not known, the dry run was stopped at {run.duration_s:g} s of "
+                f"{run.planned_s:g} s; {near}"
+            )
+        case Verdict.REFUSED:
+            yield (
+                f"{what} would not start: {run.robot} lacks the limits {', '.join(run.missing)}; "
+                f"{near}"
+            )
+            yield "Its description needs this, with values of its own; --robot names the file:"
+            yield from (f"  {line}" for line in safety_example(run.missing).splitlines())
+
+
+def _nearest(run: DryRun) -> str:
+    """What comes closest to its limit."""
+    found = run.closest
+    if found is None:
+        return "it has no limits to come close to"
+    joint, demand = found
+    unit, scale = _SHOWN_AS[demand.name]
+    return (
+        f"closest to a limit: {joint}, {demand.name} {scale * demand.value:.3g} of "
+        f"{scale * demand.limit:.3g} {unit} ({demand.share:.0%})"
+    )
+
+
+def _clamps(run: DryRun) -> str:
+    named = [
+        f"{joint.name} {joint.clamped:.0%} of the time" for joint in run.joints if joint.clamped
+    ]
+    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+    cut = f"cut to the joint limits: {', '.join(run.cut)}" if run.cut else ""
+    return "; ".join(part for part in (", ".join(named[:_NAMED]) + more, cut) if part)
+
+
+def _remarks(run: DryRun) -> Iterator[str]:
+    """What the gate would change, and why."""
+    found = [remark.text for remark in run.remarks if remark.level == "warn"]
+    yield from (f"  {text}" for text in found[:_REMARKS])
+    if len(found) > _REMARKS:
+        yield f"  and {len(found) - _REMARKS} more of this kind; --json has all"
+
+
+def _approach(run: DryRun) -> str:
+    if np.isnan(run.first_pose).any():
+        return "first pose: not known"
+    farthest = max(range(len(run.joints)), key=lambda i: abs(run.first_pose[i]))
+    angle = math.degrees(run.first_pose[farthest])
+    if run.approach_s == 0.0:
+        return "first pose: straight joints"
+    how_long = f"a ramp of {run.approach_s:.2f} s from straight joints"
+    if math.isnan(run.approach_s):
+        how_long = "no ramp_rate says how fast to go there"
+    return f"first pose: {run.joints[farthest].name} farthest, at {angle:.1f}°; {how_long}"
+
+
+def reported(run: DryRun) -> dict[str, Any]:
+    """The dry run as plain JSON values.
+
+    Args:
+        run: How it went.
+
+    Returns:
+        SI units; what isn't known, or has no limit, is None.
+    """
+    found = run.closest
+    net, absolute, electrical = run.energy_j
+    seconds = max(run.duration_s, 1e-9)
+    return {
+        "armed": False,
+        "driven": run.driven,
+        "kind": run.kind,
+        "robot": run.robot,
+        "world": run.world,
+        "verdict": str(run.verdict),
+        "would_run": run.verdict.fit,
+        "duration_s": run.duration_s,
+        "planned_duration_s": run.planned_s,
+        "stop": _stop(run),
+        "missing_limits": list(run.missing),
+        "closest": None if found is None else {"joint": found[0], **_demand(found[1])},
+        "first_pose": list(run.first_pose),
+        "approach_s": _known(run.approach_s),
+        "energy_net_j": net,
+        "energy_abs_j": absolute,
+        "energy_el_j": electrical,
+        "power_net_w": net / seconds,
+        "power_el_w": electrical / seconds,
+        "cut": list(run.cut),
+        "remarks": [{"level": one.level, "text": one.text} for one in run.remarks],
+        "joints": [_joint(joint) for joint in run.joints],
+        "path": None if run.path is None else str(run.path),
+    }
+
+
+def _stop(run: DryRun) -> dict[str, Any] | None:
+    fault = run.fault
+    if fault is None:
+        return None
+    return {
+        "time_s": run.duration_s if run.started else None,
+        "why": fault.text,
+        "kind": str(fault.kind),
+        "joint": fault.joint or None,
+        "value": fault.value,
+        "limit": fault.limit,
+    }
+
+
+def _joint(joint: JointDemand) -> dict[str, Any]:
+    values = {name: _known(value) for name, value in vars(joint).items()}
+    shares = {demand.name.replace(" ", "_"): _known(demand.share) for demand in joint.demands}
+    return {**values, "margin": joint.margin, "share": shares}
+
+
+def _demand(demand: Demand) -> dict[str, Any]:
+    return {
+        "quantity": demand.name,
+        "value": demand.value,
+        "limit": demand.limit,
+        "share": demand.share,
+    }
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,1 @@
+"""Models of identical modules, from runs of the twin."""

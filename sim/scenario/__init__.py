@@ -1,0 +1,1 @@
+"""Scenarios: every parameter of a simulation, and its TOML."""

@@ -1,0 +1,1 @@
+"""The twin: stepped, recorded, or as a source of the recorder."""

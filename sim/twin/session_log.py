@@ -1,0 +1,227 @@
+"""The twin's samples, written to the log contract.
+
+What the sensors tell is written when it arrives at the robot's computer: ``header.stamp`` is the
+sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
+joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
+means over one control period (:mod:`.sim.sensing.polling`). Their products miss what happens within
+a period, so each joint's powers are logged besides, accumulated at the physics rate. Commands,
+gait, odometry, powers and ledger are the twin's own; powers carry the middle of their period, the
+others the tick. Time is simulated: nothing of the machine's clock enters the file, and the same
+scenario gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+
+import numpy as np
+
+from undulog.capture.log.messages.power_topics import PowerTopic
+from undulog.capture.log.write.sensor_channels import open_sensor
+from undulog.capture.log.write.writer import SessionWriter
+from undulog.capture.robot.kinematics import rotation_from_quaternion
+
+from ..physics.energy_flows import JOINT_TERMS
+from ..physics.ledger import TERMS
+from ..scenario.engines import Kernels
+from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from ..sensing.contract import JointSample, RangeSample, SensorSample
+from .stability import warnings
+from .twin import Sample, Twin
+from .urdf import frame_origins, urdf
+
+GAIT_UNIT = "rad, omega in rad/s"
+"""Unit of the values on ``/gait``."""
+
+_TF_EVERY = 5  # ticks: 20 Hz, a view aid
+_TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
+_POWER_TERMS = {
+    PowerTopic.MECHANICAL: JOINT_TERMS.index("mechanical_net"),
+    PowerTopic.MECHANICAL_PLUS: JOINT_TERMS.index("mechanical_plus"),
+    PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
+    PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
+}
+"""Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged."""
+
+_POWER_PER_W = float(2**24)
+"""Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes."""
+
+
+def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mapping[str, str]:
+    """What the session's metadata says about the run.
+
+    Args:
+        scenario: The scenario.
+        kernels: What computes the force laws.
+
+    Returns:
+        Names to text: scenario, seed, times, the joints' sampling, and versions.
+    """
+    return {
+        "scenario": scenario.name,
+        "seed": str(scenario.seed),
+        "planned_duration_s": repr(scenario.duration_s),
+        "settle_s": repr(scenario.settle_s),
+        "physics_rate_hz": str(scenario.physics_rate_hz),
+        "joint_sampling": _sampling(scenario.sensing.servo.slot_s),
+        "engine": scenario.engine,
+        "kernels": kernels,
+        scenario.engine.package: version(scenario.engine.package),
+        **{name: version(name) for name in ("numpy", kernels)},
+        "python": platform.python_version(),
+    }
+
+
+class SessionLog:
+    """Writes one run into an open session."""
+
+    def __init__(self, writer: SessionWriter, twin: Twin, *, epoch_ns: int | None = None) -> None:
+        """Open the channels and store what explains the run.
+
+        Args:
+            writer: The session; the log does not close it.
+            twin: What will be run.
+            epoch_ns: Unix time of the first sample [ns]; that of the scenario by default.
+        """
+        scenario = self._scenario = twin.scenario
+        self._epoch_ns = scenario.epoch_ns if epoch_ns is None else epoch_ns
+        robot = scenario.robot
+        names, head = robot.joint_names, robot.links[0].name
+        description = urdf(robot)
+        writer.attach("robot.urdf", "application/xml", description.encode())
+        writer.attach("scenario.toml", "application/toml", scenario.toml().encode())
+        self._commands = writer.joint_state("/joint_commands", names, unit="rad")
+        self._states = writer.joint_state(
+            "/joint_states", names, unit="rad", velocity=True, effort=True
+        )
+        self._offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
+        self._current = writer.joint_state("/joint_current", names, unit="A")
+        self._voltage = writer.joint_state("/joint_voltage", names, unit="V")
+        told = twin.gait.names  # recorded commands may come without their gait
+        self._gait = writer.joint_state("/gait", told, unit=GAIT_UNIT) if told else None
+        self._powers = {topic: writer.joint_state(topic, names, unit="W") for topic in _POWER_TERMS}
+        self._booked = 0, np.zeros((len(JOINT_TERMS), len(names)))
+        self._energy = writer.joint_state("/energy_ledger", TERMS, unit="J")
+        self._odometry = writer.odometry("/odom", frame="world", child=head)
+        self._transforms = writer.transforms(
+            "/tf", parent="world", children=[link.name for link in robot.links]
+        )
+        sensors = robot.sensors if scenario.sensing.enabled else ()
+        self._sensors = {one.name: open_sensor(writer, one) for one in sensors}
+        self._mode = writer.string("/gait/mode")
+        self._events = writer.log("/rosout")
+        self._lower, self._upper = robot.limits()
+        self._last_mode = ""
+        self._said: set[str] = set()
+        self._t_ns = self._epoch_ns
+        writer.string("/robot_description").write(self._t_ns, description)
+        for text in warnings(scenario):
+            self.say("warn", text)
+        if scenario.faults:
+            text = "the scenario's faults are those of a bus, which this run does not have"
+            self.say("warn", text)
+        self.say("info", f"start of {scenario.name}, seed {scenario.seed}: {scenario.description}")
+
+    def say(self, level: str, text: str) -> None:
+        """Write an event, once.
+
+        Args:
+            level: ``info``, ``warn`` or ``error``.
+            text: What happened.
+        """
+        if text not in self._said:
+            self._said.add(text)
+            self._events.write(self._t_ns, level, "twin", text)
+
+    def write(self, sample: Sample) -> None:
+        """Write one sample to all channels.
+
+        Args:
+            sample: The twin's sample.
+        """
+        t_ns = self._t_ns = self._epoch_ns + sample.tick * _TICK_NS
+        body = sample.step.body
+        self._commands.write(t_ns, sample.gait.command)
+        self.hear(sample.sensed)
+        if self._gait is not None:
+            self._gait.write(t_ns, sample.gait.values)
+        self._energy.write(t_ns, sample.energy)
+        self._write_powers(sample)
+        position, quaternion = body.position[:, 0], body.quaternion[:, 0]
+        into_head = rotation_from_quaternion(quaternion).T
+        self._odometry.write(
+            t_ns, position, quaternion, into_head @ body.velocity[:, 0], into_head @ body.spin[:, 0]
+        )
+        if sample.tick % _TF_EVERY == 0:
+            centres, turns = body.position.T, body.quaternion.T
+            origins = frame_origins(self._scenario.robot, centres, turns)
+            self._transforms.write(t_ns, origins, turns)
+        if sample.gait.mode != self._last_mode:
+            self._last_mode = sample.gait.mode
+            self._mode.write(t_ns, sample.gait.mode)
+        self._note(sample)
+
+    def hear(self, samples: Sequence[SensorSample]) -> None:
+        """Write what the sensors told, as arrived by the time of the last sample written.
+
+        Args:
+            samples: From :attr:`Sample.sensed`, or from :meth:`Twin.flush` at the end of the run.
+        """
+        for sample in samples:
+            if isinstance(sample, JointSample):
+                self._write_joints(sample)
+            else:
+                ranged = isinstance(sample, RangeSample)
+                values = np.array([sample.distance]) if ranged else sample.vector
+                t_ns = self._epoch_ns + round(sample.time_s * 1e9)
+                self._sensors[sample.name](values, t_ns, self._t_ns)
+
+    def _write_joints(self, sample: JointSample) -> None:
+        t_ns, now_ns = self._epoch_ns + sample.cycle * _TICK_NS, self._t_ns
+        states = sample.position, sample.velocity, sample.effort
+        self._states.write(t_ns, *states, log_time_ns=now_ns)
+        self._offsets.write(t_ns, sample.offset_s, log_time_ns=now_ns)
+        self._current.write(t_ns, sample.current, log_time_ns=now_ns)
+        self._voltage.write(t_ns, sample.voltage, log_time_ns=now_ns)
+
+    def _write_powers(self, sample: Sample) -> None:
+        """Write the joints' mean powers since the sample before."""
+        (tick, energy), self._booked = self._booked, (sample.tick, sample.joint_energy)
+        if sample.tick == tick:  # the first sample
+            return
+        length_ns = (sample.tick - tick) * _TICK_NS
+        power = (sample.joint_energy - energy) * (1e9 / length_ns)
+        power = np.rint(power * _POWER_PER_W) / _POWER_PER_W
+        middle_ns = self._t_ns - length_ns // 2
+        for topic, row in _POWER_TERMS.items():
+            self._powers[topic].write(middle_ns, power[row], log_time_ns=self._t_ns)
+
+    def _note(self, sample: Sample) -> None:
+        """Say what deserves saying about a sample."""
+        if sample.tick == round(self._scenario.settle_s * CONTROL_RATE_HZ):
+            self.say("info", f"settled: {self._scenario.settle_s:g} s have passed")
+        target = self._scenario.world.target
+        head = sample.step.body.position[:2, 0]
+        if target is not None and math.dist(head, target.position) <= target.radius:
+            self.say("info", "the head has met the target")
+        for name in sample.gait.clamped:
+            self.say("warn", f"{name} clamped to the joint limits")
+        angle = sample.step.body.angle
+        for i in np.flatnonzero((angle < self._lower) | (angle > self._upper)):
+            joint = self._scenario.robot.joints[i]
+            self.say(
+                "warn", f"{joint.name} passed its limits {joint.lower:g} to {joint.upper:g} rad"
+            )
+
+
+def _sampling(slot_s: float) -> str:
+    """How the joints are sampled, in words."""
+    at = (
+        f"each joint {slot_s:g} s after the one before it, at the stamp plus /joint_sample_offset"
+        if slot_s
+        else "all joints at the stamp"
+    )
+    return f"{at}; effort, current and voltage are means over one control period around it"

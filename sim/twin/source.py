@@ -1,0 +1,183 @@
+"""The twin as a source of a recording: ``twin:SCENARIO``, in real time or as fast as it can."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from queue import Empty, Full, Queue
+
+from undulog.capture.common.errors import SimulationError, SourceError, UndulogError, UsageError
+from undulog.capture.robot.model import ClockDomain, Robot
+from undulog.capture.sources.contract import (
+    Polled,
+    SourceAddress,
+    SourceContext,
+    SourceCounts,
+    SourceEvent,
+)
+
+from ..physics.engine import engine_type
+from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from ..scenario.scenario_file import load_scenario
+from .session_log import SessionLog, session_facts
+from .twin import Sample, Twin
+
+_AHEAD = 100
+"""Samples that the twin may be ahead of the recording."""
+
+_PERIOD_NS = 1_000_000_000 // CONTROL_RATE_HZ
+
+
+class TwinSource:
+    """Runs a scenario beside the recorder, in a thread of its own."""
+
+    def __init__(self, address: SourceAddress, scenario: Scenario) -> None:
+        """Wrap a scenario; :meth:`start` runs it.
+
+        Args:
+            address: The source as it was asked for.
+            scenario: What to run.
+        """
+        self.name = address.name
+        self.clock = ClockDomain.SIMULATED
+        self.directions = False
+        self.robot: Robot | None = scenario.robot
+        self.counts = SourceCounts()
+        self._address = address
+        self._scenario = scenario
+        self._queue: Queue[Sample | UndulogError | None] = Queue(_AHEAD)
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._log: SessionLog | None = None
+        self._twin: Twin | None = None
+        self._context: SourceContext | None = None
+        self._finished = False
+
+    @property
+    def facts(self) -> Mapping[str, str]:
+        """What the session's metadata says of the run."""
+        return session_facts(self._scenario)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the twin runs."""
+        return self._thread is not None and not self._finished
+
+    @property
+    def finished(self) -> bool:
+        """Whether the scenario has ended and all its samples are written."""
+        return self._finished
+
+    def start(self, context: SourceContext) -> None:
+        """Set the robot on the ground and let it go.
+
+        Args:
+            context: The recording; its fact ``fast`` lets the twin run as fast as it can, and
+                ``duration_s`` is how long it runs, rather than as long as the scenario says.
+
+        Raises:
+            SourceError: If the engine cannot hold the robot, or can't run so long.
+        """
+        self._context = context
+        try:
+            self._begin(context)
+        except UsageError as error:
+            raise SourceError(self._address.text, str(error)) from error
+
+    def _begin(self, context: SourceContext) -> None:
+        duration_s = context.facts.get("duration_s")
+        if duration_s is not None:
+            self._scenario = self._scenario.changed(duration_s=float(duration_s))
+        self._twin = Twin(self._scenario)
+        self._log = SessionLog(context.writer, self._twin, epoch_ns=context.now_ns())
+        fast = context.facts.get("fast") == "true"
+        self._thread = threading.Thread(target=self._run, args=(fast,), name=self.name, daemon=True)
+        self._thread.start()
+
+    def poll(self) -> Polled:
+        """Write the samples that are due.
+
+        Returns:
+            Events only: the samples are on the twin's own channels by then.
+
+        Raises:
+            LogWriteError: If the session can't be written.
+        """
+        events: list[SourceEvent] = []
+        while not self._finished and self._log is not None and self._context is not None:
+            try:
+                item = self._queue.get_nowait()
+            except Empty:
+                break
+            if isinstance(item, Sample):
+                self._log.write(item)
+                self.counts.dropped = item.tick - self.counts.frames  # ticks are numbered from 0
+                self.counts.frames += 1
+                continue
+            self._finished = True
+            if self._twin is not None:
+                self._log.hear(self._twin.flush())
+            now_ns = self._context.now_ns()
+            if item is None:
+                events.append(SourceEvent(now_ns, "info", f"{self._scenario.name} has ended"))
+            else:
+                events.append(SourceEvent(now_ns, "error", str(item)))
+        return Polled(events=tuple(events))
+
+    def stop(self) -> None:
+        """End the run; safe to call twice."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._twin is not None:
+            self._twin.close()
+            self._twin = None
+
+    def _run(self, fast: bool) -> None:
+        """In the thread: samples into the queue, each not before its time."""
+        assert self._twin is not None  # noqa: S101 - start made it
+        begun = time.monotonic_ns()
+        last: UndulogError | None = None
+        try:
+            for sample in self._twin.samples():
+                ahead_s = (begun + sample.tick * _PERIOD_NS - time.monotonic_ns()) * 1e-9
+                if not fast and ahead_s > 0:
+                    self._ended.wait(ahead_s)
+                if not self._put(sample):
+                    return
+        except SimulationError as error:
+            last = error
+        self._put(last)
+
+    def _put(self, item: Sample | UndulogError | None) -> bool:
+        while not self._ended.is_set():
+            try:
+                self._queue.put(item, timeout=0.1)
+            except Full:
+                continue
+            return True
+        return False
+
+
+def open_twin(address: SourceAddress) -> TwinSource:
+    """Open a scenario as a source.
+
+    Args:
+        address: ``twin:SCENARIO``, a shipped name or a TOML file.
+
+    Returns:
+        The source.
+
+    Raises:
+        UsageError: If there is no such scenario, or an option is given.
+        ScenarioError: If the scenario's file has faults.
+        ImportError: If its engine is not installed.
+    """
+    if address.options:
+        given = ", ".join(address.options)
+        raise UsageError(f"{address.text}: a twin takes no options; found {given}")
+    scenario = load_scenario(address.rest)
+    engine_type(scenario.engine)  # is told before a recording is begun
+    return TwinSource(address, scenario)

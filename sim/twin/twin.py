@@ -1,0 +1,190 @@
+"""The twin: a robot in its world, its sensors and its gait.
+
+Physics runs at the scenario's rate (1 kHz by default), control and samples at 100 Hz. Within a
+control period the commands are held, as a servo bus holds them. A period is simulated to its end,
+then the sensors look at all of it, then the gait is asked with what they have told by then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import SimulationError
+
+from ..control.build import build_gait
+from ..gait.contract import Gait, GaitTick
+from ..physics.ledger import Ledger
+from ..physics.plant import Plant
+from ..physics.steps import Step, Steps
+from ..scenario.engines import Kernels
+from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from ..sensing.contract import SensorSample
+from ..sensing.quantise import quantised
+from ..sensing.senses import Senses
+from .stability import likely_cause
+
+MAX_SPEED = 10.0
+"""No link of an undulating robot is faster than this [m/s]: beyond it the simulation has failed."""
+
+MAX_ROTOR_SPEED = 1000.0
+"""No servo turns faster than this, referred to its joint [rad/s]."""
+
+
+class Sample(NamedTuple):
+    """The twin at one control tick.
+
+    Attributes:
+        tick: Number of the control period, from 0.
+        gait: What the gait commands from here on.
+        step: Body, ground, rotors and servos at this instant.
+        sensed: The sensors' samples that have arrived since the tick before; the newest ones
+            arrive after the run, by :meth:`Twin.flush`.
+        energy: The ledger up to here [J], as :data:`.sim.physics.ledger.TERMS`, shape (23,).
+        contact_s: For how long each link has touched an obstacle so far [s], shape (n,).
+        joint_energy: The part of each joint in it [J], rows as
+            :data:`.sim.physics.energy_flows.JOINT_TERMS`, shape (9, m).
+    """
+
+    tick: int
+    gait: GaitTick
+    step: Step
+    sensed: list[SensorSample]
+    energy: FloatArray
+    contact_s: FloatArray
+    joint_energy: FloatArray
+
+    @property
+    def time_s(self) -> float:
+        """Time since the start [s]."""
+        return self.tick / CONTROL_RATE_HZ
+
+
+class Twin:
+    """One robot in its world; use it in a ``with`` block, and run it with :meth:`samples`.
+
+    Attributes:
+        scenario: What it runs.
+        gait: Its gait.
+        sensed: Sensor samples that arrive by the present tick, there before the gait is asked: a
+            gait that speaks over a bus hands them out first.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        gait: Gait | None = None,
+        *,
+        kernels: Kernels = Kernels.NUMPY,
+    ) -> None:
+        """Set the robot on the ground, straight, its servos at rest, in vertical balance.
+
+        Args:
+            scenario: What to run.
+            gait: Who commands the joints; the scenario's own gait if None.
+            kernels: What computes the force laws.
+
+        Raises:
+            UsageError: If the engine cannot hold the robot.
+            ImportError: If the engine or the kernels are not installed.
+        """
+        robot, world = scenario.robot, scenario.world
+        self.scenario = scenario
+        self.gait: Gait = gait or build_gait(scenario)
+        self.sensed: list[SensorSample] = []
+        self._sensing = Senses(scenario)
+        self._plant = Plant(scenario, kernels)
+        self._ledger = Ledger(
+            robot,
+            self._plant.servos,
+            gravity=np.array(world.gravity),
+            stiffness=world.ground.stiffness if world.ground is not None else 0.0,
+            obstacle_stiffness=world.obstacle_contact.stiffness,
+            dt=self._plant.dt,
+            start=self._plant.now,
+            kernels=kernels,
+        )
+
+    def __enter__(self) -> Self:
+        """Enter the block that owns the physics world."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Free the physics world."""
+        self.close()
+
+    def close(self) -> None:
+        """Free the physics world; the twin can't be run any more."""
+        self._plant.close()
+
+    def samples(self) -> Iterator[Sample]:
+        """Run the scenario, once.
+
+        Yields:
+            A sample at the start of every control period, and one at the end of the last.
+
+        Raises:
+            SimulationError: If the state becomes impossible.
+        """
+        resolution = self.scenario.sensing.servo.command_resolution
+        for tick in range(self.scenario.tick_count):
+            time_s = tick / CONTROL_RATE_HZ
+            if tick:
+                steps = self._plant.advance()
+                self._check(steps, time_s - 1 / CONTROL_RATE_HZ)
+                self._ledger.book(steps)
+                self.sensed = self._sensing.observe(steps)
+            gait = self.gait.step(time_s, self._sensing.readings)
+            gait = gait._replace(command=quantised(gait.command, resolution))
+            self._plant.command(gait.command)
+            step = self._plant.now
+            ledger = self._ledger
+            booked = ledger.read(step), ledger.contact_s, ledger.joints
+            yield Sample(tick, gait, step, self.sensed, *booked)
+
+    def flush(self) -> list[SensorSample]:
+        """End the run, wherever it stands: sensor samples that have not arrived yet.
+
+        Returns:
+            These samples, in the order of their arrival.
+        """
+        return self._sensing.flush()
+
+    def _check(self, steps: Steps, start_s: float) -> None:
+        """Refuse an impossible state.
+
+        Args:
+            steps: A control period.
+            start_s: When it starts [s].
+
+        Raises:
+            SimulationError: If there is one.
+        """
+        motion, rotors = np.abs(steps.links[:, 7:10]), np.abs(steps.motors[:, 1])
+        if motion.max() <= MAX_SPEED and rotors.max() <= MAX_ROTOR_SPEED:  # false for NaN
+            return
+        speed = motion.max(axis=1)
+        sound = rotors <= MAX_ROTOR_SPEED  # false for NaN
+        k = int(np.argmin(sound.all(axis=1) & (speed <= MAX_SPEED).all(axis=1)))
+        if not sound[k].all():  # a servo that runs away throws links, hardly the other way round
+            joint = int(np.argmax(rotors[k]))  # NaN before all numbers
+            name = self.scenario.robot.joints[joint].name
+            what = f"the servo of {name} turns at {rotors[k, joint]:g} rad/s"
+            bound = f"{MAX_ROTOR_SPEED:g} rad/s"
+        else:
+            link = int(np.argmax(speed[k]))
+            name = self.scenario.robot.links[link].name
+            what, bound = f"{name} moves at {speed[k, link]:g} m/s", f"{MAX_SPEED:g} m/s"
+        raise SimulationError(
+            f"the twin failed at {start_s + k * self._plant.dt:.3f} s: {what}, more than {bound}; "
+            f"{likely_cause(self.scenario)}"
+        )
