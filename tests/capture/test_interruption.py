@@ -49,7 +49,7 @@ def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
 
 def test_the_second_signal_acts_as_usual() -> None:
     code = (
-        "import time; from undulog.capture.interruption import interruptible\n"
+        "import time; from undulog.capture.common.interruption import interruptible\n"
         "with interruptible() as stop:\n"
         "    print('in', flush=True)\n"
         "    while not stop.requested: time.sleep(1e-3)\n"
