@@ -1,5 +1,7 @@
 """What display tests share: a Chromium, or a skip that says so."""
 
+import contextlib
+import ctypes
 import ctypes.util
 import json
 import os
@@ -23,6 +25,34 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, lambda *_: None)
+
+PR_SET_CHILD_SUBREAPER = 36
+# Processes that a failed test leaves behind become children of this one, which ends them.
+ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def _children():
+    """Processes whose parent this one is; multiprocessing ends its tracker itself."""
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            with contextlib.suppress(OSError):
+                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+                if parent == os.getpid() and b"tracker" not in (folder / "cmdline").read_bytes():
+                    yield int(folder.name)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """End what is still running."""
+    for _ in range(10):  # the children of those that end come here, too
+        found = list(_children())
+        for pid in found:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+        if not found:
+            return
+
 
 REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
