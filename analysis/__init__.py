@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .compare.decisions import Margins
     from .experiment.analyse import analyse_experiment
     from .present.notebook.files import load
-    from .present.notebook.picture import Picture
+    from .present.notebook.pictures import Picture
     from .present.text.table import render
     from .results.analysis import Analysis, Index, JointResult
     from .results.comparison import Comparison
@@ -61,7 +61,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "LocalCoupling": "results.coupling",
         "Margins": "compare.decisions",
         "Options": "signals.stretch",
-        "Picture": "present.notebook.picture",
+        "Picture": "present.notebook.pictures",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
         "analyse_session": "session.analyse",

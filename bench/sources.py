@@ -33,9 +33,8 @@ import numpy as np
 
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.frames import FRAME_DTYPE, empty_frames
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext
-from undulog.capture.sources.registry import open_source
 
 TICK_S = 0.005
 STREAM_S = 60.0

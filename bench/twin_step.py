@@ -23,7 +23,7 @@ from collections.abc import Callable
 import pybullet
 
 from undulog.capture.robot.model import Plane, Robot
-from undulog.sim.gait.readings import Readings
+from undulog.sim.gait.contract import Readings
 from undulog.sim.gait.serpentine import SerpentineGait
 from undulog.sim.scenario.engines import EngineKind, Kernels
 from undulog.sim.scenario.scenario import CONTROL_RATE_HZ, Scenario

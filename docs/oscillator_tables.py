@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.analysis.oscillators.comparator import homogeneous
 from undulog.analysis.oscillators.laplacian import spectrum
+from undulog.analysis.oscillators.predictions import homogeneous
 
 TESTS = Path(__file__).parents[1] / "tests" / "analysis" / "oscillators"
 shared = runpy.run_path(str(TESTS / "closed_loop.py"))

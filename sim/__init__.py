@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING
 from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
-    from .gait.contract import Gait, GaitTick
-    from .gait.readings import Readings
+    from .gait.contract import Gait, GaitTick, Readings
     from .gait.serpentine import Serpentine, SerpentineGait
     from .gait.wave import PlaneGait, Wave
     from .scenario.field import RandomField
-    from .scenario.ground import FrictionLaw, Ground
     from .scenario.obstacles import Box, Cylinder, ObstacleMaterial, Target, Wall
     from .scenario.scenario import Scenario
     from .scenario.scenario_file import load_scenario, parse_scenario, scenario_names
@@ -30,7 +28,7 @@ if TYPE_CHECKING:
         ServoPolling,
         SonarModel,
     )
-    from .scenario.world import World
+    from .scenario.world import FrictionLaw, Ground, World
     from .twin.recording import record
     from .twin.twin import Twin
 
@@ -41,16 +39,16 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "Box": "scenario.obstacles",
         "CompassModel": "scenario.sensors",
         "Cylinder": "scenario.obstacles",
-        "FrictionLaw": "scenario.ground",
+        "FrictionLaw": "scenario.world",
         "Gait": "gait.contract",
         "GaitTick": "gait.contract",
-        "Ground": "scenario.ground",
+        "Ground": "scenario.world",
         "InfraredModel": "scenario.sensors",
         "Noise": "scenario.sensors",
         "ObstacleMaterial": "scenario.obstacles",
         "PlaneGait": "gait.wave",
         "RandomField": "scenario.field",
-        "Readings": "gait.readings",
+        "Readings": "gait.contract",
         "Scenario": "scenario.scenario",
         "SensorModels": "scenario.sensors",
         "Serpentine": "gait.serpentine",

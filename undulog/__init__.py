@@ -53,7 +53,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "Say whether a session is good, degraded or bad, and why.",
     ),
     "log recover": (
-        "undulog.capture.commands.log_recover:log_recover",
+        "undulog.capture.commands.log_edit:log_recover",
         "Write a whole file from what a crash left.",
     ),
     "log cut": (
@@ -234,7 +234,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
-    from undulog.capture.common.deferred import defer
+    from undulog.capture.common.lazy import defer
 
     defer()
     if not sys.stderr.isatty():

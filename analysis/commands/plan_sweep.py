@@ -56,7 +56,7 @@ def lag_sweep(
     """
 
     def design(base: BaseGait) -> tuple[PlannedRun, ...]:
-        from ..plan.sweep_designs import lag_sweep as sweep
+        from ..plan.designs import lag_sweep as sweep
 
         return sweep(len(base.driven), amplitude, runs)
 
@@ -99,13 +99,13 @@ def multisine(
         raise UsageError("--tones is at least 2; for one frequency there is plan lag-sweep")
 
     def design(base: BaseGait) -> tuple[PlannedRun, ...]:
-        from ..plan.sweep_designs import multisine as sines
-        from ..plan.sweep_designs import tones as choose
+        from ..plan.designs import multisine as sines
+        from ..plan.designs import tones as choose
 
         return sines(len(base.driven), amplitude, choose(base.omega, tones), runs)
 
     def whole_periods(base: BaseGait) -> float:
-        from ..plan.sweep_designs import period_s
+        from ..plan.designs import period_s
 
         period = period_s(base.omega, tones)
         return math.ceil(measure / period - 1e-6) * period

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json
 from undulog.capture.common.errors import DataError, UsageError
-from undulog.capture.common.part_file import check_output
+from undulog.capture.common.files import check_output
 
 from .options import chosen, show
 
@@ -62,7 +62,7 @@ def predict(
     from dataclasses import asdict
     from json import dumps
 
-    from undulog.capture.common.part_file import write_text
+    from undulog.capture.common.files import write_text
 
     from ..experiment.kicks.prediction import closed_loop
     from ..present.text.closed_loop import render_loop

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, say
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.part_file import check_output, write_text
+from undulog.capture.common.files import check_output, write_text
 
 from .options import PAGES, chosen
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
-from ..estimators.intervals import around
+from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p
 from ..results.comparison import BODY, Difference, Equivalence, NamedJoint
 from ..results.estimate import Estimate
 from .differences import Differences, Quantities, from_runs, holm, independent, paired

@@ -16,8 +16,7 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Robot
 
-from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
-from ..estimators.intervals import CONFIDENCE
+from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..oscillators.body import body_oscillators
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
@@ -38,22 +37,17 @@ from ..session.runs import (
     sort_runs,
 )
 from ..signals.stretch import Options
-from .answer import broken_first, experiment_answer
+from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
 from .indices import experiment_indices
-from .kick_answer import kick_answer
 from .kicks.coupling import kick_coupling
-from .kicks.experiment import find_kicks
 from .kicks.matrices import ROW_TOLERANCE
-from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME
-from .pooled_answer import pooled_answer
-from .pooling import PooledResponse, pool_runs
+from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
+from .pooling import PooledResponse, pool_runs, pooled_answer
 from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
-from .reversal.modules import SAME_HEADING_RAD, SIGNIFICANT, reversal_of
-from .reversal.shares import RESAMPLES
+from .reversal.modules import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, reversal_of
 from .reversal.tilt import floor_lean
 from .sweep.coupling import NONLINEAR, sweep_coupling
 from .sweep.runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
-from .sweep_answer import sweep_answer
 
 _LOW_FLOOR = 0.01
 """A p-value that can't go below this leaves little room under the level."""

@@ -9,8 +9,7 @@ from scipy.special import stdtridf
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..estimators.intervals import CONFIDENCE
-from ..estimators.norm_ratio import noise_draws
+from ..estimators.intervals import CONFIDENCE, noise_draws
 from ..results import formats
 from ..results.coupling import LocalCoupling, Matrix, rows_of
 from ..results.estimate import Estimate
@@ -22,10 +21,8 @@ from ..results.oscillators import (
     Mode,
     RelativeCoupling,
 )
-from .comparator import explicit_coupling, homogeneous
-from .entrainment import entrainment
-from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, spectrum
-from .pseudospectrum import pseudospectrum
+from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, pseudospectrum, spectrum
+from .predictions import entrainment, explicit_coupling, homogeneous
 
 EXPLICIT_DRAWS = 100
 """Draws of P for the interval of the explicit coupling, each a root to find."""

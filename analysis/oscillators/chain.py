@@ -8,14 +8,66 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import fdtrc
 
+from undulog.capture import Session
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..results.deciding import beyond, percent
 from ..results.estimate import Estimate
 from ..results.oscillators import ChainCoupling, Link, Rate
-from .pieces import between_kicks
-from .weak_form import OscillatorFit, fit_oscillator, window_length
+from .phase_log import read_phases
+from .weak_form import OscillatorFit, Piece, fit_oscillator, window_length
+
+LEAST_KICK = 0.1
+"""A phase that jumps by less between two samples, against those beside them, isn't kicked [rad]."""
+
+BEYOND_NOISE = 8.0
+"""A jump must stand out of the noise of the steps by this many standard deviations, too."""
+
+_SIGMA_OF_MAD = 1.4826
+
+
+def kicked_steps(phases: FloatArray) -> BoolArray:
+    """Which steps from sample to sample hold a kick.
+
+    Args:
+        phases: Of n oscillators, without wrap-around [rad], shape (k, n).
+
+    Returns:
+        Shape (k - 1,).
+    """
+    steps = np.diff(phases, axis=0)
+    if len(steps) < 3:
+        return np.zeros(len(steps), dtype=np.bool_)
+    # Against the smaller of the two differences, so that the step after a kick isn't one, too.
+    change = np.abs(np.diff(steps, axis=0))
+    edge = np.zeros((1, phases.shape[1]))  # the first step and the last have one side only
+    lone = np.minimum(np.concatenate([edge, change]), np.concatenate([change, edge]))
+    usual = _SIGMA_OF_MAD * np.median(lone, axis=0)
+    return np.any(lone > np.maximum(LEAST_KICK, BEYOND_NOISE * usual), axis=1)
+
+
+def between_kicks(
+    phases: FloatArray, whole: BoolArray, inputs: FloatArray | None = None
+) -> tuple[Piece, ...]:
+    """Cut a record where a phase jumps or a sample is missing.
+
+    Args:
+        phases: [rad], shape (k, n).
+        whole: Whether each step from sample to sample lasts one period, shape (k - 1,).
+        inputs: What else turns the oscillators, shape (k, n).
+
+    Returns:
+        The pieces, in order; those of a single sample are left out.
+    """
+    cut = np.flatnonzero(kicked_steps(phases) | ~whole) + 1
+    bounds = [0, *cut.tolist(), len(phases)]
+    return tuple(
+        Piece(phases[i:j], None if inputs is None else inputs[i:j])
+        for i, j in pairwise(bounds)
+        if j - i > 1
+    )
+
 
 MOST_CONDITION = 500.0
 """Condition number beyond which couplings are refused: random kicks of up to 1 rad every 5 s give
@@ -145,3 +197,30 @@ def _rate(name: str, fit: OscillatorFit) -> Rate:
         feedback = Estimate(fit.gain, around(fit.gain, factor * fit.gain_error))
     omega = Estimate(fit.omega, around(fit.omega, factor * fit.omega_error))
     return Rate(name, omega, feedback, fit.noise)
+
+
+_NS = 1e9
+
+
+def session_couplings(
+    session: Session, start_s: float | None = None, stop_s: float | None = None
+) -> tuple[ChainCoupling, ...]:
+    """Tell the couplings of each plane's oscillators.
+
+    Args:
+        session: An open session.
+        start_s: From when on, from the session's start [s]; all of it if None.
+        stop_s: Until when [s].
+
+    Returns:
+        One a plane; none where no oscillator's phase was logged.
+    """
+    start_ns, stop_ns = (
+        None if one is None else session.start_ns + round(one * _NS) for one in (start_s, stop_s)
+    )
+    return tuple(
+        chain_coupling(
+            log.plane, log.names, log.phases, log.period_s, whole=log.whole, inputs=log.inputs
+        )
+        for log in read_phases(session, start_ns, stop_ns)
+    )

@@ -12,7 +12,7 @@ import numpy as np
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import LogWriteError, UsageError
-from undulog.capture.common.part_file import part_file
+from undulog.capture.common.files import part_file
 
 from .designs import PlannedRun
 from .gait_base import BaseGait

@@ -1,10 +1,4 @@
-"""What an analysis says: frozen values at the border between estimators and readers of results.
-
-``Analysis.to_dict`` is the object that ``undulog analyse --json`` prints and that a result file
-holds. A value that could not be computed is None (null), and ``Analysis.warnings`` or
-``Analysis.notes`` says why.
-Angles are in rad, energies in J over the analysed windows, times in s from the session's start.
-"""
+"""A value with its interval, and where a result comes from."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..estimators.equivalence import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
+from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response.response import Response
 from ..results.answer import Shape, StandOut
 from .family import LEVEL, Scatter, critical_value, scatter_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -19,18 +19,17 @@ from undulog.capture.log.read.signals import Signal
 from ..artefacts.find import find_artefacts
 from ..body.motion import body_motion
 from ..dead_band.find import dead_bands
-from ..energy.cycles import energy_result
-from ..energy.joint import Energies
+from ..energy.joint import Energies, energy_result
 from ..energy.ledger import check_ledger
 from ..energy.transport import transport
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
-from ..oscillators.session import session_couplings
+from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
 from ..response.gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
-from ..results.analysis import Analysis, GaitFacts, SessionFacts, Window
-from ..results.artefact import flags_by_joint
+from ..results.analysis import Analysis, GaitFacts, JointResult, SessionFacts, Window
+from ..results.artefact import KINDS, Artefact, flags_by_joint
 from ..results.dead_band import DeadBand
 from ..results.estimate import Estimate, Provenance
 from ..results.remarks import Note, Remarks
@@ -46,14 +45,79 @@ from ..segments.session import (
 from ..signals.reading import drag_ratio, read_columns, settle_time_s
 from ..signals.stretch import Options, choose_stretch, recorded, without_breaks
 from ..signals.windows import Span, Stretch, whole_cycles
-from .artefact_warnings import warn_flags, within
 from .coupling_of_one_gait import one_gait_coupling
 from .demodulation_session import response_over_time
-from .group_facts import group_facts
-from .indices import heterogeneity_indices
-from .joints import joint_energies, joint_results
+from .heterogeneity import heterogeneity_indices
+from .joints import group_facts, joint_energies, joint_results
 
 _NS = 1e9
+
+
+def within(
+    artefacts: Iterable[Artefact], session: Session, stretch: Stretch
+) -> tuple[Artefact, ...]:
+    """The artefacts that hold in the analysed stretch.
+
+    Args:
+        artefacts: Of the whole session.
+        session: The session.
+        stretch: What is analysed.
+
+    Returns:
+        Those of them.
+    """
+    start_s, stop_s = ((t - session.start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns))
+    return tuple(one for one in artefacts if one.within(start_s, stop_s))
+
+
+def warn_flags(
+    artefacts: Iterable[Artefact],
+    joints: tuple[JointResult, ...],
+    gait: GaitFit | None,
+    warn: Warn,
+) -> None:
+    """Name the joints of each artefact, and whether it is the sensor's, the record's or a limit.
+
+    Args:
+        artefacts: Of the analysed stretch.
+        joints: The joints' results.
+        gait: The fitted gait, or None.
+        warn: Takes a sentence for each kind.
+    """
+    joined: dict[tuple[str, str, str], list[Artefact]] = {}
+    for one in artefacts:
+        joined.setdefault((one.flag, one.quantity, one.topic), []).append(one)
+    for (flag, quantity, topic), same in joined.items():
+        if flag == "gaps":  # of the whole session; those that matter are in the joints' flags
+            continue
+        about, text = KINDS[flag]
+        where = f"{quantity} on {topic}" if topic else quantity
+        meaning = {
+            "sensor": "an artefact of the sensor, not mechanics"
+            + ("; gain and lag are null" if same[0].falsifies("position") else ""),
+            "sensor or joint": "the sensor or the joint itself, see the answer"
+            + ("; gain and lag are null" if same[0].falsifies("position") else ""),
+            "record": "an artefact of the record, not mechanics",
+            "limit": "a limit of the robot, not a fault of the sensor",
+        }[about]
+        notes = ", ".join(dict.fromkeys(one.note for one in same if one.note))
+        told = f"{flag}, {notes}" if notes else flag
+        warn(f"{', '.join(one.joint for one in same)}: {where}: values {text} ({told}): {meaning}")
+    holed = [joint.name for joint in joints if "gaps" in joint.flags]
+    if holed:
+        warn(f"{', '.join(holed)}: positions have gaps (an artefact of the record, not mechanics)")
+    lost = [
+        joint.name
+        for joint in joints
+        if gait is not None and joint.name in gait.all_answered and joint.lag_rad.value is None
+    ]
+    if lost:
+        warn(
+            f"{', '.join(lost)}: no response at the gait frequency that can be told from noise: "
+            "gain and lag are null"
+        )
+
+
 _FEW = 1e-3
 """Up to one sample in a thousand left out is a note: no loss for a fit."""
 

@@ -11,7 +11,7 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.strict_table import read_toml
 from undulog.capture.following.session import MOST_JOINTS
-from undulog.capture.log.messages.power_topics import PowerTopic
+from undulog.capture.log.messages.topics import PowerTopic
 from undulog.capture.log.read.signals import JointSignals, Signal
 from undulog.capture.robot.model import Robot
 

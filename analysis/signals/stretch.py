@@ -18,8 +18,7 @@ from undulog.capture.log.read.unbroken import longest_unbroken
 from ..estimators.series import clean
 from ..response.gait import MIN_CYCLES
 from .reading import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns, settle_time_s
-from .soft_start import steady_part
-from .windows import Stretch, covered, long_enough, moving, settled, steady_runs
+from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
 GAIT_TOPIC = "/gait"
 _NS = 1e9

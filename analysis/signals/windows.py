@@ -3,6 +3,15 @@
 In this order: what the user named; the longest stretch over which the logged gait parameters stay
 as they are; after the settling time that the session states; without standing still at the ends.
 Within the stretch, energies are taken over whole cycles at its end, where it is best settled.
+
+Where a gait has its steady amplitude: without a soft start and a soft stop.
+
+Controllers let the amplitude of a gait grow over some seconds, and logs that state neither gait nor
+settling time hold that, too. A harmonic fit over it leaves what the amplitude lacks as residual,
+and its intervals are a hundred times too wide. So the amplitude of the commands is followed, over
+one cycle at a time, and what comes before it reaches its steady value is left out. A gait that is
+modulated all along, comes in bursts, or changes from one steady amplitude to another has no soft
+start, and nothing of it is left out.
 """
 
 from __future__ import annotations
@@ -15,8 +24,173 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
+from ..estimators.cycle_sums import starts_of
+from ..estimators.harmonic_moments import cos_sin
 from ..estimators.series import Series
-from ..response.gait import MIN_CYCLES
+from ..response.gait import MIN_CYCLES, Rhythm
+from ..response.groups import find_groups
+
+STEADY = 0.03
+"""Cycles whose amplitude is within this share of the commonest one are steady."""
+
+REACHED = 0.005
+"""Share of the steady amplitude that may be lacking where the steady part begins; more where the
+amplitude itself scatters by more."""
+
+_PARTS = 4
+"""Steps of the window of one cycle in each cycle."""
+
+_LEAST_STEADY = 0.9
+"""Share of the windows between the first and the last steady one that are steady themselves."""
+
+_LEVEL = 0.3
+"""Share of a soft start that no constant amplitude below the steady one may last."""
+
+_AT_FREQUENCY = 0.5
+"""Share of a cycle's variance that its frequency explains; a soft start from zero reaches 0.7."""
+
+_SUBHARMONIC = 0.1
+"""A fundamental with less than this share of the strongest harmonic's power is a subharmonic."""
+
+_LEAST_SAMPLES = 8
+
+
+def steady_part(commands: Sequence[Series], start_s: float, stop_s: float) -> tuple[float, float]:
+    """Find where the commands have their steady amplitude.
+
+    Args:
+        commands: Commands between start and stop.
+        start_s: Start of the motion [s].
+        stop_s: Its end [s].
+
+    Returns:
+        Start and end of the steady part [s]; those of the motion where it has no soft start or no
+        soft stop, or where less than ``MIN_CYCLES`` steady cycles would be left.
+    """
+    found = find_groups(commands, stop_s - start_s)
+    if found is None:
+        return start_s, stop_s
+    first_s, last_s = start_s, stop_s
+    slowest_s = 0.0
+    for rhythm in found.rhythms:
+        members = [one for one in commands if one.name in rhythm.names]
+        omega = rhythm.omega * _strongest(rhythm)
+        period_s = 2 * np.pi / omega
+        slowest_s = max(slowest_s, period_s)
+        edges_s = np.arange(start_s, stop_s + 1e-6 * period_s, period_s / _PARTS)
+        size = amplitude_by_cycle(members, omega, edges_s)
+        lead, tail = soft_ends(size)
+        if lead:
+            first_s = max(first_s, float(edges_s[lead]))
+        if tail:
+            last_s = min(last_s, float(edges_s[edges_s.size - 1 - tail]))
+    if last_s - first_s < MIN_CYCLES * slowest_s:
+        return start_s, stop_s
+    return first_s, last_s
+
+
+def _strongest(rhythm: Rhythm) -> int:
+    """Order of the harmonic to follow: over a long soft start a subharmonic may fit best."""
+    power = np.sum(np.abs(rhythm.fit.amplitudes) ** 2, axis=0)
+    order = int(np.argmax(power))
+    return order + 1 if power[0] < _SUBHARMONIC * power[order] else 1
+
+
+def amplitude_by_cycle(commands: Sequence[Series], omega: float, edges_s: FloatArray) -> FloatArray:
+    """Follow the amplitude of several commands together.
+
+    Args:
+        commands: Commands, k of them.
+        omega: Their angular frequency [rad/s].
+        edges_s: Times a quarter of a cycle apart [s], shape (n,).
+
+    Returns:
+        Root of the summed squares of the amplitudes, over one cycle from each edge on, by least
+        squares with a constant, shape (n - 4,); NaN where a cycle has too few samples or most of
+        its motion is not at that frequency.
+    """
+    count = max(edges_s.size - _PARTS, 0)
+    power, motion = np.zeros((2, count))
+    for one in commands:
+        starts = starts_of(one.t_s, edges_s)
+        begin, end = starts[:count], starts[_PARTS : _PARTS + count]
+        cosine, sine = cos_sin(omega * one.t_s)
+        rows = np.stack([np.ones(one.count), cosine, -sine])
+        values = one.values - one.values.mean()
+        usable: BoolArray = end - begin >= _LEAST_SAMPLES
+        gram = np.stack([_sums(rows * row, begin, end) for row in rows], axis=1)[usable]
+        right = _sums(rows * values, begin, end)[usable]
+        solved = np.linalg.solve(gram, right[..., None])[..., 0]
+        power[usable] += solved[:, 1] ** 2 + solved[:, 2] ** 2
+        power[~usable] = np.nan
+        filled = np.maximum(end - begin, 1)
+        mean, square = _sums(np.stack([values, values**2]), begin, end).T / filled
+        motion += 2 * (square - mean**2)
+    other = (power < _AT_FREQUENCY * motion) & (motion > STEADY**2 * motion.max(initial=0.0))
+    return np.sqrt(np.where(other, np.nan, power))
+
+
+def _sums(rows: FloatArray, begin: IntArray, end: IntArray) -> FloatArray:
+    """Sums of the rows (q, n) from begin to end, each of shape (c,); shape (c, q)."""
+    running = np.zeros((rows.shape[0], rows.shape[1] + 1))
+    np.cumsum(rows, axis=1, out=running[:, 1:])
+    return (running[:, end] - running[:, begin]).T
+
+
+def soft_ends(size: FloatArray) -> tuple[int, int]:
+    """Find a soft start and a soft stop in an amplitude that was followed by cycles.
+
+    Args:
+        size: Amplitude of each window, a quarter of a cycle apart, shape (n,); NaN is not steady.
+
+    Returns:
+        How many quarters of a cycle to leave out at the start and at the end; 0 where the
+        amplitude begins, or ends, steady, and where it varies otherwise than by a soft start.
+    """
+    known = np.isfinite(size) & (size > 0)
+    if np.count_nonzero(known) < _PARTS * MIN_CYCLES:
+        return 0, 0
+    level = _commonest(size[known])
+    steady = known & (np.abs(np.where(known, size, 0.0) / level - 1) <= STEADY)
+    inside = np.flatnonzero(steady)
+    first, last = int(inside[0]), int(inside[-1])
+    if last - first < _PARTS * (MIN_CYCLES - 1) or steady[first : last + 1].mean() < _LEAST_STEADY:
+        return 0, 0
+    plateau = size[steady]
+    level = float(np.median(plateau))
+    scatter = 1.4826 * float(np.median(np.abs(plateau - level))) / level
+    lacking = level * (1 - min(max(REACHED, 3 * scatter), STEADY))
+    return _lead(size, first, level, lacking), _lead(
+        size[::-1], size.size - 1 - last, level, lacking
+    )
+
+
+def _commonest(size: FloatArray) -> float:
+    """Median of the largest number of values within ``STEADY`` of one of them."""
+    ordered = np.sort(size)
+    stops = np.searchsorted(ordered, ordered * (1 + 2 * STEADY), side="right")
+    k = int(np.argmax(stops - np.arange(ordered.size)))
+    return float(np.median(ordered[k : stops[k]]))
+
+
+def _lead(size: FloatArray, first: int, level: float, lacking: float) -> int:
+    """Windows to leave out before the steady part; 0 where what comes before is no soft start."""
+    reached = first + int(np.argmax(size[first:] >= lacking))
+    if reached == 0:
+        return 0
+    lead = size[:first]
+    if lead.size and not np.all(np.isfinite(lead)):
+        return 0
+    falls = np.maximum.accumulate(lead) - lead
+    if lead.size and (float(falls.max()) > STEADY * level or float(lead.max()) > level):
+        return 0
+    if lead.size >= _PARTS * MIN_CYCLES:
+        # A constant amplitude below the steady one is another gait, not a start.
+        stops = np.searchsorted(np.sort(lead), np.sort(lead) * (1 + 2 * STEADY), side="right")
+        longest = int(np.max(stops - np.arange(lead.size)))
+        if longest >= max(_PARTS * MIN_CYCLES, _LEVEL * lead.size):
+            return 0
+    return reached + 1
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,42 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
+
+_MOST_POLL_BYTES = 8
+
+
+def poll_frames(robot: Robot) -> FrameArray:
+    """The frames that ask for the robot's state.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Records of :data:`.FRAME_DTYPE`, without times, in the order of the map;
+        none where nothing has to be asked.
+
+    Raises:
+        DataError: If the robot has no bus, or a request that is no classic CAN frame.
+    """
+    bus, messages = bus_messages(robot)
+    frames = empty_frames(len(bus.polls))
+    frames["dir"] = DIR_TX
+    for frame, poll in zip(frames, bus.polls, strict=True):
+        message = messages[poll.message]
+        if message.length > _MOST_POLL_BYTES:
+            raise DataError(
+                f"{poll.message} of {robot.name} is a CAN FD frame; only classic are sent"
+            )
+        fields = {each.name: BitField.of(each) for each in message.signals}
+        word = 0
+        for name, number in poll.signals:
+            word |= fields[name].placed(number, message.length)
+        frame["id_flags"], frame["dlc"] = frame_id(message), message.length
+        data = word.to_bytes(message.length, "little").ljust(_MOST_POLL_BYTES, b"\0")
+        frame["data"] = np.frombuffer(data, np.uint8)
+    return frames
+
+
 BusValue: TypeAlias = tuple[str, Quantity, str]
 """What a value is: name of a joint or sensor, quantity, and axis of a vector quantity, else ""."""
 

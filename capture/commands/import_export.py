@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from ..common.console import emit_json, say
 from ..common.errors import ImportFormatError, UsageError
-from ..common.input_file import is_file
+from ..common.files import is_file
 
 if TYPE_CHECKING:
     from ..exchange.column_map import ColumnMap

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..common.interruption import StopRequest
     from ..recorder.report import RecordReport
     from ..recorder.settings import RecordSettings
-    from ..recorder.snapshot import RecorderSnapshot
+    from ..recorder.statuses import RecorderSnapshot
 
 
 _Words = Annotated[tuple[str, ...], Parameter(show_default=False)]
@@ -123,9 +123,9 @@ def record(
 
 
 def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
-    from ..recorder.notify import Notifier
     from ..recorder.record import Recording
     from ..recorder.terminal import Terminal
+    from ..recorder.unit import Notifier
 
     terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:

@@ -2,7 +2,7 @@
 
 python-can hands out times as floating-point seconds, which at today's Unix time resolve 0.24 us;
 they are rounded to 1 us, the resolution of the formats it reads. Logs whose times count from their
-own start (ASC, some TRC) are put at :data:`.capture.exchange.undated.RELATIVE_EPOCH_NS`.
+own start (ASC, some TRC) are put at :data:`.capture.exchange.frame_log.RELATIVE_EPOCH_NS`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from ..common.errors import ImportFormatError
-from ..common.input_file import is_file
+from ..common.files import is_file
 from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
@@ -32,9 +32,16 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
 )
 from .candump import read_candump
-from .frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
+from .frame_log import (
+    EARLIEST_NS,
+    FRAMES_PER_BLOCK,
+    LATEST_NS,
+    RELATIVE_EPOCH_NS,
+    BlockBuilder,
+    FrameLog,
+    LogBlock,
+)
 from .mf4 import open_mf4
-from .undated import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 
 if TYPE_CHECKING:
     from can import Message

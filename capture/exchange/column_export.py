@@ -28,8 +28,8 @@ from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import MissingChannelError, MissingExtraError, UsageError
+from ..common.files import check_stop, part_file
 from ..common.interruption import StopRequest
-from ..common.part_file import check_stop, part_file
 from ..log.messages.schemas import JOINT_STATE
 from ..log.read.joint_reader import UNITS
 from ..log.read.session import Session

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import Fault, FaultyFileError, UsageError
-from ..common.input_file import read_input
+from ..common.files import read_input
 from ..common.strict_table import Faults, Table, listed, read_toml
 from ..robot.bus_map import JOINT_QUANTITIES
 from ..robot.model import Quantity, Robot

@@ -24,8 +24,8 @@ from ..robot.model import Quantity, Robot
 from ..robot.units import SESSION_UNIT, TIME_UNITS, unit_for
 from .can_logs import CSV_HEADER
 from .column_map import Column, ColumnMap
+from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
 from .import_output import ImportReport, imported_session
-from .undated import LATEST_NS, RELATIVE_EPOCH_NS
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
 _ROWS_PER_UPDATE = 4096

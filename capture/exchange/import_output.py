@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.console import refuse_existing
-from ..common.part_file import part_file
+from ..common.files import part_file
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
 

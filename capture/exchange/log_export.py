@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ..common.console import progress, refuse_existing
 from ..common.errors import UsageError
+from ..common.files import check_stop, part_file
 from ..common.interruption import StopRequest
-from ..common.part_file import check_stop, part_file
 from ..log.read.session import Session
 from .frame_blocks import chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS

@@ -11,7 +11,11 @@ times as floating-point Unix seconds; the file has them from its start, good to 
 
 from __future__ import annotations
 
+import gc
 import gzip
+import logging
+import sys
+import traceback
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import BoolArray, IntArray
-from ..common.deferred import undefer
 from ..common.errors import ImportFormatError, MissingExtraError
+from ..common.lazy import undefer
 from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
@@ -39,9 +43,80 @@ from ..log.messages.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock
-from .mf4_faults import readable, said
-from .undated import EARLIEST_NS, RELATIVE_EPOCH_NS
+from .frame_log import EARLIEST_NS, FRAMES_PER_BLOCK, RELATIVE_EPOCH_NS, FrameLog, LogBlock
+
+
+@contextmanager
+def readable(path: Path, what: str) -> Generator[None]:
+    """Turn whatever asammdf raises for a damaged file into our error with the file.
+
+    Args:
+        path: The file.
+        what: How the error begins, e.g. ``can't be read``.
+
+    Yields:
+        Nothing: a ``with`` block around calls of asammdf.
+
+    Raises:
+        ImportFormatError: If any of them fails.
+    """
+    try:
+        yield
+    except ImportFormatError:
+        raise
+    except Exception as error:  # a damaged file raises anything, from IndexError to IsalError
+        _let_go(error)
+        raise ImportFormatError(path, f"{what}: {error}") from error
+
+
+def _let_go(error: Exception) -> None:
+    """Free what asammdf half opened: it fails once more when it goes, and would say so."""
+    before = sys.unraisablehook
+
+    def quiet(fault: sys.UnraisableHookArgs) -> None:
+        if not getattr(fault.object, "__qualname__", "").startswith("MDF"):
+            before(fault)
+
+    sys.unraisablehook = quiet
+    try:
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+    finally:
+        sys.unraisablehook = before
+
+
+class _Saying(logging.Filter):
+    """Keeps what a logger would print, in one line each, and lets none of it through."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__()
+        self._problems = problems
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        lines = record.getMessage().strip().splitlines()
+        text = lines[0] if len(lines) == 1 else f"{lines[0].partition(':')[0]}: {lines[-1]}"
+        if record.levelno >= logging.WARNING:
+            self._problems.append(f"asammdf: {text}")
+        return False
+
+
+@contextmanager
+def said(problems: list[str]) -> Generator[None]:
+    """Note what asammdf logs; it prints to the terminal of its own accord.
+
+    Args:
+        problems: Gets a sentence for each.
+
+    Yields:
+        Nothing: a ``with`` block around calls of asammdf.
+    """
+    logger, saying = logging.getLogger("asammdf"), _Saying(problems)
+    logger.addFilter(saying)
+    try:
+        yield
+    finally:
+        logger.removeFilter(saying)
+
 
 _KIND_FLAGS = {"CAN_DataFrame": 0, "CAN_RemoteFrame": REMOTE_FLAG, "CAN_ErrorFrame": ERROR_FLAG}
 _NS = 1_000_000_000

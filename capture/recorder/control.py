@@ -9,19 +9,133 @@ a tick: it takes what has come, within a budget, and waits for nobody.
 
 from __future__ import annotations
 
+import json
 import os
 import selectors
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter_ns
 from typing import Any, Final, cast
 
 from ..common.errors import ControlError, UndulogError
-from .control_connection import Connection
-from .control_lines import BUFFER, TOO_LONG, Reply, read_request, refusal, reply_line
 from .control_socket import listen, release
+
+Reply = Mapping[str, Any]
+
+BUFFER = 64 * 1024
+"""Longest request, and the most replies that wait for a client that doesn't read [B]."""
+
+TOO_LONG = f"a request is longer than {BUFFER} bytes"
+
+
+def read_request(line: bytes) -> dict[str, Any] | str:
+    """Read one line.
+
+    Args:
+        line: With or without its newline.
+
+    Returns:
+        The request, or what is wrong with the line.
+    """
+    if len(line) > BUFFER:
+        return TOO_LONG
+    try:
+        request = json.loads(line, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        return f"not JSON: {error}"
+    if not isinstance(request, dict):
+        return 'a request is a JSON object such as {"do": "status"}'
+    return cast("dict[str, Any]", request)
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def reply_line(reply: Reply) -> bytes:
+    """Write one line.
+
+    Args:
+        reply: Plain JSON values.
+
+    Returns:
+        The line, its newline at the end.
+
+    Raises:
+        ValueError: If it has a number that JSON doesn't have.
+        TypeError: If it has a value that JSON doesn't have.
+    """
+    return json.dumps(reply, allow_nan=False).encode() + b"\n"
+
+
+def refusal(error: str) -> bytes:
+    """The reply to what can't be done.
+
+    Args:
+        error: Why.
+
+    Returns:
+        The line.
+    """
+    return reply_line({"ok": False, "error": error})
+
+
+class Connection:
+    """One client.
+
+    Attributes:
+        socket: Its socket, non-blocking.
+        heard: The poll in which it last said something.
+        incoming: Bytes of requests that are not answered yet.
+        outgoing: Bytes of replies that it has not taken yet.
+        ended: It will send no more.
+        closing: We take no more from it.
+        waits: For the end of the recording.
+        more: A whole request is left from the last poll.
+    """
+
+    def __init__(self, connection: socket.socket, number: int) -> None:
+        """Nothing has come yet.
+
+        Args:
+            connection: The socket.
+            number: The poll in which it connected.
+        """
+        self.socket = connection
+        self.heard = number
+        self.incoming = bytearray()
+        self.outgoing = bytearray()
+        self.ended = False
+        self.closing = False
+        self.waits = False
+        self.more = False
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a reply still fits."""
+        return len(self.outgoing) < BUFFER
+
+    @property
+    def has_request(self) -> bool:
+        """Whether a whole request has come."""
+        # The last one of a client that has ended may lack its newline.
+        return b"\n" in self.incoming or (self.ended and bool(self.incoming))
+
+    def lines(self) -> Iterator[bytes]:
+        """The requests that have come whole.
+
+        Yields:
+            Each, taken off the buffer as it is handed out.
+        """
+        while self.has_request:
+            at = self.incoming.find(b"\n")
+            end = len(self.incoming) if at < 0 else at + 1
+            line = bytes(self.incoming[:end])
+            del self.incoming[:end]
+            yield line
+
 
 MAX_CLIENTS = 16
 """More than these and the one that was silent for longest is let go."""

@@ -24,8 +24,8 @@ from ..log.messages.rosmsg import parse_message_type
 from ..log.sinks.sink import Description
 from ..robot.model import Robot
 from ..sources.contract import Source
-from .snapshot import SourceSnapshot, TopicSnapshot
 from .source_clock import SourceClock
+from .statuses import SourceSnapshot, TopicSnapshot
 
 HORIZON_S = 60
 """How far the stamps of a running recording may go back [s]: what is older is summed up."""

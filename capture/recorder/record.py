@@ -14,25 +14,23 @@ from typing import Any
 from ..common.errors import LogWriteError, SocketInUseError, SourceError, UsageError
 from ..common.interruption import StopRequest
 from ..log.write.writer import SessionWriter
+from ..sources.address import open_sources
 from ..sources.contract import SourceContext
-from ..sources.registry import open_sources
-from .clock import SessionClock
 from .control import ControlServer
 from .control_requests import OperatorLog, request_handler
 from .control_socket import default_sockets
 from .live_feed import LiveFeed
 from .live_health import LiveHealth
-from .machine import free_space, machine_facts
-from .notify import Notifier
 from .plan import decoded_source, robot_of
 from .recorder import Ending, Recorder
-from .report import RecordReport
+from .report import RecordReport, free_space, machine_facts
 from .screen import plain_line
 from .settings import RecordSettings
-from .snapshot import EventLine, RecorderSnapshot
-from .statuses import statuses
+from .statuses import EventLine, RecorderSnapshot, statuses
 from .storage import open_storage
 from .tapped_sink import TappedSink
+from .ticks import SessionClock
+from .unit import Notifier
 
 _NS = 1_000_000_000
 _EVENTS_SHOWN = 8

@@ -24,10 +24,8 @@ from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
 from ..sources.contract import EndingSource, Polled, Source, SourceContext
 from .bus_recorder import BusRecorder
-from .clock import SessionClock
-from .each_second import EachSecond
 from .source_clock import SourceClock
-from .ticks import TickTally
+from .ticks import EachSecond, SessionClock, TickTally
 
 TICK_NS = 10_000_000
 """Sources are asked this often, and what they have is safe then [ns]."""

@@ -14,9 +14,15 @@ from ..common.amounts import format_size
 from ..common.console import plain
 from ..common.text_table import Cells, Column, cut, fit, table
 from ..log.health.health import has_rhythm
-from ..log.messages.diagnostics import ERROR, OK
-from .snapshot import EventLine, RecorderSnapshot, SourceSnapshot, TopicSnapshot
-from .statuses import group_of, source_state
+from ..log.messages.topics import ERROR, OK
+from .statuses import (
+    EventLine,
+    RecorderSnapshot,
+    SourceSnapshot,
+    TopicSnapshot,
+    group_of,
+    source_state,
+)
 
 STYLES = {"good": "bold cyan", "degraded": "bold yellow", "bad": "bold white on red"}
 """Of verdicts."""

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.live import Live
 
 from .screen import event_line, plain_line, screen
-from .snapshot import EventLine, RecorderSnapshot
+from .statuses import EventLine, RecorderSnapshot
 
 LINE_EVERY_S = 10.0
 """How often a line is printed where there is no terminal [s] of the recording."""

@@ -1,9 +1,79 @@
-"""How long the recorder's ticks take: what else runs on the computer must not slow them down."""
+"""Time in the recorder: its clock, the duration of its ticks, tasks once a second.
+
+The clock of a recording: Unix time at its start, and monotonic time from there on.
+
+The wall clock may be set while a robot is being recorded (NTP, a user, a GPS fix); nothing of that
+may change an order or a duration in the session.
+"""
 
 from __future__ import annotations
 
+import time
 from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+
+class SessionClock:
+    """Unix time at the start plus monotonic time since."""
+
+    def __init__(self) -> None:
+        """Start now."""
+        before = time.monotonic_ns()
+        self.epoch_ns = time.time_ns()
+        self._zero = self.epoch_ns - (before + time.monotonic_ns()) // 2
+
+    def now_ns(self) -> int:
+        """The present time of the session [Unix ns]; never goes back."""
+        return self._zero + time.monotonic_ns()
+
+    def from_monotonic_ns(self, monotonic_ns: int) -> int:
+        """The session's time at a moment of the monotonic clock.
+
+        Args:
+            monotonic_ns: As ``time.monotonic_ns`` gives it.
+
+        Returns:
+            Session time [Unix ns].
+        """
+        return self._zero + monotonic_ns
+
+
+_NS = 1_000_000_000
+
+
+class EachSecond:
+    """Runs tasks once a second each, at most one a call.
+
+    By the clock, not by counting calls: under load these come more often, or less.
+    """
+
+    def __init__(self, tasks: Sequence[Callable[[], object]], now_ns: int) -> None:
+        """Begin in a second from now, in the order given.
+
+        Args:
+            tasks: What to do.
+            now_ns: A monotonic clock [ns].
+        """
+        self._tasks = tuple(tasks)
+        step_ns = _NS // (len(tasks) + 1)
+        self._due_ns = [now_ns + (k + 1) * step_ns for k in range(len(tasks))]
+
+    def run(self, now_ns: int) -> None:
+        """Run the task that has waited for longest, if one is due.
+
+        Args:
+            now_ns: The same clock [ns].
+        """
+        if not self._tasks:
+            return
+        k = min(range(len(self._due_ns)), key=self._due_ns.__getitem__)
+        if self._due_ns[k] > now_ns:
+            return
+        late = now_ns - self._due_ns[k] >= _NS
+        self._due_ns[k] = now_ns + _NS if late else self._due_ns[k] + _NS
+        self._tasks[k]()
+
 
 _PER_DECADE = 40
 _EDGES_NS = [round(1e3 * 10 ** (k / _PER_DECADE)) for k in range(7 * _PER_DECADE + 1)]

@@ -1,12 +1,131 @@
-"""The systemd unit that ships with the recorder, fitted to where undulog is installed."""
+"""systemd: the unit that comes with the recorder, and sd_notify.
+
+Telling the service manager how it goes, by the sd_notify protocol.
+
+https://www.freedesktop.org/software/systemd/man/latest/sd_notify.html: datagrams of ``KEY=VALUE``
+lines to the socket that ``NOTIFY_SOCKET`` names. Where that is not set, nothing is sent. Sending
+never waits and never ends a recording: what the manager doesn't take is counted, and its own
+watchdog acts if it hears nothing.
+"""
 
 from __future__ import annotations
 
+import os
+import socket
 import sys
+import time
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 
 from ..common.errors import UsageError
+
+_LONGEST_STATUS = 512
+_WATCHDOG_PART = 0.5  # of the time after which the manager gives us up, as sd_notify(3) advises
+
+
+class Notifier:
+    """Speaks to the service manager, if there is one.
+
+    Attributes:
+        failed: Messages that could not be sent.
+        watchdog_ns: The manager acts after so long a silence [ns]; None where it doesn't watch.
+    """
+
+    def __init__(self, environ: Mapping[str, str]) -> None:
+        """Look who wants to be told.
+
+        Args:
+            environ: The environment: ``NOTIFY_SOCKET``, ``WATCHDOG_USEC``, ``WATCHDOG_PID``.
+        """
+        self.failed = 0
+        self.watchdog_ns = _watchdog_ns(environ)
+        self._address = _address(environ.get("NOTIFY_SOCKET", ""))
+        self._socket: socket.socket | None = None
+        if self._address is not None:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            self._socket.setblocking(False)
+        self._next_beat_ns = 0
+        self._status = ""
+
+    @property
+    def active(self) -> bool:
+        """Whether anybody listens."""
+        return self._socket is not None
+
+    def ready(self, status: str = "") -> None:
+        """Say that the recording has begun.
+
+        Args:
+            status: One sentence for ``systemctl status``.
+        """
+        self._send("READY=1", *self._status_line(status))
+
+    def status(self, text: str) -> None:
+        """Say how it goes; nothing is sent while the text stays the same.
+
+        Args:
+            text: One sentence for ``systemctl status``.
+        """
+        if text != self._status:
+            self._send(*self._status_line(text))
+
+    def alive(self, now_ns: int | None = None) -> None:
+        """Say that the loop is alive, as often as the manager's watchdog needs it.
+
+        Called every tick from the very loop that must not hang, never from a thread of its own.
+
+        Args:
+            now_ns: A monotonic clock [ns]; the system's by default.
+        """
+        if self.watchdog_ns is None or self._socket is None:
+            return
+        now_ns = time.monotonic_ns() if now_ns is None else now_ns
+        if now_ns >= self._next_beat_ns:
+            self._next_beat_ns = now_ns + int(self.watchdog_ns * _WATCHDOG_PART)
+            self._send("WATCHDOG=1")
+
+    def stopping(self, status: str = "") -> None:
+        """Say that the recording ends.
+
+        Args:
+            status: One sentence for ``systemctl status``.
+        """
+        self._send("STOPPING=1", *self._status_line(status))
+
+    def close(self) -> None:
+        """Release the socket; nothing is sent any more. Safe to call twice."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+    def _status_line(self, text: str) -> tuple[str, ...]:
+        self._status = text
+        line = " ".join(text.split())[:_LONGEST_STATUS]  # a newline would begin another key
+        return (f"STATUS={line}",) if line else ()
+
+    def _send(self, *lines: str) -> None:
+        if self._socket is None or self._address is None or not lines:
+            return
+        try:
+            self._socket.sendto("\n".join(lines).encode("utf-8", "replace"), self._address)
+        except OSError:  # full, or gone: the manager's trouble, never the recording's
+            self.failed += 1
+
+
+def _address(name: str) -> bytes | None:
+    """The socket's address; None where it is none that a Unix socket can have."""
+    if name.startswith("@"):  # abstract: no file
+        return b"\0" + os.fsencode(name[1:])
+    return os.fsencode(name) if name.startswith("/") else None
+
+
+def _watchdog_ns(environ: Mapping[str, str]) -> int | None:
+    text, owner = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
+    if owner and owner != str(os.getpid()):
+        return None  # meant for another process that we inherited it from
+    return int(text) * 1000 if text.isascii() and text.isdigit() and int(text) > 0 else None
+
 
 UNIT_NAME = "undulog-record@.service"
 """File name of the unit; what stands after the @ names the settings."""

@@ -26,21 +26,285 @@ its message and signal for that joint's name. The keys are the fields of the cla
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..common.errors import Fault, RobotFileError
-from ..common.shipped import Shelf
-from ..common.strict_table import Faults, Table, read_toml
+from ..common.files import Shelf
+from ..common.strict_table import Faults, Table, listed, read_toml
 from .bus_map import read_bus
-from .chain_table import read_joints, read_links
-from .mesh import read_meshes
-from .model import ClockDomain, Robot
-from .repeated import note_repeated
-from .safety_table import read_safety
-from .sensor_table import read_sensors
+from .mesh import MESH_TYPES, is_mesh, read_meshes
+from .model import ClockDomain, Joint, Link, Plane, Robot, Sensor, SensorKind, Servo
+from .safety import JOINT_LIMITS, OnFault, Safety
+
+
+def note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
+    """Note names that occur more than once; empty ones are faults already.
+
+    Args:
+        faults: Where they are noted.
+        what: What has these names, e.g. ``links``.
+        names: The names.
+    """
+    for name in sorted({name for name in names if name and names.count(name) > 1}):
+        faults.add(what, f"{names.count(name)} times {name}", "every name once")
+
+
+LONGEST_CHAIN = 1000
+"""Joints of a chain that is described by its length: far beyond any robot, short of a slip."""
+
+
+def read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
+    """Read ``joints``, or a ``chain`` of like ones, with ``defaults`` of joint and servo.
+
+    Args:
+        top: The description.
+        defaults: Its ``defaults``.
+
+    Returns:
+        The joints, the one next to the head first.
+    """
+    common, servo = defaults.table("joint"), defaults.table("servo")
+    entries = _chain(top) if "chain" in top else top.tables("joints")
+    if not entries:
+        top.fault("joints", "an array of at least one table, the joint next to the head first")
+    joints: list[Joint] = []
+    for values, where in entries:
+        table = Table(values, where, top.faults, common)
+        joint = Joint(
+            name=table.name("name"),
+            plane=table.choice("plane", Plane) or Plane.HORIZONTAL,
+            lower=table.number("lower", default=Joint.lower),
+            upper=table.number("upper", default=Joint.upper),
+            max_velocity=table.number("max_velocity", default=Joint.max_velocity, above=0),
+            servo=_servo(table.table("servo", servo)),
+        )
+        if joint.lower >= joint.upper:
+            table.fault("upper", f"more than lower = {joint.lower:g}", f"{joint.upper:g}")
+        table.close()
+        joints.append(joint)
+    if entries:
+        common.close()
+        servo.close()
+    return tuple(joints)
+
+
+def _chain(top: Table) -> list[tuple[dict[str, Any], str]]:
+    """Entries for ``joints`` of a chain that is described by its length."""
+    if "joints" in top:
+        top.fault("joints", "leave it out: the chain has them")
+    table = top.table("chain")
+    count = table.integer("joints", at_least=1)
+    if count > LONGEST_CHAIN:
+        table.fault("joints", f"at most {LONGEST_CHAIN}")
+        count = 1
+    planes = table.words("planes", valid=Plane) or tuple(Plane)
+    table.close()
+    names = numbered("joint", count)
+    return [
+        ({"name": name, "plane": planes[i % len(planes)]}, "chain") for i, name in enumerate(names)
+    ]
+
+
+def numbered(word: str, count: int) -> list[str]:
+    """Names of like parts that sort as they stand in the chain.
+
+    Args:
+        word: What they are.
+        count: How many.
+
+    Returns:
+        ``joint01``, ``joint02``, ...; three digits for more than 99.
+    """
+    width = max(2, len(str(count)))
+    return [f"{word}{i:0{width}d}" for i in range(1, count + 1)]
+
+
+def _servo(table: Table) -> Servo:
+    servo = Servo(
+        supply_v=table.number("supply_v", default=Servo.supply_v, above=0),
+        stall_torque=table.number("stall_torque", default=Servo.stall_torque, above=0),
+        torque_constant=table.number("torque_constant", default=Servo.torque_constant, above=0),
+        proportional_gain=table.number(
+            "proportional_gain", default=Servo.proportional_gain, above=0
+        ),
+        rotor_inertia=table.number("rotor_inertia", default=Servo.rotor_inertia, above=0),
+        viscous_friction=table.number(
+            "viscous_friction", default=Servo.viscous_friction, at_least=0
+        ),
+        coulomb_friction=table.number(
+            "coulomb_friction", default=Servo.coulomb_friction, at_least=0
+        ),
+        gear_stiffness=table.number("gear_stiffness", default=Servo.gear_stiffness, above=0),
+        gear_damping=table.number("gear_damping", default=Servo.gear_damping, at_least=0),
+        backlash=table.number("backlash", default=Servo.backlash, at_least=0),
+        static_friction=table.number("static_friction", default=Servo.static_friction, at_least=0),
+        stribeck_speed=table.number("stribeck_speed", default=Servo.stribeck_speed, above=0),
+    )
+    if 0 < servo.static_friction < servo.coulomb_friction:
+        table.fault(
+            "static_friction", f"0, or at least coulomb_friction = {servo.coulomb_friction:g}"
+        )
+    table.close()
+    return servo
+
+
+def read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...]:
+    """Read ``links``, or make one more than joints as ``defaults`` say.
+
+    Args:
+        top: The description.
+        defaults: Its ``defaults``.
+        joint_count: Number of joints.
+
+    Returns:
+        The links, the head first.
+    """
+    common = defaults.table("link")
+    entries = top.tables("links")
+    if "links" not in top:
+        entries = [({"name": name}, "defaults.link") for name in numbered("link", joint_count + 1)]
+    elif len(entries) != joint_count + 1:
+        top.fault("links", f"{joint_count + 1}, one more than joints", str(len(entries)))
+    links: list[Link] = []
+    for values, where in entries:
+        table = Table(values, where, top.faults, common)
+        link = Link(
+            name=table.name("name"),
+            length=table.number("length", above=0),
+            radius=table.number("radius", above=0),
+            mass=table.number("mass", above=0),
+            inertia=table.triple("inertia", above=0),
+            mesh=table.text("mesh", ""),
+            mesh_scale=table.number("mesh_scale", default=Link.mesh_scale, above=0),
+        )
+        if link.mesh and not is_mesh(link.mesh):
+            table.fault("mesh", f"a file {listed(MESH_TYPES)}, or leave it out")
+        # Each principal moment of a rigid body is at most the sum of the other two.
+        if 2 * max(link.inertia) > sum(link.inertia) * (1 + 1e-12):
+            table.fault("inertia", "moments of which none exceeds the sum of the other two")
+        table.close()
+        links.append(link)
+    if entries:
+        common.close()
+    note_repeated(top.faults, "links", [link.name for link in links])
+    return tuple(links)
+
+
+_ANY_SIGN = ("max_temperature",)
+_TIMES = ("reply_timeout_s", "max_late_s")
+
+
+def read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
+    """Read ``safety``, and what single joints have otherwise.
+
+    Args:
+        top: The description.
+        joints: Its joints.
+
+    Returns:
+        The limits that are given; None without the table.
+    """
+    if "safety" not in top:
+        if "safety_of" in top:
+            top.fault("safety_of", "leave it out: there is no safety for it to differ from")
+        return None
+    table = top.table("safety")
+    common = {limit: _limit(table, limit) for limit in (*JOINT_LIMITS, *_TIMES)}
+    fault_after_s = table.number("fault_after_s", default=Safety.fault_after_s, above=0)
+    on_fault = Safety.on_fault
+    if "on_fault" in table:
+        on_fault = table.choice("on_fault", OnFault) or on_fault
+    table.close()
+    singles = top.table("safety_of")
+    of: list[tuple[str, str, float]] = []
+    for joint in joints:
+        own = singles.table(joint.name)
+        given = ((joint.name, limit, _limit(own, limit)) for limit in JOINT_LIMITS)
+        of += [(name, limit, value) for name, limit, value in given if value is not None]
+        own.close()
+    singles.close()
+    return Safety(**common, fault_after_s=fault_after_s, on_fault=on_fault, of=tuple(of))
+
+
+def _limit(table: Table, name: str) -> float | None:
+    """One limit; None where it isn't given."""
+    if name not in table:
+        return None
+    return table.number(name, above=None if name in _ANY_SIGN else 0)
+
+
+_RANGED = (SensorKind.IR, SensorKind.SONAR)
+
+
+def read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[Sensor, ...]:
+    """Read ``sensors``, with ``defaults`` of each kind.
+
+    Args:
+        top: The description.
+        defaults: Its ``defaults``.
+        links: The links that may carry them.
+
+    Returns:
+        The sensors.
+    """
+    common = {kind: defaults.table(kind) for kind in SensorKind}
+    used: set[SensorKind] = set()
+    sensors: list[Sensor] = []
+    for values, where in top.tables("sensors"):
+        kind = Table(values, where, top.faults).choice("kind", SensorKind)
+        if kind is not None:
+            used.add(kind)
+            table = Table(values, where, top.faults, common[kind])
+            table.choice("kind", SensorKind)
+            sensors.append(_sensor(table, kind, [link.name for link in links]))
+            table.close()
+    for kind, table in common.items():
+        if kind in used:
+            table.close()
+        elif kind in defaults:
+            defaults.fault(kind, f"leave it out: no sensor is of kind {kind}")
+    topics = [sensor.topic for sensor in sensors]
+    note_repeated(top.faults, "topics of the sensors", topics)
+    return tuple(sensors)
+
+
+def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
+    name, link = table.name("name"), table.text("link")
+    if link and link not in link_names:
+        table.fault("link", listed(link_names, link))
+    position = table.triple("position")
+    rpy = table.triple("rpy", default=(0.0, 0.0, 0.0))
+    range_min = range_max = field_of_view = None
+    axes: tuple[str, ...] = ()
+    fields = ["link", "position", "rpy"]
+    if kind in _RANGED:
+        range_min = table.number("range_min", at_least=0)
+        range_max = table.number("range_max", above=0)
+        if range_min >= range_max:
+            table.fault("range_max", f"more than range_min = {range_min:g}", f"{range_max:g}")
+        field_of_view = table.number("field_of_view", above=0, at_most=6.29)
+        fields += ["range_min", "range_max", "field_of_view"]
+    else:
+        axes = table.words("axes", valid=("x", "y", "z"))
+        if not axes:
+            table.fault("axes", 'an array of the measured axes, e.g. ["x", "y"]')
+        fields += ["axes"]
+    return Sensor(
+        name=name,
+        kind=kind,
+        link=link,
+        position=position,
+        rpy=rpy,
+        range_min=range_min,
+        range_max=range_max,
+        field_of_view=field_of_view,
+        axes=axes,
+        assumed=table.words("assumed", valid=fields),
+    )
+
 
 _SHELF = Shelf("robot", "undulog.capture.robot", "shipped", RobotFileError)
 _PARTS = ("links", "joints", "servo", "sensors", "bus")

@@ -24,8 +24,7 @@ import numpy as np
 
 from ..common.arrays import ComplexArray, FloatArray, frozen
 from ..common.errors import Fault, NullModelError
-from ..common.input_file import read_input
-from ..common.part_file import write_text
+from ..common.files import read_input, write_text
 from ..common.strict_table import Faults, Table
 
 FORMAT = "undulog null model 1"

@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from ..common.errors import UsageError
 from ..log.messages.frames import FrameArray
 from ..robot.model import ClockDomain
+from .address import number, only
 from .contract import SourceAddress
 from .events import Tally
 from .link import LinkedSource
-from .options import number, only
 from .receive_many import ArrivalClock
 from .receive_thread import ReceiveThread
 from .socketcand_text import SocketcandText

@@ -1,7 +1,7 @@
 """Sources with the scheme ``unix``: frames from other processes of this computer.
 
 The recorder listens at a path; whoever may write there connects and sends packets as
-:mod:`.capture.sources.packets` describes them. It is the fast way in: up to 256 frames a packet,
+:mod:`.capture.sources.records` describes them. It is the fast way in: up to 256 frames a packet,
 and the kernel stamps each packet's arrival.
 """
 
@@ -25,13 +25,12 @@ from ..common.errors import SourceError, UsageError
 from ..common.priority import share_priority
 from ..log.messages.frames import FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
-from .bus_watch import BusWatch
+from .address import flag, only
 from .contract import Polled, Source, SourceAddress, SourceContext, SourceCounts
-from .events import Tally
-from .options import flag, only
-from .packets import HEAD, LONGEST, MOST_RECORDS, RECORD_SIZE
+from .events import BusWatch, Tally
 from .receive_many import ArrivalClock, Batch
 from .receive_thread import ReceiveThread
+from .records import HEAD, LONGEST, MOST_RECORDS, RECORD_SIZE
 
 _MOST_PACKETS = 8192  # in one poll, of one sender: others want to be heard too
 _BACKLOG = 64

@@ -25,7 +25,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
-from undulog.sim.scenario.ground import FrictionLaw
+from undulog.sim.scenario.world import FrictionLaw
 
 from .answers import Answers
 from .determined import Z95

@@ -1,7 +1,16 @@
-"""A session's commands and joint states, and the twin's parameters that fit them best."""
+"""A session's commands and joint states, and the twin's parameters that fit them best.
+
+Which single module's servo differs? Each is freed by itself; the best one is fitted, and tested.
+
+At the fit of the shared parameters a module's own factor would lessen Q by about b_j^2 (A_j^-1)_jj,
+b_j its column's product with the weighted residuals and A_j the normal matrix with that column. The
+largest is fitted in full; its p-value is that of its logarithm over its standard error, times the
+number of modules that were tried (Bonferroni).
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +28,73 @@ from ..reproduce.run import find_repetition
 from .alternatives import Alternative, alternatives
 from .answers import Answers, read_measured
 from .determined import Ridge, half_widths, ridges, what_would_tell
-from .lack_of_fit import LackOfFit, halves, lack_of_fit
-from .misfit import Misfit, misfit
+from .lack_of_fit import LackOfFit, Misfit, halves, lack_of_fit, misfit
 from .parameters import DELAY, Unknown, module_unknown, unknowns, with_values
-from .solve import Solution, solve
-from .weak_module import Search, find_weak_module
+from .solve import Solution, derivatives, solve
+
+SIGNIFICANT = 0.05
+
+
+@dataclass(frozen=True)
+class Search:
+    """What came of it.
+
+    Attributes:
+        module: The joint that fits best with a servo of its own.
+        p: Family-wise p-value.
+        tried: How many modules were.
+    """
+
+    module: str
+    p: float
+    tried: int
+
+    @property
+    def named(self) -> bool:
+        """Whether it is shown to differ."""
+        return self.p < SIGNIFICANT
+
+
+def find_weak_module(
+    answers: Answers,
+    shared: Solution,
+    spread: float,
+    on_iteration: Callable[[int, float], None],
+) -> tuple[Search, Solution]:
+    """Try every module.
+
+    Args:
+        answers: The twin under the commands.
+        shared: The fit of identical modules.
+        spread: Prior standard deviation of a module's ln factor.
+        on_iteration: As :func:`.replay.calibrate.solve.solve` has it.
+
+    Returns:
+        The search, and the fit with that module's own factor.
+    """
+    joints = answers.measured.joints
+    gains: list[float] = []
+    for joint in joints:
+        wanted = (*shared.unknowns, module_unknown(answers.scenario, joint, spread))
+        column = derivatives(answers, wanted, np.append(shared.x, 0.0), [len(shared.x)])
+        normal = np.zeros((len(wanted), len(wanted)))
+        normal[:-1, :-1], normal[-1, -1] = shared.normal, spread**-2
+        slope = 0.0
+        for own, others, rest, s in zip(
+            column, shared.columns, shared.after, shared.sigma.tolist(), strict=True
+        ):
+            normal[-1, :-1] += own[:, 0] @ others / s**2
+            normal[-1, -1] += own[:, 0] @ own[:, 0] / s**2
+            slope += float(own[:, 0] @ rest) / s**2
+        normal[:-1, -1] = normal[-1, :-1]
+        gains.append(slope**2 * float(np.linalg.inv(normal)[-1, -1]))
+    best = joints[int(np.argmax(gains))]
+    wanted = (*shared.unknowns, module_unknown(answers.scenario, best, spread))
+    fitted = solve(answers, wanted, start=np.append(shared.x, 0.0), on_iteration=on_iteration)
+    z = abs(float(fitted.x[-1])) / math.sqrt(float(fitted.covariance[-1, -1]))
+    p = min(1.0, len(joints) * math.erfc(z / math.sqrt(2.0)))
+    return Search(best, p, len(joints)), fitted
+
 
 SPREAD = 0.5
 WITHIN = 0.05

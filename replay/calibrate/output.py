@@ -15,7 +15,7 @@ import tomlkit
 
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import DataError
-from undulog.capture.common.part_file import part_file, write_text
+from undulog.capture.common.files import part_file, write_text
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 from undulog.sim.scenario.modules import Modules

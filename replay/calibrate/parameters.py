@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Servo
-from undulog.sim.scenario.ground import FrictionLaw, Ground
 from undulog.sim.scenario.scenario import Scenario
+from undulog.sim.scenario.world import FrictionLaw, Ground
 
 SERVO = {
     "stall_torque": "N m",

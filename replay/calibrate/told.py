@@ -10,8 +10,7 @@ import numpy as np
 from .alternatives import Alternative
 from .determined import Z95, Ridge
 from .fit import Calibration, Fitted
-from .lack_of_fit import LEVEL, LackOfFit
-from .misfit import Misfit
+from .lack_of_fit import LEVEL, LackOfFit, Misfit
 from .parameters import DELAY
 
 NOT_NOISE = 3.0

@@ -10,8 +10,8 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, refuse_existing, say
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.files import check_stop
 from undulog.capture.common.interruption import interruptible
-from undulog.capture.common.part_file import check_stop
 
 
 def fit(

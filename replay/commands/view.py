@@ -14,7 +14,7 @@ from undulog.capture.common.console import emit_json, progress, refuse_existing,
 from undulog.capture.common.errors import UsageError
 
 from .view_film import ClipOptions, view_clip
-from .view_overlay_options import BesideOptions
+from .view_overlay import BesideOptions
 from .view_single import SingleOptions
 
 if TYPE_CHECKING:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, say
 from undulog.capture.common.interruption import interruptible
@@ -17,7 +20,31 @@ from ..overlay.side import names_of
 from ..overlay.together import bring_together, steps
 from ..overlay.write import Beside, Place
 from ..viewer import viewer
-from .view_overlay_options import BesideOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class BesideOptions:
+    """What the command line says of sessions side by side; None is what it doesn't say.
+
+    Attributes:
+        align: With several sessions, what happens at once: the same `time` since each one's first
+            sample (where nothing is said), the same time since the start of its `gait`, or the
+            same `phase` of the gait.
+        names: With several sessions: what they are called, with commas, e.g. `robot,twin`; the
+            files' names where nothing is said.
+        place: With several sessions: whether bodies are laid on the first one at the `start`
+            (where nothing is said) or stay where each session's `world` has them.
+    """
+
+    align: Annotated[Literal["time", "gait", "phase"] | None, Parameter(name="--align")] = None
+    names: Annotated[str | None, Parameter(name="--names")] = None
+    place: Annotated[Literal["start", "world"] | None, Parameter(name="--place")] = None
+
+    @property
+    def given(self) -> list[str]:
+        """Names of the options that were given."""
+        named = {"align": self.align, "names": self.names, "place": self.place}
+        return [f"--{name}" for name, value in named.items() if value is not None]
 
 
 def view_beside(

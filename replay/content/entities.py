@@ -1,9 +1,4 @@
-"""The mean cycle as entities of its own on a timeline of its own.
-
-``ensemble_cycle`` runs from 0 to 360 degrees of the gait's phase, one number a degree, and the
-viewer loops it at the gait's own speed. Nothing of it is on the session's timelines but the body's
-first shape, so that its view isn't black there.
-"""
+"""Series, places, charts and maps: what a recording contains, by the names of its entities."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError, UsageError
+from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.interruption import StopRequest
-from undulog.capture.common.part_file import check_stop, part_file
 
 from ..content.content import Content
 from ..layout.views import build_views

@@ -25,7 +25,8 @@ from ..draw.cycles import mean_cycle
 from ..draw.cycles.heat_maps import VISIBLE
 from ..draw.cycles.response import SEGMENTS
 from ..draw.plots import gait, joints
-from ..draw.scene import body, trail
+from ..draw.scene import body
+from ..draw.scene import surroundings as trail
 from ..draw.scene.body import body_title
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 

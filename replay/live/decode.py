@@ -286,7 +286,7 @@ class LiveLog:
         return self._shifted(group.stamps, group.log_ns)
 
     def _shifted(self, stamp_ns: IntArray, log_ns: IntArray) -> IntArray:
-        """Stamps on the log's clock; see :mod:`.capture.log.read.stamp_clock`."""
+        """Stamps on the log's clock; see :mod:`.capture.log.read.own_times`."""
         if not stamp_ns.any():
             return log_ns
         if self._shift_ns is None:

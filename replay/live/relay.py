@@ -21,8 +21,8 @@ import numpy as np
 import rerun as rr
 
 from undulog.capture.common.errors import DataError, LogWriteError
+from undulog.capture.common.files import part_file
 from undulog.capture.common.interruption import StopRequest, interruptible
-from undulog.capture.common.part_file import part_file
 from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
 from ..record.rrd import APPLICATION, recording_id, require_whole

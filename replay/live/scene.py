@@ -20,8 +20,10 @@ from ..content import entities
 from ..content.content import Content, Signal, Start, signal_title
 from ..draw.drawing import palette_of, start_of
 from ..draw.facts import code, escaped, log_facts
-from ..draw.plots import gait, joints, power
-from ..draw.scene import body, markers, ranges, trail
+from ..draw.plots import gait, joints
+from ..draw.plots import joints as power
+from ..draw.scene import body, markers, ranges
+from ..draw.scene import surroundings as trail
 from ..draw.scene.body import body_title
 from ..draw.scene.motion import BODY_RATE_HZ, SPARSE_RATE_HZ, HeadPath, Motion, assemble, still_head
 from ..layout.blueprint import build_blueprint

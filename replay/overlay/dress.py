@@ -18,7 +18,7 @@ from ..content.entities import Color
 from ..draw.scene.body import MEASURED
 from ..draw.scene.meshes import MESHES, meshed
 from ..draw.scene.motion import HeadPath
-from ..draw.scene.trail import TRAIL
+from ..draw.scene.surroundings import TRAIL
 from ..samples.sampling import decimate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from .alignment import Aligned

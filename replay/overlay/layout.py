@@ -16,12 +16,11 @@ from ..draw.plots import gait
 from ..draw.scene import ranges
 from ..draw.scene.body import COMMANDED, MEASURED
 from ..draw.scene.markers import LABELS, MARKERS
-from ..draw.scene.trail import TRAIL, TRAIL_SECONDS
+from ..draw.scene.surroundings import TRAIL, TRAIL_SECONDS
 from ..layout.views import AFTER_CURSOR_S, BEFORE_CURSOR_S, build_views
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from .alignment import Align
-from .bars import BARS, DIFFERENCES, Quantity
-from .lines import LINES, POWER
+from .differences import BARS, DIFFERENCES, LINES, POWER, Quantity
 from .side import Side
 from .words import FACTS
 

@@ -15,15 +15,17 @@ from rerun.chunk import LazyChunkStream
 from undulog.analysis.compare.compare import Choices, compare_seen
 from undulog.analysis.compare.side import Seen
 from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.interruption import StopRequest
-from undulog.capture.common.part_file import check_stop, part_file
 
 from ..draw.plots.joints import log_scalars
 from ..draw.scene.body import body_title
 from ..record.rrd import Recording, open_recording, recording_id, require_whole, rerun_writes
 from ..samples.sampling import decimate
 from ..samples.tracks import Track
-from . import bars, dress, lines, words
+from . import differences as bars
+from . import differences as lines
+from . import dress, words
 from .alignment import Align, Aligned
 from .difference import angle_differences, log_differences
 from .layout import APART, Shown, build_blueprint

@@ -23,7 +23,7 @@ from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.session.cycles import CycleMaps
 from undulog.capture import Session
 from undulog.capture.common.errors import LogWriteError
-from undulog.capture.common.part_file import part_file
+from undulog.capture.common.files import part_file
 
 from ..content.content import Content
 from ..content.layer import Layer, Named

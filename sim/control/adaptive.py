@@ -6,13 +6,11 @@ import numpy as np
 
 from undulog.capture.robot.model import Plane, Robot
 
-from ..gait.contract import WALK, GaitTick, Generator, Modulation
-from ..gait.readings import Readings
+from ..gait.contract import WALK, GaitTick, Generator, Modulation, Readings
 from ..scenario.controllers import Controller
 from ..scenario.sensor_layout import layout
 from .course import Course
-from .distances import Distances
-from .lookout import Lookout
+from .lookout import Distances, Lookout
 from .moment import Moment
 from .phase_history import BodyWave
 from .reactions import Haste, Shrinking, Steering

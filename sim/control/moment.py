@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..gait.readings import Readings
+from ..gait.contract import Readings
 from .reckoning import Pose
 
 

@@ -9,10 +9,9 @@ from undulog.capture.robot.model import Plane, Robot
 
 from ..scenario.controllers import HeadSteering, SideShrinking, TailHaste
 from ..scenario.sensor_layout import Layout
-from .distances import Distances
 from .filters import LowPass, SideLatch
 from .laws import amplitude, bend, frequency
-from .lookout import InTheWay
+from .lookout import Distances, InTheWay
 from .moment import Moment
 from .phase_history import TURN, PhaseHistory
 

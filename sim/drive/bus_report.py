@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..gate.lateness import Jitter
-from ..gate.outcome import How, Outcome
+from ..gate.outcome import How, Jitter, Outcome
 from ..gate.tick import Remark
 from .loop import LoopTally
 

@@ -21,8 +21,7 @@ from undulog.capture.common.errors import DataError, JointSetError
 from undulog.capture.log.read.signals import JointSignals
 from undulog.capture.robot.model import Robot
 
-from ..gait.contract import GaitTick
-from ..gait.readings import Readings
+from ..gait.contract import GaitTick, Readings
 from ..scenario.scenario import CONTROL_RATE_HZ
 
 COMMANDS = "/joint_commands"

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, JointSetError, PlanError, UsageError
-from undulog.capture.common.shipped import Shelf
+from undulog.capture.common.files import Shelf
 from undulog.capture.robot.model import Plane, Robot
 
 from ..control.build import build_gait
@@ -20,8 +20,7 @@ from ..scenario.engines import Kernels
 from ..scenario.scenario import Scenario
 from ..scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 from .command_session import CommandReplay, RecordedCommands
-from .plan import PlanGait
-from .plan_file import is_plan, parse_plan
+from .plan import PlanGait, is_plan, parse_plan
 
 _EXPLAINS = ("plan.toml", "gait.toml")
 """Attachments of recorded commands that say what they were made from: they go on to the run."""

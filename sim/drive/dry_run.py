@@ -24,10 +24,9 @@ from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import Robot
 from undulog.capture.robot.safety import Safety
 
-from ..gate.faults import GateFault
 from ..gate.gate import POSE_S, Gate
 from ..gate.limits import GateLimits, gate_limits, missing_limits
-from ..gate.outcome import How
+from ..gate.outcome import GateFault, How
 from ..gate.ramp import Ramp
 from ..gate.tick import Remark
 from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario

@@ -9,12 +9,10 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
-from ..gait.contract import Gait, GaitTick
-from ..gait.readings import Readings
+from ..gait.contract import Gait, GaitTick, Readings
 from ..gate.gate import Gate
 from ..gate.limits import GateLimits
-from ..gate.status import JointStatus
-from ..gate.tick import Heard, Phase, Remark
+from ..gate.tick import Heard, JointStatus, Phase, Remark
 from ..sensing.contract import JointSample
 from ..twin.twin import Sample, Twin
 from .dry_run_tally import DemandTally

@@ -5,13 +5,91 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from undulog.capture.common.interruption import StopRequest
+import numpy as np
 
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.robot.model import Plane, Robot
+
+from ..gait.contract import Gait, GaitTick, Readings
+from ..gait.rhythm import smoothstep
 from ..scenario.scenario import Scenario
 from ..twin.recording import Driver, Recording, record
 from ..twin.twin import Sample
 from .driven import Driven
-from .fading import FadingGait
+
+FADE_S = 1.0
+"""A gait that is to stop comes to rest within this time [s]."""
+
+STOP = "stop"
+"""The mode of a gait that comes to rest."""
+
+_ROUNDING_S = 1e-9  # a tick that is due when the fade ends is in time
+_FADED = ("A", "offset")  # of a plane or a joint, not of what a controller tells of itself
+
+
+class FadingGait:
+    """A gait, untouched until it is to end; then its commands shrink smoothly to straight joints.
+
+    The commands are multiplied by 1 - S((t - t_0) / T), S(x) = 3 x^2 - 2 x^3; for a wave that is
+    its amplitude and offset going to zero while its phase runs on. It works for any gait, recorded
+    commands and adaptive ones alike.
+    """
+
+    def __init__(self, gait: Gait, robot: Robot, fade_s: float = FADE_S) -> None:
+        """Wrap a gait.
+
+        Args:
+            gait: Who commands.
+            robot: Whose joints.
+            fade_s: T [s].
+        """
+        self._gait, self._fade_s = gait, fade_s
+        waves = {*Plane, *robot.joint_names}
+        parts = [name.rpartition(".") for name in gait.names]
+        faded = [wave in waves and value in _FADED for wave, _, value in parts]
+        self._faded = np.array(faded, dtype=np.bool_)
+        self._rest = np.clip(np.zeros(len(robot.joints)), *robot.limits())
+        self._asked = False
+        self._begun_s: float | None = None
+        self._passed = 0.0  # share of the fade's time
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values: the gait's own."""
+        return self._gait.names
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last command was the pose at rest, to be held from then on."""
+        return self._passed == 1.0
+
+    def begin(self) -> None:
+        """Come to rest from the next step on; safe to call again."""
+        self._asked = True
+
+    def step(self, time_s: float, readings: Readings) -> GaitTick:
+        """Advance to a time and say what to do from then on.
+
+        Args:
+            time_s: Time since the start [s], never less than in the call before.
+            readings: For the gait.
+
+        Returns:
+            Commands and values.
+        """
+        tick = self._gait.step(time_s, readings)
+        if not self._asked:
+            return tick
+        if self._begun_s is None:
+            self._begun_s = time_s
+        elapsed_s = time_s - self._begun_s + _ROUNDING_S
+        self._passed = min(elapsed_s / self._fade_s, 1.0)
+        share = 1.0 - smoothstep(self._passed)
+        command: FloatArray = self._rest + share * (tick.command - self._rest)
+        values = tick.values.copy()
+        values[self._faded] *= share
+        return GaitTick(command, values, STOP, tick.clamped)
 
 
 def drive_twin(
@@ -25,7 +103,7 @@ def drive_twin(
 ) -> Recording:
     """Drive the twin and record it.
 
-    A stop request lets the gait come to rest first (:mod:`.sim.drive.fading`), then ends the run.
+    A stop request lets the gait come to rest first (:class:`Fading`), then the run ends.
 
     Args:
         driven: What to drive.

@@ -2,32 +2,52 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.bus.encoding import BusEncoder, BusValue
-from undulog.capture.bus.polling import poll_frames
+from undulog.capture.bus.encoding import BusEncoder, BusValue, poll_frames
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SourceError, UndulogError
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.robot.model import Direction, Quantity, Robot
 
+from ..gate.clamp import Spacing
 from ..gate.confirmation import Confirmation
-from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate
+from ..gate.outcome import FaultKind, GateFault
 from ..gate.presence import Presence
-from ..gate.spacing import Spacing
 from ..gate.tick import GateStep, Heard, Phase
 from ..scenario.scenario import CONTROL_RATE_HZ
 from .console_watch import ConsoleWatch
 from .link import Link
 from .pace import Pace
 from .readings_from_bus import BusReadings
-from .why_stop import why_stop
+
+_WORDS = {
+    signal.SIGINT: "asked to stop (Ctrl-C)",
+    signal.SIGTERM: "asked to stop (SIGTERM)",
+    signal.SIGHUP: "the console is gone",
+}
+
+
+def why_stop(stop: StopRequest, *, console_gone: bool) -> str:
+    """Why it is to stop.
+
+    Args:
+        stop: What signals asked for.
+        console_gone: Whether the terminal hung up.
+
+    Returns:
+        A few words; empty if it is not to stop.
+    """
+    if stop.signal is not None:
+        return _WORDS.get(stop.signal, f"asked to stop ({stop.signal.name})")
+    return _WORDS[signal.SIGHUP] if console_gone else ""
 
 
 class BusTick(NamedTuple):

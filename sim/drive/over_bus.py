@@ -11,21 +11,19 @@ from pathlib import Path
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
-from undulog.capture.recorder.clock import SessionClock
+from undulog.capture.recorder.ticks import SessionClock
 from undulog.capture.robot.model import Bus, Direction, Quantity, Robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceAddress, SourceCounts
 from undulog.capture.sources.events import Tally
 
+from ..gate.clamp import Spacing
 from ..gate.confirmation import Confirmation
-from ..gate.faults import FaultKind, GateFault
 from ..gate.gate import Gate
-from ..gate.lateness import jitter
 from ..gate.limits import GateLimits, gate_limits
-from ..gate.outcome import How, Outcome
-from ..gate.spacing import Spacing
+from ..gate.outcome import FaultKind, GateFault, How, Outcome, jitter
 from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
-from ..twin.garbage import quick_collections
+from ..twin.recording import quick_collections
 from .bus_report import UNASKED, BusReport, Feedback, remarks_of
 from .bus_session import BusSession, stamped
 from .console_watch import ConsoleWatch
@@ -33,8 +31,8 @@ from .driven import Driven
 from .gait_teller import GaitTeller
 from .link import Link, VirtualRobotLink
 from .loop import BusTick, ControlLoop, LoopTally
-from .open_link import open_link
 from .pace import LockstepPace, WallPace
+from .python_can_bus import open_link
 
 LISTEN_S = 0.5
 """A bus is listened to for so long before anything is sent [s]: whose it is, and how often joints

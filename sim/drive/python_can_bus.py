@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 
@@ -13,14 +14,14 @@ from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.can_interfaces import DEVICE_TIME, check_interface, known_options
+from undulog.capture.sources.address import flag, only
+from undulog.capture.sources.can_source import DEVICE_TIME, check_interface, known_options
 from undulog.capture.sources.contract import SourceAddress
 from undulog.capture.sources.events import Tally
-from undulog.capture.sources.options import only
 from undulog.capture.sources.python_can import PythonCanLink, bus_class, failure, open_bus
 from undulog.capture.sources.socketcand import server_of
 
-from .link import wait_until
+from .link import VirtualRobotLink, find_virtual_robot, wait_until
 
 _SEND_S = 0.02
 """So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one
@@ -161,3 +162,30 @@ class PythonCanBus:
     def _lost(self, error: OSError) -> SourceError:
         reason = (error.strerror or str(error)).partition("\n")[0].strip()
         return SourceError(self.place, f"the bus is lost: {reason}")
+
+
+def open_link(address: SourceAddress, tally: Tally) -> VirtualRobotLink | PythonCanBus:
+    """Open a bus: a virtual robot's where one says that it is there, else any of python-can's.
+
+    Args:
+        address: ``can:INTERFACE:CHANNEL``; for socketcand with ``plain=yes`` the server is not
+            asked whether it is a virtual robot.
+        tally: Where to count.
+
+    Returns:
+        The bus.
+
+    Raises:
+        UsageError: If there is no such interface or option.
+        SourceError: If it can't be opened.
+    """
+    interface, _, channel = address.rest.partition(":")
+    if interface != "socketcand":
+        return PythonCanBus(address, tally)
+    if not channel:
+        raise UsageError(f"{address.text!r}: no channel; expected can:socketcand:CHANNEL")
+    plain = flag(address, "plain", default=False)
+    own = {key: value for key, value in address.options.items() if key != "plain"}
+    address = dataclasses.replace(address, options=own)
+    virtual = None if plain else find_virtual_robot(address, tally)
+    return virtual or PythonCanBus(address, tally)

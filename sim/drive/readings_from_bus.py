@@ -16,8 +16,8 @@ from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 from undulog.capture.log.messages.frames import FrameArray
 from undulog.capture.robot.model import Quantity, Robot
 
-from ..gait.readings import Readings
-from ..gate.status import JointStatus
+from ..gait.contract import Readings
+from ..gate.tick import JointStatus
 
 OLDEST_S = 0.5
 """A value older than this counts as unknown [s]; the slowest sensors come several times in it."""

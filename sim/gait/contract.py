@@ -4,18 +4,57 @@ A gait is asked once a control tick, in order of time, with the readings that th
 has by then; it answers with the joint commands and with what it meant by them. Each plane's phase
 is *integrated*, Phi' = omega, and never computed as omega t: the two differ as soon as omega
 changes.
+
+What the robot's computer knows at one control tick: the newest value of each sensor.
+
+Gaits and controllers see this and never the truth: values are noisy, quantised and late, as the
+sensors and the bus make them, and the same whether twin or robot sent them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, frozen
+from undulog.capture.robot.model import Robot
 
-from .readings import Readings
+
+@dataclass(frozen=True)
+class Readings:
+    """The newest value of each sensor; NaN, or absent from a mapping, until the first has come.
+
+    Attributes:
+        angle: Joint angles that the encoders report [rad], shape (m,).
+        velocity: Joint rates that the servos report [rad/s], shape (m,).
+        ranges: Name of an infrared sensor or sonar to its distance [m]; +inf: nothing in range.
+        acceleration: Name of an accelerometer to the specific force in its frame [m/s^2],
+            shape (3,), NaN on an axis that it does not measure.
+        magnetic_field: Name of a compass to the field in its frame [T], shape (3,), NaN likewise.
+    """
+
+    angle: FloatArray
+    velocity: FloatArray
+    ranges: Mapping[str, float] = field(default_factory=dict[str, float])
+    acceleration: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
+    magnetic_field: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
+
+    @classmethod
+    def nothing(cls, robot: Robot) -> Readings:
+        """What is known before anything was reported.
+
+        Args:
+            robot: The robot.
+
+        Returns:
+            Readings without a value.
+        """
+        unknown = frozen(np.full(len(robot.joints), np.nan))
+        return cls(unknown, unknown)
+
 
 WALK = "walk"
 """The mode of a gait that only goes on."""

@@ -24,11 +24,9 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Plane, Robot
 
-from .limits import started
-from .readings import Readings
-from .rhythm import Change, IntegratedPhase, Swing
-from .wave import Wave
-from .waves import WaveGenerator
+from .contract import Readings
+from .rhythm import Change, IntegratedPhase, Swing, started
+from .wave import Wave, WaveGenerator
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The oscillator generator: each plane a chain of coupled oscillators, perhaps felt back.
 
 Eq. 1 of Meister, Stepanenko & Kernbach 2011 for the joints of each plane. Joint i is commanded
-A_i r_i sin(phi_i) + Y_i; A and Y follow what is asked for by :class:`~.sim.gait.approach.Approach`,
-so that nothing jumps, and begin at zero.
+A_i r_i sin(phi_i) + Y_i; A and Y follow what is asked for by :class:`Approach`, so that nothing
+jumps, and begin at zero.
 
 With feedback each oscillator turns by what its own servo reports,
 
@@ -29,13 +29,56 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Plane, Robot
 
-from .approach import Approach
+from .contract import Readings
 from .coupled import Coupling, HopfOscillators, PhaseOscillators
 from .coupled import Oscillators as OscillatorState
-from .readings import Readings
 from .rhythm import Change, IntegratedPhase, Swing
-from .wave import PlaneGait
-from .waves import WaveGenerator
+from .wave import PlaneGait, WaveGenerator
+
+
+class Approach:
+    """r'' = g (g (R - r) - 2 r'): critically damped, for each of n values.
+
+    The amplitude law of Ijspeert, Crespi, Ryczko & Cabelguen, Science 315, 1416 (2007), with
+    a = 2 g. R changes only at ticks, so the closed form is exact.
+    """
+
+    def __init__(self, start: FloatArray, rate: float) -> None:
+        """Rest at a value.
+
+        Args:
+            start: The values, shape (n,).
+            rate: g [1/s].
+        """
+        self.value = start
+        self._target = start
+        self._velocity = np.zeros_like(start)
+        self._rate = rate
+
+    def advance(self, elapsed_s: float) -> FloatArray:
+        """Go on towards the target in force.
+
+        Args:
+            elapsed_s: For how long [s].
+
+        Returns:
+            The values reached, shape (n,).
+        """
+        g, error = self._rate, self.value - self._target
+        slope = self._velocity + g * error
+        decay = np.exp(-g * elapsed_s)
+        self.value = self._target + (error + slope * elapsed_s) * decay
+        self._velocity = (self._velocity - g * slope * elapsed_s) * decay
+        return self.value
+
+    def aim(self, target: FloatArray) -> None:
+        """Take another target from now on.
+
+        Args:
+            target: R, shape (n,).
+        """
+        self._target = target
+
 
 Numbers: TypeAlias = "float | tuple[float, ...]"
 """One number for all, or one for each."""

@@ -9,11 +9,9 @@ import numpy as np
 
 from undulog.capture.robot.model import Plane, Robot
 
-from .limits import started
-from .readings import Readings
-from .rhythm import Change, IntegratedPhase, Swing
-from .wave import PlaneGait
-from .waves import WaveGenerator
+from .contract import Readings
+from .rhythm import Change, IntegratedPhase, Swing, started
+from .wave import PlaneGait, WaveGenerator
 
 
 @dataclass(frozen=True)

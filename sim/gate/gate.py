@@ -10,7 +10,7 @@
 It is asked once a control tick what to send. Until the pose of every joint is known it sends
 nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
 (:mod:`.sim.gate.clamp`). A fault or a request to stop leads to the ending that the robot's file
-names. While the bus is silent (:mod:`.sim.gate.silence`) nothing is sent, and the servos hold; the
+names. While the bus is silent (:mod:`.sim.gate.watch`) nothing is sent, and the servos hold; the
 ending begins when a joint is received again. It opens nothing and waits for nothing.
 """
 
@@ -24,17 +24,11 @@ from undulog.capture.robot.safety import OnFault
 
 from ..gait.contract import Gait, GaitTick
 from .clamp import Clamp, Clamped
-from .ending import Ending
-from .faults import MUTE, FaultKind, GateFault
 from .limits import GateLimits
-from .outcome import How, Outcome
-from .pose import why_not_from
-from .ramp import Ramp
-from .silence import Silence
-from .status import JointStatus
-from .tick import GateStep, Heard, Phase, Remark
-from .watch import Watch
-from .yielding import Yielding
+from .outcome import MUTE, FaultKind, GateFault, How, Outcome
+from .ramp import Ending, Ramp, why_not_from
+from .tick import GateStep, Heard, JointStatus, Phase, Remark
+from .watch import Silence, Watch, Yielding
 
 POSE_S = 2.0
 """So long the gate waits for the pose of every joint [s]."""

@@ -6,7 +6,113 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from .faults import GateFault
+import numpy as np
+
+
+class FaultKind(StrEnum):
+    """What went wrong."""
+
+    LOST = "lost"
+    SILENT = "silent"
+    TRACKING = "tracking"
+    CURRENT = "current"
+    TEMPERATURE = "temperature"
+    VOLTAGE = "voltage"
+    LATE = "late"
+    BUS_OFF = "bus-off"
+    STRANGER = "stranger"
+    BUS = "bus"
+    GAIT = "gait"
+    LOG = "log"
+
+
+MUTE = frozenset({FaultKind.BUS_OFF, FaultKind.BUS, FaultKind.STRANGER})
+"""Faults after which nothing more is sent: nobody hears it, or somebody else commands."""
+
+
+@dataclass(frozen=True)
+class GateFault:
+    """Why a drive ends early.
+
+    Attributes:
+        kind: What went wrong.
+        text: One sentence: joint, value, limit.
+        joint: The joint, empty if it is not one joint's.
+        value: What was found; None where it is no number.
+        limit: What is allowed; None likewise.
+        since_s: Since when, on the loop's clock [s]; None where it has no length.
+    """
+
+    kind: FaultKind
+    text: str
+    joint: str = ""
+    value: float | None = None
+    limit: float | None = None
+    since_s: float | None = None
+
+
+_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """Lateness of control ticks against deadlines that are anchored at the first one.
+
+    Attributes:
+        ticks: Ticks.
+        median_s: [s].
+        p99_s: Of a hundred ticks one is later [s].
+        worst_s: [s].
+        counts: Ticks up to 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50 and 100 ms late, each without those
+            before it, and those beyond.
+    """
+
+    ticks: int
+    median_s: float
+    p99_s: float
+    worst_s: float
+    counts: tuple[int, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the same, with the bounds of the counts."""
+        bounds = [f"<= {edge:g} ms" for edge in _EDGES_MS] + [f"> {_EDGES_MS[-1]:g} ms"]
+        return {
+            "ticks": self.ticks,
+            "median_s": self.median_s,
+            "p99_s": self.p99_s,
+            "worst_s": self.worst_s,
+            "counts": dict(zip(bounds, self.counts, strict=True)),
+        }
+
+    def __str__(self) -> str:
+        """One line."""
+        return (
+            f"ticks were late by {self.median_s * 1e3:.2f} ms (median), "
+            f"{self.p99_s * 1e3:.2f} ms (99 %), {self.worst_s * 1e3:.2f} ms at worst"
+        )
+
+
+def jitter(late_s: list[float]) -> Jitter | None:
+    """Sum lateness up.
+
+    Args:
+        late_s: Of each tick [s].
+
+    Returns:
+        The summary; None without a tick.
+    """
+    if not late_s:
+        return None
+    late = np.array(late_s)
+    place = np.searchsorted(np.array(_EDGES_MS) * 1e-3, late, side="left")
+    counts = np.bincount(place, minlength=len(_EDGES_MS) + 1)
+    return Jitter(
+        ticks=len(late),
+        median_s=float(np.median(late)),
+        p99_s=float(np.quantile(late, 0.99)),
+        worst_s=float(late.max()),
+        counts=tuple(counts.tolist()),
+    )
 
 
 class How(StrEnum):

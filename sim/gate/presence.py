@@ -16,9 +16,9 @@ from undulog.capture.log.messages.frames import (
     identifier_text,
 )
 from undulog.capture.robot.model import Direction, Robot
-from undulog.capture.sources.bus_watch import BUS_OFF
+from undulog.capture.sources.events import BUS_OFF
 
-from .faults import FaultKind, GateFault
+from .outcome import FaultKind, GateFault
 
 _SHOWN = 6
 

@@ -8,10 +8,27 @@ from typing import NamedTuple
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..gait.contract import GaitTick
-from ..gait.readings import Readings
-from .faults import GateFault
-from .status import JointStatus
+from ..gait.contract import GaitTick, Readings
+from .outcome import GateFault
+
+
+@dataclass(frozen=True)
+class JointStatus:
+    """The newest values of each joint; NaN where none came or it is too old. Shapes are (m,).
+
+    Attributes:
+        angle: Measured angles [rad].
+        current: Currents [A].
+        temperature: [degC].
+        voltage: Supply voltages [V].
+        silence_s: Time since the last angle [s]; inf before the first.
+    """
+
+    angle: FloatArray
+    current: FloatArray
+    temperature: FloatArray
+    voltage: FloatArray
+    silence_s: FloatArray
 
 
 class Phase(StrEnum):

@@ -11,7 +11,7 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
-from ..scenario.ground import Ground
+from ..scenario.world import Ground
 from . import kernels
 from .servo import Servos
 from .steps import Steps

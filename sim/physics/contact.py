@@ -19,7 +19,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..scenario.ground import FrictionLaw, Ground
+from ..scenario.world import FrictionLaw, Ground
 from .engine import BodyState
 
 _TINY = 1e-300

@@ -10,7 +10,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
 from ..scenario.engines import Kernels
-from ..scenario.ground import Ground
+from ..scenario.world import Ground
 from .contact import GroundContact
 from .servo import Servos
 from .steps import Steps

@@ -122,7 +122,7 @@ class Ledger:
 
     def _book_compiled(self, steps: Steps) -> None:
         """Add the flows through joints and to the ground, by the compiled kernels."""
-        from .ledger_kernels import add_ground_flows, add_joint_flows
+        from .kernels import add_ground_flows, add_joint_flows
 
         table, n, m = steps.table, steps.link_count, steps.joint_count
         add_joint_flows(table, n, m, self._servos.table, self._dt, self._joints)
@@ -155,7 +155,7 @@ class Ledger:
     def _kinetic(self, body: BodyState) -> float:
         """Kinetic energy of the links [J]."""
         if self._kernels is Kernels.NUMBA:
-            from .ledger_kernels import kinetic_energy
+            from .kernels import kinetic_energy
 
             return kinetic_energy(*body[1:4], self._mass, self._inertia)
         spin = into_frames(body.quaternion, body.spin)

@@ -27,15 +27,18 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from ..scenario.closest import Closest, rectangle_gaps, to_circles, to_rectangles
 from ..scenario.obstacles import (
     Boxes,
+    Closest,
     Cylinders,
     Obstacle,
     ObstacleMaterial,
     columns,
     into_axes,
     out_of_axes,
+    rectangle_gaps,
+    to_circles,
+    to_rectangles,
 )
 from .contact import normal_force
 from .vectors import cross

@@ -7,8 +7,8 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 
 from ..scenario.engines import Kernels
-from ..scenario.push import pushes_during
 from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from ..scenario.world import pushes_during
 from .engine import engine_type
 from .laws import laws_for
 from .obstacle_contact import obstacle_law

@@ -9,8 +9,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
-from .closest import to_circles, to_rectangles
-from .obstacles import Cylinder, Obstacle, Target, columns, into_axes
+from .obstacles import Cylinder, Obstacle, Target, columns, into_axes, to_circles, to_rectangles
 
 STREAM = 2
 """Number of the random stream that places and radii are drawn from."""

@@ -17,14 +17,12 @@ from undulog.capture.robot.model import Robot
 
 from ..gait.build import GaitParameters
 from .bus_faults import BusFault
-from .controllers import Controller
-from .controllers_toml import controller_table
+from .controllers import Controller, controller_table
 from .engines import EngineKind
 from .gaits_toml import gait_table
 from .modules import Modules
-from .push import Push
 from .sensors import Noise, SensorModels
-from .world import World
+from .world import Push, World
 from .world_toml import body_length, world_table
 
 CONTROL_RATE_HZ = 100

@@ -92,20 +92,19 @@ from pathlib import Path
 from typing import Any, cast
 
 from undulog.capture.common.errors import Fault, ScenarioError, UsageError
-from undulog.capture.common.input_file import is_file
-from undulog.capture.common.shipped import Shelf
+from undulog.capture.common.files import Shelf, is_file
 from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.capture.robot.model import Plane, Robot
 
 from .bus_faults import read_faults
-from .controllers_toml import read_controller
+from .controllers import read_controller
 from .engines import EngineKind
 from .gaits_toml import read_gait
 from .modules import read_modules
-from .push import read_pushes
 from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
-from .sensors_toml import read_noise, read_sensing
+from .sensors import read_noise, read_sensing
+from .world import read_pushes
 from .world_toml import read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32

@@ -4,13 +4,137 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.strict_table import Table, listed
+from undulog.capture.robot.model import Robot
 
 from .field import RandomField
-from .ground import Ground
 from .obstacles import Obstacle, ObstacleMaterial, Target
+
+
+class FrictionLaw(StrEnum):
+    """How the ground resists a link that slips along it.
+
+    The first three are Coulomb's, proportional to the normal force; they differ in how the two
+    coefficients combine when a link slips obliquely. The last one is a fluid's.
+
+    ``ellipse``: greatest dissipation on the ellipse (F_t/mu_t)^2 + (F_n/mu_n)^2 = N^2, the
+    convex anisotropic Coulomb law (Goyal, Ruina & Papadopoulos, Wear 143, 1991).
+    ``box``: each axis on its own, F_i = mu_i N sgn(v_i), the literal reading of Meister,
+    Stepanenko & Kernbach 2011.
+    ``transeth``: F_i = mu_i N v_i / |v| (Transeth, Leine, Glocker & Pettersen, IEEE Trans.
+    Robotics 24, 2008).
+    ``viscous``: F_i = -c_i v_i, whatever the normal force, on every link that touches the surface:
+    resistive-force theory (Gray & Hancock, J. Exp. Biol. 32, 1955), for eels and for theory.
+    """
+
+    ELLIPSE = "ellipse"
+    BOX = "box"
+    TRANSETH = "transeth"
+    VISCOUS = "viscous"
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What the ground is made of.
+
+    Attributes:
+        stiffness: k of Eq. 7 [N/m].
+        damping: d of Eq. 7 [N s/m].
+        mu_tangential: Friction coefficient along the body.
+        mu_normal: Friction coefficient across the body.
+        slip_speed: The smoothing: at this slip speed friction reaches 1/sqrt(2) of Coulomb's [m/s].
+        law: How the ground resists slip.
+        drag_tangential: c_t of the viscous law, a link's drag along the body [N s/m].
+        drag_normal: c_n of the viscous law, a link's drag across the body [N s/m].
+    """
+
+    stiffness: float = 2000.0
+    damping: float = 20.0
+    mu_tangential: float = 0.05
+    mu_normal: float = 0.5
+    slip_speed: float = 0.01
+    law: FrictionLaw = FrictionLaw.ELLIPSE
+    drag_tangential: float = 1.0
+    drag_normal: float = 10.0
+
+
+@dataclass(frozen=True)
+class Push:
+    """A constant force on the centre of a link.
+
+    Attributes:
+        link: Name of the link.
+        force: In the world [N].
+        start_s: When it begins [s].
+        duration_s: How long it lasts [s].
+    """
+
+    link: str
+    force: tuple[float, float, float]
+    start_s: float
+    duration_s: float
+
+
+def pushes_during(
+    pushes: Sequence[Push], link_names: Sequence[str], times_s: FloatArray
+) -> FloatArray | None:
+    """Forces on all links at some times.
+
+    Args:
+        pushes: The pushes.
+        link_names: Names of the n links.
+        times_s: Times of k physics steps [s], shape (k,).
+
+    Returns:
+        Forces in the world [N], shape (k, 3, n), or None where nothing pushes at any of them.
+    """
+    forces: FloatArray | None = None
+    for push in pushes:
+        acts = (times_s >= push.start_s) & (times_s < push.start_s + push.duration_s)
+        if acts.any():
+            if forces is None:
+                forces = np.zeros((len(times_s), 3, len(link_names)))
+            forces[acts, :, link_names.index(push.link)] += push.force
+    return forces
+
+
+def read_pushes(top: Table, robot: Robot | None) -> tuple[Push, ...]:
+    """Read ``[[disturbances]]`` of a scenario.
+
+    Args:
+        top: The scenario.
+        robot: Who is pushed; None after a fault: then names can't be checked.
+
+    Returns:
+        The pushes.
+    """
+    return tuple(
+        _read_push(Table(values, where, top.faults), robot)
+        for values, where in top.tables("disturbances")
+    )
+
+
+def _read_push(table: Table, robot: Robot | None) -> Push:
+    push = Push(
+        link=table.text("link"),
+        force=table.triple("force"),
+        start_s=table.number("start_s", at_least=0.0),
+        duration_s=table.number("duration_s", above=0.0),
+    )
+    names = [] if robot is None else [link.name for link in robot.links]
+    if robot is not None and push.link and push.link not in names:
+        table.fault("link", listed(names, push.link))
+    table.close()
+    return push
+
 
 STANDARD_GRAVITY = 9.81
 """Acceleration of gravity where nothing else is said [m/s^2]."""

@@ -12,9 +12,8 @@ from undulog.capture.common.strict_table import Table
 from undulog.capture.robot.model import Robot
 
 from .field import RandomField
-from .ground import FrictionLaw, Ground
 from .obstacles import Box, Cylinder, Obstacle, ObstacleMaterial, Target, Wall
-from .world import World, tilted_gravity
+from .world import FrictionLaw, Ground, World, tilted_gravity
 
 
 class _Surface(StrEnum):

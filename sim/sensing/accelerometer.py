@@ -19,8 +19,7 @@ from ..physics.steps import Steps
 from ..physics.vectors import cross, into_frames, out_of_frames
 from ..scenario.sensors import AccelerometerModel
 from .contract import VectorSample
-from .mount import Mounts
-from .quantise import quantised
+from .mount import Mounts, quantised
 
 STREAM = 5
 """Number of the random stream that the sensors' noise is drawn from."""

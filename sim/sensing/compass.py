@@ -21,8 +21,7 @@ from ..physics.vectors import into_frames
 from ..scenario.sensors import CompassModel
 from .accelerometer import measured
 from .contract import VectorSample
-from .mount import Mounts, Schedule
-from .quantise import quantised
+from .mount import Mounts, Schedule, quantised
 
 STREAM = 6
 """Number of the random stream that the sensors' noise is drawn from."""

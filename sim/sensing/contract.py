@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..gait.readings import Readings
+from ..gait.contract import Readings
 from ..physics.steps import Steps
 
 

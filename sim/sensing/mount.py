@@ -13,6 +13,19 @@ from ..physics.engine import BodyState
 from ..physics.vectors import out_of_frames
 
 
+def quantised(values: FloatArray, step: float) -> FloatArray:
+    """Round to whole steps, halves to the even one.
+
+    Args:
+        values: Any shape.
+        step: In the unit of the values; 0 leaves them as they are.
+
+    Returns:
+        The nearest multiples of the step, same shape.
+    """
+    return step * np.rint(values / step) if step > 0.0 else values
+
+
 def rotation_from_rpy(rpy: Sequence[float]) -> FloatArray:
     """Rotation by roll, pitch and yaw about fixed axes, as URDF has it: Rz(yaw) Ry(pitch) Rx(roll).
 

@@ -24,7 +24,7 @@ from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 from ..physics.steps import Steps
 from ..scenario.sensors import Noise, ServoPolling
 from .contract import JointSample
-from .quantise import quantised
+from .mount import quantised
 
 STREAM = 1
 """Number of the random stream that the servos' noise is drawn from."""

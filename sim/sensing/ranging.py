@@ -1,4 +1,14 @@
-"""What infrared sensors and sonars share: rays from moving mounts, samples at due times."""
+"""What infrared sensors and sonars share: rays from moving mounts, samples at due times.
+
+Infrared distance sensors of the Sharp GP2Y0A02 kind, as the robot's computer reads them.
+
+Triangulation gives a voltage that falls with the distance, V = 90.05/(d + 13.46) - 0.137 with d in
+cm (a fit to the data sheet's typical curve, 20 to 150 cm). Nearer than the peak the spot of light
+leaves the detector and the voltage falls back; the data sheet draws that branch without numbers,
+here it is a parabola from nothing at d = 0 to the peak. The sensor takes a new value every 38 ms
+and holds it; an ADC reads it, and the computer turns it into a distance by inverting the falling
+branch. So what is nearer than the peak is told as farther than it is: that is the sensor's physics.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +21,9 @@ from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..physics.vectors import out_of_frames
+from ..scenario.sensors import InfraredModel
 from .contract import RangeSample
-from .mount import Mounts, Schedule
+from .mount import Mounts, Schedule, quantised
 from .rays import RayCaster
 
 
@@ -79,3 +90,94 @@ class Ranging:
             RangeSample(self._names[i], float(k * self._dt), distance)
             for k, i, distance in zip(step.tolist(), which.tolist(), told, strict=True)
         ]
+
+
+STREAM = 3
+"""Number of the random stream that the sensors' noise is drawn from."""
+
+_SCALE, _SHIFT, _BIAS = 0.9005, 0.1346, 0.137  # V m, m, V
+
+
+def voltage(distance: FloatArray, peak: float) -> FloatArray:
+    """What the sensor's output is at a distance.
+
+    Args:
+        distance: [m], not negative, inf where nothing is there; any shape.
+        peak: Distance of the greatest voltage [m].
+
+    Returns:
+        Voltage [V], never negative, same shape.
+    """
+    falling = np.maximum(_SCALE / (np.maximum(distance, peak) + _SHIFT) - _BIAS, 0.0)
+    x = np.minimum(distance / peak, 1.0)
+    return falling * x * (2.0 - x)
+
+
+def decoded(volts: FloatArray) -> FloatArray:
+    """The distance that the falling branch has at a voltage.
+
+    Args:
+        volts: Voltage [V], not negative; any shape.
+
+    Returns:
+        Distance [m], same shape.
+    """
+    return _SCALE / (volts + _BIAS) - _SHIFT
+
+
+class Infrared:
+    """A robot's infrared sensors; each measures along one ray, its x axis."""
+
+    def __init__(
+        self,
+        model: InfraredModel,
+        sensors: Sequence[Sensor],
+        robot: Robot,
+        caster: RayCaster,
+        *,
+        dt: float,
+        seed: int,
+    ) -> None:
+        """Start before the first control period; the sensors' clocks are staggered evenly.
+
+        Args:
+            model: How they measure.
+            sensors: The sensors.
+            robot: Who carries them.
+            caster: The world.
+            dt: Physics step [s].
+            seed: Of the noise.
+        """
+        count = len(sensors)
+        self._ranging = Ranging(
+            sensors,
+            robot,
+            caster,
+            Schedule(model.hold_s, count, dt),
+            bundles=np.tile([[1.0], [0.0], [0.0]], (count, 1, 1)),
+            sees_ground=True,
+            dt=dt,
+        )
+        self._model = model
+        self._longest = np.array([one.range_max for one in sensors], dtype=np.float64)
+        self._random = np.random.default_rng([seed, STREAM])
+
+    def observe(self, steps: Steps, start: int) -> list[RangeSample]:
+        """Measure what is due in one control period.
+
+        Args:
+            steps: Its physics steps, both ends included.
+            start: Number of the first one since the start of the run.
+
+        Returns:
+            The samples, in order of time; +inf beyond a sensor's range (REP 117).
+        """
+        return self._ranging.observe(steps, start, self._reported)
+
+    def _reported(self, distance: FloatArray, which: IntArray) -> FloatArray:
+        model = self._model
+        volts = voltage(distance, model.peak)
+        volts = volts + model.noise_v * self._random.standard_normal(len(volts))
+        read = quantised(np.clip(volts, 0.0, model.adc_v), model.adc_v / (2**model.adc_bits - 1))
+        told = decoded(read)
+        return np.where(told > self._longest[which], np.inf, told)

@@ -6,14 +6,14 @@ from typing import Protocol
 
 from undulog.capture.robot.model import Sensor, SensorKind
 
-from ..gait.readings import Readings
+from ..gait.contract import Readings
 from ..physics.steps import Steps
 from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
 from .accelerometer import Accelerometer
 from .compass import Compass
 from .contract import JointSample, RangeSample, SensorSample, VectorSample
-from .ir import Infrared
 from .polling import JointPolling
+from .ranging import Infrared
 from .rays import RayCaster
 from .sonar import Sonar
 

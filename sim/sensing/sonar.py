@@ -19,8 +19,7 @@ from undulog.capture.robot.model import Robot, Sensor
 from ..physics.steps import Steps
 from ..scenario.sensors import SonarModel
 from .contract import RangeSample
-from .mount import Schedule
-from .quantise import quantised
+from .mount import Schedule, quantised
 from .ranging import Ranging
 from .rays import RayCaster
 

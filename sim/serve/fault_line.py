@@ -9,7 +9,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
 from undulog.capture.robot.model import Robot
-from undulog.capture.sources.bus_watch import BUS_OFF, RESTARTED
+from undulog.capture.sources.events import BUS_OFF, RESTARTED
 
 from ..scenario.bus_faults import BusFault, FaultKind
 from ..sensing.contract import JointSample, SensorSample

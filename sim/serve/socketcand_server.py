@@ -21,7 +21,7 @@ from collections.abc import Callable
 from undulog.capture.log.messages.frames import FrameArray
 
 from .bus_client import BusClient, Sent
-from .loopback import listen_on_loopback
+from .pacing import listen_on_loopback
 from .socketcand_text import frame_text, sent_frame
 
 MOST_CLIENTS = 16

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -23,6 +24,21 @@ from ..scenario.engines import Kernels
 from ..scenario.scenario import Scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin
+
+
+@contextmanager
+def quick_collections() -> Generator[None]:
+    """Garbage is looked for among new objects only: all of them at once take longer than a tick.
+
+    Yields:
+        Nothing.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 @dataclass(frozen=True)

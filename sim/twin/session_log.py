@@ -19,7 +19,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from undulog.capture.log.messages.power_topics import PowerTopic
+from undulog.capture.log.messages.topics import PowerTopic
 from undulog.capture.log.write.sensor_channels import open_sensor
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.kinematics import rotation_from_quaternion

@@ -27,8 +27,8 @@ from undulog.capture.robot.model import Plane, Robot
 
 from ..physics.obstacle_contact import yielding
 from ..physics.servo import COULOMB_SPEED, Servos
-from ..scenario.ground import FrictionLaw
 from ..scenario.scenario import Scenario
+from ..scenario.world import FrictionLaw
 
 _BOUNDED = (
     *("world.ground.slip_speed", "servo.coulomb_friction"),

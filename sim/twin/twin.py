@@ -24,7 +24,7 @@ from ..physics.steps import Step, Steps
 from ..scenario.engines import Kernels
 from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
 from ..sensing.contract import SensorSample
-from ..sensing.quantise import quantised
+from ..sensing.mount import quantised
 from ..sensing.senses import Senses
 from .stability import likely_cause
 

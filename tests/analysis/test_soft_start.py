@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.signals.soft_start import steady_part
 from undulog.analysis.signals.stretch import Options
+from undulog.analysis.signals.windows import steady_part
 
 analysed = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["analysed"]
 

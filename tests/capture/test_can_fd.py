@@ -20,8 +20,8 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.exchange.log_export import export_log
-from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import (
     DIR_RX,
@@ -34,12 +34,11 @@ from undulog.capture.log.messages.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from undulog.capture.recorder.clock import SessionClock
 from undulog.capture.recorder.recorder import Ending, Recorder
+from undulog.capture.recorder.ticks import SessionClock
 from undulog.capture.robot.description import parse_robot
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext
-from undulog.capture.sources.registry import open_source
 
 S = 1_000_000_000
 T0 = 1_700_000_003_250_000_000

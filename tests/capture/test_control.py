@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder import control
-from undulog.capture.recorder.control import MAX_CLIENTS, ControlServer
+from undulog.capture.recorder.control import BUFFER, MAX_CLIENTS, ControlServer
 from undulog.capture.recorder.control_client import ControlClient
-from undulog.capture.recorder.control_lines import BUFFER
 
 shared = runpy.run_path(str(Path(__file__).with_name("control_clients.py")))
 PATIENCE_S = shared["PATIENCE_S"]

@@ -11,7 +11,7 @@ from undulog.capture.common.errors import FaultyFileError, ImportFormatError, Us
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.exchange.column_map import column_map_from_options, read_column_map
 from undulog.capture.exchange.csv_import import import_csv, is_frame_csv
-from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 
 ARCSNAKE = Path(__file__).parents[2].parent / "shared" / "data" / "arcsnake"
 GEAR = 22

@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.diagnostics import ERROR, OK, DiagnosticStatus
 from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.topics import ERROR, OK, DiagnosticStatus
 from undulog.capture.log.sinks.durable_sink import DurableSink
 from undulog.capture.recorder.tapped_sink import TappedSink
 

@@ -7,8 +7,14 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.frame_messages import FRAMES_TYPE, frame_message, records_at
-from undulog.capture.log.messages.frames import FRAME_DTYPE, FRAME_LAYOUT, frames_from_bytes
+from undulog.capture.log.messages.frames import (
+    FRAME_DTYPE,
+    FRAME_LAYOUT,
+    FRAMES_TYPE,
+    frame_message,
+    frames_from_bytes,
+    records_at,
+)
 from undulog.capture.log.messages.schemas import message_type
 
 RECORDS = st.integers(0, 300).flatmap(

@@ -16,8 +16,8 @@ from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.health.freeze import FreezeTally, RangeTally
 from undulog.capture.log.health.session_check import SessionHealth, check_session
 from undulog.capture.log.health.session_scan import SessionMeasures
-from undulog.capture.log.messages.diagnostics import OK, DiagnosticStatus
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
+from undulog.capture.log.messages.topics import OK, DiagnosticStatus
 from undulog.capture.log.sinks.mcap_sink import McapSink
 from undulog.capture.log.sinks.sink import Description, MessageSink
 from undulog.capture.recorder import live_health

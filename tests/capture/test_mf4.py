@@ -17,7 +17,7 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.can_logs import open_frame_log
-from undulog.capture.exchange.undated import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,

@@ -14,7 +14,7 @@ from mcap.writer import Writer as McapWriter
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.columns import arenas
-from undulog.capture.log.columns.read_ahead import Piece, ahead, helpers
+from undulog.capture.log.columns.arenas import Piece, ahead, helpers
 from undulog.capture.log.file.storage import LogFile
 from undulog.capture.log.sinks.durable_sink import DurableSink
 

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.sources.packets import HEAD
+from undulog.capture.sources.records import HEAD
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000

@@ -23,10 +23,9 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from undulog.capture import Session
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.log.sinks.mcap_sink import McapSink
-from undulog.capture.log.sinks.ring_mark import MARK_RECORD
-from undulog.capture.log.sinks.ring_sink import MAX_WAITING, MESSAGE_OVERHEAD, RingSink
+from undulog.capture.log.sinks.ring_sink import MARK_RECORD, MAX_WAITING, MESSAGE_OVERHEAD, RingSink
 from undulog.capture.log.write.writer import SessionWriter
-from undulog.capture.recorder.ring_storage import RingStorage
+from undulog.capture.recorder.storage import RingStorage
 
 EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

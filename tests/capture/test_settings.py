@@ -21,8 +21,7 @@ from undulog.capture.common.amounts import (
     parse_size,
 )
 from undulog.capture.common.errors import DataError, InputFileError, SettingsError
-from undulog.capture.recorder.setting_values import PARSERS
-from undulog.capture.recorder.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, resolve
+from undulog.capture.recorder.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, PARSERS, resolve
 
 MANUAL = Path(__file__).parents[2] / "docs" / "recording.md"
 NEEDED = {"sources": ("can:virtual:a",), "output": "run.mcap"}

@@ -3,9 +3,8 @@
 import numpy as np
 
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
-from undulog.capture.sources.backoff import Backoff
-from undulog.capture.sources.bus_watch import BUS_OFF, RESTARTED, BusWatch
-from undulog.capture.sources.events import EventLog, Tally
+from undulog.capture.sources.events import BUS_OFF, RESTARTED, BusWatch, EventLog, Tally
+from undulog.capture.sources.link import Backoff
 
 S = 1_000_000_000
 

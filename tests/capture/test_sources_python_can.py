@@ -15,16 +15,15 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
 )
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import parse_address
-from undulog.capture.sources.can_interfaces import (
+from undulog.capture.sources.address import open_source, parse_address
+from undulog.capture.sources.can_source import (
     DEVICE_TIME,
     LISTEN_ONLY,
     NO_CONTROLLER,
     known_options,
+    open_can,
 )
-from undulog.capture.sources.can_source import open_can
 from undulog.capture.sources.python_can import bus_class, failure, fd_frames_of, frames_of
-from undulog.capture.sources.registry import open_source
 
 
 def message_of(frame) -> can.Message:

@@ -23,9 +23,8 @@ from undulog.capture.log.messages.frames import (
     empty_frames,
 )
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
-from undulog.capture.sources.registry import open_source
 from undulog.capture.sources.slcan_text import STAMP_PERIOD_MS, SlcanText
 
 

@@ -25,7 +25,7 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
 )
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.receive_many import (
     SO_RXQ_OVFL,
@@ -34,7 +34,6 @@ from undulog.capture.sources.receive_many import (
     Batch,
     ReceiveMany,
 )
-from undulog.capture.sources.registry import open_source
 from undulog.capture.sources.socketcan import SocketcanLink, frames_of
 
 

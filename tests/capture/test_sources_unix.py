@@ -17,8 +17,7 @@ import pytest
 from undulog.capture.common.errors import DataError, SourceError, UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import parse_address
-from undulog.capture.sources.registry import open_source
+from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.sender import FrameSender
 from undulog.capture.sources.unix_socket import MOST_SENDERS
 

@@ -23,16 +23,16 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from undulog.capture.log.health.source_health import measure_sources, read_statuses
-from undulog.capture.log.messages.diagnostics import ERROR, OK, STALE, WARN
+from undulog.capture.log.messages.topics import ERROR, OK, STALE, WARN
 from undulog.capture.recorder.screen import clock_time, plain_line, screen, time_left
-from undulog.capture.recorder.snapshot import (
+from undulog.capture.recorder.source_clock import ClockEstimate
+from undulog.capture.recorder.statuses import (
     EventLine,
     RecorderSnapshot,
     SourceSnapshot,
     TopicSnapshot,
+    statuses,
 )
-from undulog.capture.recorder.source_clock import ClockEstimate
-from undulog.capture.recorder.statuses import statuses
 from undulog.capture.recorder.terminal import Terminal
 
 EPOCH_NS = 1_700_000_000_000_000_000

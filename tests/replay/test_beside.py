@@ -18,8 +18,7 @@ from undulog.capture.common.palette import joint_colors
 from undulog.replay.overlay.alignment import Align, align, times_of
 from undulog.replay.overlay.layout import all_views
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.stoppable import StoppableSession
-from undulog.replay.overlay.together import bring_together
+from undulog.replay.overlay.together import StoppableSession, bring_together
 from undulog.replay.overlay.write import Converted, write_beside
 from undulog.replay.samples.timeline import Rhythm
 

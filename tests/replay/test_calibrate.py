@@ -15,7 +15,7 @@ import undulog as front
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.interruption import StopRequest
 from undulog.replay.calibrate.determined import ridges
-from undulog.replay.calibrate.misfit import misfit
+from undulog.replay.calibrate.lack_of_fit import misfit
 from undulog.replay.calibrate.noise import memory, score_covariance
 from undulog.replay.calibrate.parameters import Unknown
 from undulog.replay.calibrate.solve import solve

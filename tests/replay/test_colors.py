@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from undulog.replay.draw.scene.colors import power_colors
+from undulog.replay.draw.scene.body import power_colors
 from undulog.replay.samples.quantities import power_limit
 
 

@@ -15,7 +15,7 @@ from undulog.replay.content.entities import ENERGY, GAIN, LAG, CycleTable
 from undulog.replay.draw.cycles.heat_maps import cell_colors, heat_maps
 from undulog.replay.draw.cycles.response import charts
 from undulog.replay.draw.cycles.steps import cycle_tables, together
-from undulog.replay.draw.scene.colors import power_colors
+from undulog.replay.draw.scene.body import power_colors
 from undulog.replay.record.rrd import write_recording
 
 STARTS = (0.0, 1.0, 2.0)

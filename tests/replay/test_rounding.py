@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from undulog.replay.samples.rounding import LEVELS, plot_step, rounded
+from undulog.replay.samples.sampling import LEVELS, plot_step, rounded
 
 
 @pytest.mark.parametrize("size", [1e-6, 0.3, 45.0, 1e5])

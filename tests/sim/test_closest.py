@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from undulog.sim.scenario.closest import to_circles, to_rectangles
+from undulog.sim.scenario.obstacles import to_circles, to_rectangles
 
 PLACES = np.linspace(-1.0, 1.0, 20001)
 

@@ -11,11 +11,9 @@ from undulog.capture.robot.model import Plane, Robot, Sensor, SensorKind
 from undulog.sim import PlaneGait, Readings, Serpentine
 from undulog.sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
 from undulog.sim.control.course import RandomCourse, StraightOn, TargetCourse
-from undulog.sim.control.distances import Distances
-from undulog.sim.control.lookout import Lookout
+from undulog.sim.control.lookout import Distances, Lookout
 from undulog.sim.control.moment import Moment
-from undulog.sim.control.odometry import SlipOdometry
-from undulog.sim.control.reckoning import Pose
+from undulog.sim.control.reckoning import Pose, SlipOdometry
 from undulog.sim.gait.build import generator
 from undulog.sim.gait.contract import WALK
 from undulog.sim.scenario.controllers import (

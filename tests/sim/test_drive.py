@@ -19,7 +19,7 @@ from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from undulog.sim.drive.command_session import CommandReplay, RecordedCommands
-from undulog.sim.drive.fading import FadingGait
+from undulog.sim.drive.in_process import FadingGait
 from undulog.sim.gait.contract import GaitTick
 from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 

@@ -27,9 +27,9 @@ from undulog.sim.control.build import build_gait
 from undulog.sim.drive.driven import find_driven
 from undulog.sim.drive.link import find_virtual_robot, sent_text
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.drive.open_link import open_link
 from undulog.sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
 from undulog.sim.drive.pace import WallPace
+from undulog.sim.drive.python_can_bus import open_link
 from undulog.sim.gate.outcome import How
 from undulog.sim.sensing.contract import JointSample
 from undulog.sim.serve.bus import VirtualBus

@@ -9,8 +9,7 @@ import pytest
 from undulog.capture.common.errors import PlanError
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, load_scenario
-from undulog.sim.drive.plan import Plan, PlanGait, Segment
-from undulog.sim.drive.plan_file import is_plan, parse_plan
+from undulog.sim.drive.plan import Plan, PlanGait, Segment, is_plan, parse_plan
 
 H, V = Plane.HORIZONTAL, Plane.VERTICAL
 SLOW = PlaneGait(0.2, 0.5, 0.6)

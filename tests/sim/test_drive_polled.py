@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.bus.polling import poll_frames
+from undulog.capture.bus.encoding import poll_frames
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.capture.robot.description import load_robot

@@ -9,9 +9,9 @@ from scipy.integrate import solve_ivp
 
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from undulog.sim.gait.approach import Approach
 from undulog.sim.gait.contract import Modulation
 from undulog.sim.gait.oscillators import (
+    Approach,
     OscillatorChain,
     OscillatorChains,
     OscillatorGait,

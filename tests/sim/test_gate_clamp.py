@@ -14,13 +14,11 @@ from undulog.capture import load_robot
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.safety import OnFault
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gate.clamp import Clamp
-from undulog.sim.gate.ending import Ending
+from undulog.sim.gate.clamp import Clamp, Spacing
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.ramp import Ramp
-from undulog.sim.gate.spacing import Spacing
-from undulog.sim.gate.status import JointStatus
-from undulog.sim.gate.yielding import Yielding
+from undulog.sim.gate.ramp import Ending, Ramp
+from undulog.sim.gate.tick import JointStatus
+from undulog.sim.gate.watch import Yielding
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

@@ -16,7 +16,7 @@ from undulog.capture import load_robot
 from undulog.sim.gate.clamp import Clamp
 from undulog.sim.gate.confirmation import Confirmation
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.silence import Silence
+from undulog.sim.gate.watch import Silence
 
 sys.path.insert(0, str(Path(__file__).parent))
 from far_end import beyond_rate, largest_burst

@@ -17,13 +17,11 @@ from undulog.capture import load_robot
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.robot.safety import OnFault
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gait.contract import GaitTick
-from undulog.sim.gait.readings import Readings
-from undulog.sim.gate.faults import FaultKind, GateFault
+from undulog.sim.gait.contract import GaitTick, Readings
 from undulog.sim.gate.gate import Gate
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.status import JointStatus
-from undulog.sim.gate.tick import Heard, Phase
+from undulog.sim.gate.outcome import FaultKind, GateFault
+from undulog.sim.gate.tick import Heard, JointStatus, Phase
 
 ROBOT = load_robot("snake25")
 COUNT, RATE_HZ = len(ROBOT.joints), 100

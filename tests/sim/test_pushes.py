@@ -8,7 +8,7 @@ import pytest
 from undulog.sim import World, parse_scenario
 from undulog.sim.physics.ledger import TERMS
 from undulog.sim.scenario.engines import EngineKind
-from undulog.sim.scenario.push import Push
+from undulog.sim.scenario.world import Push
 from undulog.sim.twin.twin import Twin
 
 FREE = World(gravity=(0.0, 0.0, 0.0), ground=None)

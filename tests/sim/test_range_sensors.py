@@ -10,7 +10,7 @@ from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.obstacles import Cylinder, Wall
 from undulog.sim.scenario.sensors import InfraredModel, SonarModel
-from undulog.sim.sensing.ir import Infrared, decoded, voltage
+from undulog.sim.sensing.ranging import Infrared, decoded, voltage
 from undulog.sim.sensing.rays import RayCaster
 from undulog.sim.sensing.sonar import Sonar, cone
 

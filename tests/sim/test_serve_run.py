@@ -25,7 +25,7 @@ from undulog.capture.sources.events import Tally
 from undulog.sim.drive.driven import find_driven
 from undulog.sim.drive.link import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gait.readings import Readings
+from undulog.sim.gait.contract import Readings
 
 ROOT = Path(__file__).parents[2]
 UNDULOG = [sys.executable, "-m", "undulog"]

@@ -24,11 +24,10 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.records import records
-from undulog.capture.sources.registry import open_source
 from undulog.capture.sources.socketcand_text import SocketcandText
 from undulog.sim.serve.bus import VirtualBus
 from undulog.sim.serve.socketcand_server import MOST_CLIENTS, MOST_SENT, SocketcandServer

@@ -20,7 +20,7 @@ from undulog.capture.sources.events import Tally
 from undulog.sim.drive.driven import find_driven
 from undulog.sim.drive.link import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gait.readings import Readings
+from undulog.sim.gait.contract import Readings
 
 UNDULOG = [sys.executable, "-m", "undulog"]
 PATIENCE_S = 300

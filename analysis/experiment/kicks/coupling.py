@@ -1,13 +1,23 @@
-"""From the runs of a kick experiment to its coupling: orchestration of :mod:`.local`."""
+"""From the runs of a kick experiment to its coupling: orchestration of :mod:`.local`.
+
+Are the kicks too small for the noise, or too large for a derivative?
+
+Small ones leave P open: an element off the diagonal must exceed its interval, all elements
+together, to be shown. Large ones leave its third order in a central difference. With y+ and y- what
+a kick up and a kick down changed, (y+ + y-)/2 is of second order and (y+ - y-)/2 of first; where
+their ratio is q, the third order is some q^2 of the first.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import stdtrit
 
-from undulog.capture.common.arrays import ComplexArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 
 from ...estimators.intervals import CONFIDENCE
@@ -16,6 +26,7 @@ from ...results.coupling import (
     BaseResponse,
     Coupling,
     HeldOut,
+    KickSize,
     LocalCoupling,
     Lti,
     Matrix,
@@ -24,14 +35,165 @@ from ...results.coupling import (
     rows_of,
 )
 from ...results.estimate import Estimate
-from .experiment import KickExperiment
 from .local import Answers, Measured, RowSums, answers_of, nonlinearity
 from .lti_reading import LtiReading, lti_reading
 from .matrices import LocalMatrices, local_matrices
-from .runs import Kind, missing_kicks
-from .scatter import RunErrors
-from .size import kick_size
-from .validity import Prediction, predict, valid_to
+from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
+from .scatter import RunErrors, sides
+
+RESOLVED = 0.1
+"""Coupling between joints that kicks should be able to show: what the robot's body brings back with
+more counts as strong (:data:`.analysis.oscillators.laplacian.STRONG`)."""
+
+CURVED = 0.3
+"""Second order over first order, from which the third may be a tenth of the first."""
+
+
+def kick_size(kicks: Sequence[Kick | None], answers: Answers, matrices: LocalMatrices) -> KickSize:
+    """Judge the size of the kicks.
+
+    Args:
+        kicks: Of r runs, None of one of the base gait.
+        answers: Of the same runs.
+        matrices: What came of them.
+
+    Returns:
+        The verdict.
+    """
+    sizes = {
+        kind: [abs(one.size) for one in kicks if one is not None and one.kind is kind]
+        for kind in Kind
+    }
+    phase = float(np.mean(sizes[Kind.PHASE]))
+    amplitude = float(np.mean(sizes[Kind.AMPLITUDE])) if sizes[Kind.AMPLITUDE] else None
+    m = len(matrices.P.value)
+    resolved = float(np.median(matrices.P.half_together[~np.eye(m, dtype=bool)]))
+    curvature = _curvature(kicks, answers, matrices)
+    verdict, why = "fits", None
+    largest = max(phase, amplitude or 0.0)
+    if largest > MOST_KICK:
+        verdict = "too large"
+        why = (
+            f"kicks of {largest:.2g} are too large for a derivative (at most {MOST_KICK:g} rad or "
+            "log amplitude): record kicks of 0.05"
+        )
+    elif curvature > CURVED:
+        verdict = "too large"
+        why = (
+            f"kicks of {phase:.2g} rad are too large: what they do is "
+            f"{100 * curvature:.0f} % of second order; record kicks of "
+            f"{_rounded_down(phase * CURVED / (2 * curvature)):.2g} rad"
+        )
+    elif resolved > RESOLVED:
+        verdict = "too small"
+        why = (
+            f"kicks of {phase:.2g} rad are too small for the noise and the scatter between runs: "
+            f"they show couplings of {resolved:.2g} and more; to show {RESOLVED:g}, record "
+            f"{_larger(phase, resolved / RESOLVED)}"
+        )
+    return KickSize(phase, amplitude, resolved, curvature, verdict, why)
+
+
+def _larger(size: float, factor: float) -> str:
+    """What to record so that intervals are narrower by a factor."""
+    if size * factor <= MOST_KICK:
+        return f"kicks of {math.ceil(100 * size * factor) / 100:.2g} rad"
+    largest = max(size, 0.1)
+    repeats = math.ceil((factor * size / largest) ** 2)
+    return f"kicks of {largest:.2g} rad, each {repeats} times"
+
+
+def _rounded_down(size: float) -> float:
+    digits = 1 - math.floor(math.log10(size))
+    return math.floor(size * 10**digits) / 10**digits
+
+
+def _curvature(kicks: Sequence[Kick | None], answers: Answers, matrices: LocalMatrices) -> float:
+    """Second order over first order of the kicks of phase, Frobenius norms over all joints."""
+    errors = matrices.steady_errors
+    variance = float(np.maximum(errors.variance, errors.within).sum())
+    base = [k for k, one in enumerate(kicks) if one is None]
+    middle = answers.log[base].mean(axis=0)
+    even = odd = noise = 0.0
+    for up, down in sides(kicks, Kind.PHASE):
+        high, low = answers.log[up].mean(axis=0), answers.log[down].mean(axis=0)
+        even += float(np.sum(np.abs((high + low) / 2 - middle) ** 2))
+        odd += float(np.sum(np.abs(high - low) ** 2)) / 4
+        noise += variance * (0.25 / len(up) + 0.25 / len(down) + 1 / len(base))
+    return (max(0.0, even - noise) / odd) ** 0.5 if odd > 0 else 0.0
+
+
+BETTER = 2.0
+"""P holds where it predicts so many times better than 'each joint keeps its H_i'."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One held-out run.
+
+    Attributes:
+        size: Largest deviation of a command from the base, in phase [rad] or log amplitude.
+        error: ||a - predicted|| / ||a|| of the matrices.
+        error_kept: The same of 'each joint keeps its H_i'.
+        noise: What the run's own noise alone makes of either.
+    """
+
+    size: float
+    error: float
+    error_kept: float
+    noise: float
+
+
+def predict(
+    deviation: ComplexArray,
+    answered: ComplexArray,
+    variance: FloatArray,
+    response: ComplexArray,
+    matrices: tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None],
+) -> Prediction:
+    """Predict a run from its commands, and compare.
+
+    Args:
+        deviation: Of its commands, d ln|c| + j d psi_c, shape (m,).
+        answered: d ln|a| + j d psi as measured, shape (m,).
+        variance: Of ln|a| plus that of psi, shape (m,).
+        response: Complex amplitudes of the base's responses, shape (m,).
+        matrices: P, R, G, S; without G and S changes of amplitude are taken as G = P, S = -R.
+
+    Returns:
+        The prediction's error.
+    """
+    P, R, gain, cross = matrices
+    G, S = P if gain is None else gain, -R if cross is None else cross
+    phase = P @ deviation.imag + S @ deviation.real
+    log_amplitude = R @ deviation.imag + G @ deviation.real
+    measured = response * np.exp(answered)
+    whole = float(np.linalg.norm(measured))
+    return Prediction(
+        size=float(max(np.abs(deviation.real).max(), np.abs(deviation.imag).max())),
+        error=float(np.linalg.norm(response * np.exp(log_amplitude + 1j * phase) - measured))
+        / whole,
+        error_kept=float(np.linalg.norm(response * np.exp(deviation) - measured)) / whole,
+        noise=float(np.sum(np.abs(measured) ** 2 * variance)) ** 0.5 / whole,
+    )
+
+
+def valid_to(predictions: Sequence[Prediction]) -> float | None:
+    """Largest deviation up to which every held-out run is predicted at least ``BETTER`` better.
+
+    Args:
+        predictions: In any order.
+
+    Returns:
+        The size of the last good run before the first bad one; None where the smallest is bad, or
+        there is none.
+    """
+    reached: float | None = None
+    for one in sorted(predictions, key=lambda p: p.size):
+        if one.error * BETTER > one.error_kept:
+            break
+        reached = one.size
+    return reached
 
 
 def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:

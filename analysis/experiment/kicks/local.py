@@ -26,8 +26,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
-from ...estimators.intervals import CONFIDENCE, welch_satterthwaite
-from ...estimators.norm_ratio import noise_draws, norm_ratio
+from ...estimators.intervals import CONFIDENCE, noise_draws, norm_ratio, welch_satterthwaite
 from ...results.estimate import Estimate
 from .runs import Kick, Kind
 from .scatter import RunErrors
@@ -200,7 +199,7 @@ def nonlinearity(
 
     Returns:
         ||(G - P, S + R)|| / ||(P, R)|| (Frobenius), with what noise adds taken off; interval by
-        :func:`.analysis.estimators.norm_ratio.norm_ratio`.
+        :func:`.analysis.estimators.intervals.norm_ratio`.
     """
     m = len(P.value)
     noise = noise_draws(stacked(((P, S), (R, G)), correlation), seed)

@@ -14,7 +14,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ...estimators.norm_ratio import noise_draws, norm_ratio
+from ...estimators.intervals import noise_draws, norm_ratio
 from ...results.estimate import Estimate
 from .local import Measured, stacked
 

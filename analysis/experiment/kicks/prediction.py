@@ -16,11 +16,10 @@ from scipy.linalg import expm
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 
-from ...estimators.intervals import CONFIDENCE
-from ...estimators.norm_ratio import noise_draws
+from ...estimators.intervals import CONFIDENCE, noise_draws
 from ...oscillators.body import measured
-from ...oscillators.embodied import felt_response, relaxation
 from ...oscillators.laplacian import intervals_of, spectrum
+from ...oscillators.predictions import felt_response, relaxation
 from ...results import formats
 from ...results.coupling import BaseResponse, LocalCoupling, rows_of
 from ...results.estimate import Estimate

@@ -33,8 +33,7 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.robot.model import Servo
 
-from ...estimators.intervals import CONFIDENCE, welch_satterthwaite
-from ...estimators.norm_ratio import DRAWS
+from ...estimators.intervals import CONFIDENCE, DRAWS, welch_satterthwaite
 
 
 @dataclass(frozen=True)

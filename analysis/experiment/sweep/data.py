@@ -23,8 +23,7 @@ from ...signals.stretch import Options
 from .chain import Phasors
 from .distortion import Beside
 from .runs import CommandTones, Signals, Sweep, read_signals
-from .tone_finder import common_step
-from .tones import ToneFit, fit_tones
+from .tones import ToneFit, common_step, fit_tones
 
 _PERIODS = 1.5
 """Periods of a multisine in a record from which lines beside its tones are told apart."""

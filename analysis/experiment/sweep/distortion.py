@@ -14,7 +14,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
-from ...estimators.norm_ratio import norm_ratio
+from ...estimators.intervals import norm_ratio
 from ...results.estimate import Estimate
 from ..kicks.lti_reading import squared
 from .chain import Phasors

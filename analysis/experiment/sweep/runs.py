@@ -21,8 +21,7 @@ from ...session.analyse import Examined
 from ...session.runs import SAME_FREQUENCY
 from ...signals.reading import read_columns
 from ...signals.stretch import Options, choose_stretch
-from .tone_finder import find_tones
-from .tones import fit_tones
+from .tones import find_tones, fit_tones
 
 MOST_CONDITION = 10.0
 """Commands with a larger condition number make no sweep; a DFT matrix has 1."""

@@ -3,6 +3,11 @@
 The model of a channel is y(t) = b + Re sum_l a_l exp(j omega_l t) with the omega_l given, fitted on
 the channel's own sampling times. The noise of each line is read from the residual's periodogram in
 the nearest bins beside it that the fit has left alone, as in :mod:`.analysis.estimators.spectrum`.
+
+Which tones a command is made of: peel the highest line off, refine all, and again.
+
+For commands, which are exact up to the steps of their encoding: what a few lines don't explain is
+no multisine.
 """
 
 from __future__ import annotations
@@ -18,6 +23,141 @@ from undulog.capture.common.errors import DataError
 from ...estimators.harmonic_moments import RELATIVE_FLOOR
 from ...estimators.series import Series, shared_times
 from ...estimators.spectrum import BINS_PER_SIDE, KEPT_POWER
+from ...response.gait import NYQUIST_SHARE
+
+MOST_TONES = 12
+EXPLAINED = 0.98
+"""Share of the variance that the tones must explain."""
+
+FAINT = 0.005
+"""A line below this share of the strongest is no tone."""
+
+MULTIPLE = 1e-3
+"""How near to a whole number a ratio of frequencies must be to count as one."""
+
+_SCOUTS = 4
+_MOST_SAMPLES = 8192
+_MOST_GAPS = 8  # of an even grid over the samples, as a multiple of these: no clock that jumped
+_STEPS = 4
+
+
+def find_tones(commands: Sequence[Series]) -> FloatArray | None:
+    """The frequencies of a multisine.
+
+    Args:
+        commands: By joint; those that never move are ignored.
+
+    Returns:
+        Angular frequencies, rising [rad/s], at least two of them; None where the commands are no
+        sum of a few tones, or all tones are harmonics of the lowest: that is a gait.
+    """
+    moving = [one for one in commands if one.count > 64 and np.ptp(one.values) > 0]
+    moving.sort(key=lambda one: float(np.var(one.values)), reverse=True)
+    scouts = [_cut(one) for one in moving[:_SCOUTS]]
+    if not scouts:
+        return None
+    total = sum(float(np.sum(one.values**2)) for one in scouts)
+    omega: FloatArray = np.zeros(0)
+    residual: list[FloatArray] = [one.values for one in scouts]
+    for _ in range(MOST_TONES):
+        peak = _peak(scouts, residual)
+        if peak is None or np.any(np.abs(omega - peak) < 2 * np.pi / _span(scouts)):
+            break
+        grown: FloatArray = np.concatenate([omega, [peak]])
+        for _ in range(_STEPS):
+            grown = grown + _refine(scouts, grown).step
+        found = _refine(scouts, grown)
+        if found.amplitude[:, -1].max() < FAINT * found.amplitude.max():
+            break
+        omega, residual = grown, found.residual
+    omega = np.sort(omega)
+    explained = 1 - sum(float(np.sum(one**2)) for one in residual) / total
+    if omega.size < 2 or explained < EXPLAINED:
+        return None
+    multiples: FloatArray = omega / omega[0]
+    return None if np.all(np.abs(multiples - np.round(multiples)) < MULTIPLE) else omega
+
+
+def common_step(omega: FloatArray, most: int = 24) -> float | None:
+    """The largest frequency of which all tones are multiples.
+
+    Args:
+        omega: Rising [rad/s].
+        most: Largest multiple that the lowest tone may be.
+
+    Returns:
+        It [rad/s], or None where there is none.
+    """
+    for multiple in range(1, most + 1):
+        place: FloatArray = omega * multiple / omega[0]
+        if np.all(np.abs(place - np.round(place)) < MULTIPLE * multiple):
+            return float(np.mean(omega / np.round(place)))
+    return None
+
+
+def _cut(one: Series) -> Series:
+    values = one.values[:_MOST_SAMPLES]
+    return Series(one.name, one.t_s[:_MOST_SAMPLES], values - values.mean())
+
+
+def _span(scouts: Sequence[Series]) -> float:
+    return max(float(one.t_s[-1] - one.t_s[0]) for one in scouts)
+
+
+def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | None:
+    """The highest line of what is left [rad/s]; on an even grid, as a starting point."""
+    period = max(one.period_s for one in scouts)
+    start = max(float(one.t_s[0]) for one in scouts)
+    stop = min(float(one.t_s[-1]) for one in scouts)
+    count = int((stop - start) / period) + 1 if stop > start else 0
+    if not 64 <= count <= _MOST_GAPS * _MOST_SAMPLES:
+        return None
+    grid = start + period * np.arange(count)
+    length = 1 << int(np.ceil(np.log2(4 * count)))
+    power = np.zeros(length // 2 + 1)
+    for one, left in zip(scouts, residual, strict=True):
+        even = np.interp(grid, one.t_s, left) * np.hanning(count)
+        power += np.abs(np.fft.rfft(even, length)) ** 2
+    frequency = np.fft.rfftfreq(length, period)
+    inside = (frequency > 1.5 / (stop - start)) & (frequency < NYQUIST_SHARE / period)
+    if not inside.any():
+        return None
+    return float(2 * np.pi * frequency[inside][np.argmax(power[inside])])
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A Gauss-Newton step of all frequencies, with the amplitudes and residual before it."""
+
+    step: FloatArray
+    amplitude: FloatArray
+    residual: list[FloatArray]
+
+
+def _refine(scouts: Sequence[Series], omega: FloatArray) -> _Refined:
+    """Variable projection: what of the slopes dy/domega the other parameters can't make."""
+    tones = omega.size
+    normal, right = np.zeros((tones, tones)), np.zeros(tones)
+    sizes: list[FloatArray] = []
+    left: list[FloatArray] = []
+    for one in scouts:
+        phase: FloatArray = omega[:, None] * one.t_s[None, :]
+        cos, sin = np.cos(phase), np.sin(phase)
+        rows: FloatArray = np.concatenate([np.ones((1, one.count)), cos, -sin])
+        inverse: FloatArray = np.linalg.inv(rows @ rows.T).astype(np.float64)
+        theta: FloatArray = inverse @ (rows @ one.values)
+        re, im = theta[1 : 1 + tones, None], theta[1 + tones :, None]
+        rest: FloatArray = one.values - theta @ rows
+        slope: FloatArray = -one.t_s * (re * sin + im * cos)
+        slope = slope - (slope @ rows.T) @ inverse @ rows
+        normal += slope @ slope.T
+        right += slope @ rest
+        sizes.append(np.hypot(re, im)[:, 0])
+        left.append(rest)
+    limit = np.pi / (2 * _span(scouts))
+    step: FloatArray = np.linalg.lstsq(normal, right, rcond=None)[0].astype(np.float64)
+    return _Refined(np.clip(step, -limit, limit), np.stack(sizes), left)
+
 
 _REACH = 16
 """Bins to either side that are looked at."""

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_ty
 
 from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError
-from undulog.capture.common.input_file import read_input
-from undulog.capture.common.part_file import check_output, part_file, write_text
+from undulog.capture.common.files import check_output, part_file, read_input, write_text
 
 from ...results import energy as result_energy
 from ...results import oscillators

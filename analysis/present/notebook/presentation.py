@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ...results.shown import Shown
-    from .picture import Picture
+    from .pictures import Picture
 
 
 class Presenter:

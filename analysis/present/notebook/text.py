@@ -9,9 +9,7 @@ from typing import Any
 
 from undulog.capture.common.console import plain
 
-from ...experiment.answer import pair_order
-from ...experiment.kick_answer import kick_answer, kick_detail
-from ...experiment.sweep_answer import sweep_answer, sweep_detail
+from ...experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
 from ...results import formats
 from ...results.analysis import Analysis
 from ...results.comparison import Comparison

@@ -12,7 +12,7 @@ from undulog.capture.common.console import plain
 from ...results import formats
 from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
-from .markup import element
+from .typeset import element
 
 MOST_SPANS = 4
 """Stretches that a row lists; more are counted."""

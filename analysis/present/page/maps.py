@@ -17,8 +17,8 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from ...results.formats import decimals_for_values, number, short
 from ...session.cycles import CycleMaps
-from .drawn import Drawing
-from .markup import element
+from .svg import Drawing
+from .typeset import element
 
 MOST_COLUMNS = 150
 """Columns of a map; more cycles than these are averaged, and the page says so."""

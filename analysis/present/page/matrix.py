@@ -13,9 +13,9 @@ from typing import NamedTuple
 from markupsafe import Markup
 
 from ...results.formats import decimals_for_values, number, short
-from .drawn import Drawing
 from .entries import Entries
-from .markup import element, joined
+from .svg import Drawing
+from .typeset import element, joined
 
 PICTURE = 560.0
 """Side of a picture, one unit is a pixel of a wide page."""

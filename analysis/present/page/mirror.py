@@ -14,8 +14,20 @@ from undulog.capture.common.palette import joint_hex
 from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
-from .drawn import WIDTH_IN, Drawing, joint_ticks, key, legend
-from .svg import INK, MUTED, REFERENCE, Axes, drawing, inline_svg, new_figure
+from .svg import (
+    INK,
+    MUTED,
+    REFERENCE,
+    WIDTH_IN,
+    Axes,
+    Drawing,
+    drawing,
+    inline_svg,
+    joint_ticks,
+    key,
+    legend,
+    new_figure,
+)
 
 _ASIDE = 0.16
 """Dots of single runs stand this far beside a joint's place."""

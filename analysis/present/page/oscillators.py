@@ -13,10 +13,9 @@ from ...results import formats
 from ...results.estimate import Estimate
 from ...results.oscillators import BodyOscillators, ChainCoupling
 from ..text.oscillators import chain_detail
-from .drawn import WIDTH_IN, Drawing, key, legend
 from .entries import Entries
 from .matrix import matrix_picture
-from .svg import INK, REFERENCE, drawing, inline_svg, new_figure
+from .svg import INK, REFERENCE, WIDTH_IN, Drawing, drawing, inline_svg, key, legend, new_figure
 from .tables import Fact
 
 _DASHED = (0, (5, 3))

@@ -12,9 +12,24 @@ from undulog.capture.common.palette import joint_hex
 from ...results.analysis import JointResult
 from ...results.estimate import Estimate
 from ...results.formats import degrees, estimate, number
-from .drawn import WIDTH_IN, Drawing, key, legend, marker
 from .driven import is_driven
-from .svg import INK, MUTED, PAPER, REFERENCE, Axes, Figure, Handle, drawing, inline_svg, new_figure
+from .svg import (
+    INK,
+    MUTED,
+    PAPER,
+    REFERENCE,
+    WIDTH_IN,
+    Axes,
+    Drawing,
+    Figure,
+    Handle,
+    drawing,
+    inline_svg,
+    key,
+    legend,
+    marker,
+    new_figure,
+)
 
 _MARKER_SIZE = 5.2
 _PLANE_WORDS = {"horizontal": "horizontal", "vertical": "vertical", None: "plane unknown"}

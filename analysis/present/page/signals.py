@@ -14,9 +14,8 @@ from undulog.capture.common.palette import joint_hex
 
 from ...results.analysis import Analysis, JointResult
 from ...results.formats import degrees, estimate, short
-from .drawn import WIDTH_IN, Drawing, key, legend
 from .driven import is_driven
-from .svg import REFERENCE, Axes, drawing, inline_svg, new_figure
+from .svg import REFERENCE, WIDTH_IN, Axes, Drawing, drawing, inline_svg, key, legend, new_figure
 
 CYCLES = 2.5
 """Gait cycles shown."""

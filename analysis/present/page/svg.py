@@ -3,6 +3,12 @@
 Colours that must follow the reader's light or dark scheme are drawn in sentinel colours and
 become CSS variables here. Text stays text, in the page's own font. Nothing in the result depends
 on the time, the machine or other figures on the page: identifiers carry the figure's own prefix.
+
+What all figures of the report share: width, markers, keys.
+
+Every figure is a pure function of results. A joint keeps its colour, horizontal joints are
+circles and vertical ones squares, references and nulls are dashed grey, estimates carry their
+95 % interval, the segment axis runs head to tail from left to right.
 """
 
 from __future__ import annotations
@@ -10,16 +16,20 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 from xml.etree import ElementTree as ET
 
 import matplotlib as mpl
+from matplotlib import lines
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as _Figure
 
 from undulog.capture.common.console import plain
+
+from ...results.formats import short
 
 Figure: TypeAlias = Any
 Axes: TypeAlias = Any
@@ -248,3 +258,70 @@ def _name_it(root: ET.Element, prefix: str, title: str, description: str) -> Non
     root.set("aria-labelledby", f"{prefix}-title")
     root.set("aria-describedby", f"{prefix}-desc")
     root.set("class", "figure")
+
+
+WIDTH_IN = 8.0
+"""Width of every figure [inch]; the page scales it."""
+
+MARKERS: dict[str | None, str] = {"horizontal": "o", "vertical": "s", None: "^"}
+"""Marker by plane; a triangle where no robot description says."""
+
+key: Any = lines.Line2D
+"""A line or marker of a legend, drawn nowhere else."""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure ready for the page.
+
+    Attributes:
+        svg: The ``<svg>`` element.
+        caption: One or two sentences, plain text.
+    """
+
+    svg: str
+    caption: str
+
+
+def marker(plane: str | None) -> str:
+    """Matplotlib marker of a joint of this plane.
+
+    Args:
+        plane: ``horizontal``, ``vertical`` or None.
+
+    Returns:
+        Circle, square, or triangle for anything else.
+    """
+    return MARKERS.get(plane, "^")
+
+
+def legend(figure: Figure, handles: Sequence[Handle]) -> None:
+    """One line of keys above all panels, from the left edge.
+
+    Args:
+        figure: Laid out by the constrained engine.
+        handles: What is explained.
+    """
+    figure.legend(
+        handles=handles,
+        loc="outside upper left",
+        ncols=len(handles),
+        borderaxespad=0.2,
+        columnspacing=1.6,
+        handletextpad=0.5,
+        handlelength=1.8,
+    )
+
+
+def joint_ticks(axes: Axes, names: Sequence[str]) -> None:
+    """Joint names along the axis where they fit, else every second, third ... of them.
+
+    Args:
+        axes: Joints stand at 1, 2, ... from head to tail.
+        names: Of all joints.
+    """
+    shown = [short(name, 14) for name in names]
+    room = 95  # characters of 8 points that stand beside one another over the width
+    step = max(1, -(-sum(len(name) + 2 for name in shown) // room))
+    axes.set_xlim(0.4, len(names) + 0.6)
+    axes.set_xticks(range(1, len(names) + 1, step), shown[::step])

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 from undulog.capture.common.console import UNLIMITED, plain
 
-from ...experiment.kick_answer import kick_detail
+from ...experiment.answer import kick_detail, sweep_detail, sweep_method
 from ...experiment.reversal.modules import SIGNIFICANT
-from ...experiment.sweep_answer import sweep_detail, sweep_method
 from ...results import formats
 from ...results.coupling import LocalCoupling
 from ...results.estimate import Estimate

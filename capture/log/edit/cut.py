@@ -20,7 +20,7 @@ from mcap.records import Channel
 from ...common.console import progress
 from ...common.errors import DataError, MissingChannelError, UsageError
 from ...common.interruption import StopRequest
-from ..messages.latched import adds_up, is_latched
+from ..messages.topics import adds_up, is_latched
 from .edit import (
     EDIT_RECORD,
     HEALTH_RECORD,

@@ -18,8 +18,8 @@ from mcap.writer import Writer
 
 from ...common.console import refuse_existing
 from ...common.errors import DataError, UndulogError, UsageError
+from ...common.files import part_file
 from ...common.interruption import StopRequest
-from ...common.part_file import part_file
 from .raw_log import RawLog, RawMessage
 
 EDIT_RECORD = "undulog.edit"

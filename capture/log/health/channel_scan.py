@@ -17,7 +17,6 @@ from ..columns.groups import MOST_JOINT_LISTS, fits_layout
 from ..mcap.chunk import LAST_NS, Buffer
 from ..mcap.message_heads import BODY_AT, FIXED_SIZE, gather
 from ..messages.cdr import Layout, layout_of
-from ..messages.frame_messages import records_at
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -25,6 +24,7 @@ from ..messages.frames import (
     FRAME_DTYPE,
     FRAME_LAYOUT,
     FRAME_TOPIC_PREFIXES,
+    records_at,
 )
 from ..messages.rosmsg import MessageType
 from .bus_tally import BusTally

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from ...common.errors import DataError
 from ..edit.joined import Finding
 from ..messages.cdr import layout_of
-from ..messages.diagnostics import NO_VALUES, DiagnosticStatus
 from ..messages.rosmsg import MessageType
+from ..messages.topics import NO_VALUES, DiagnosticStatus
 from .health import BAD_LOSS, GOOD_LOSS
 
 SOURCE_PREFIX = "source "

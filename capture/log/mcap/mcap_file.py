@@ -30,7 +30,7 @@ _NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
 class McapFile(McapPayloads):
     """An MCAP file as blocks, channels, schemas, metadata and attachments.
 
-    Its attributes are those of :class:`.capture.log.mcap.mcap_contents.McapContents`.
+    Its attributes are those of :class:`.capture.log.mcap.mcap_opening.McapContents`.
     """
 
     def __init__(self, path: Path, *, bare: bool = False) -> None:

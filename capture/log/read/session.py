@@ -35,8 +35,8 @@ from ..messages.frames import (
     join_batches,
 )
 from .joint_reader import JointReader
+from .own_times import StampClock
 from .signals import JointSignals
-from .stamp_clock import StampClock
 
 _NS = 1_000_000_000
 

@@ -14,14 +14,13 @@ from pathlib import Path
 from mcap.records import Header, Metadata
 
 from ...common.errors import DataError, LogWriteError, OutputExistsError, UndulogError
-from ..file.part_names import PART_RECORD, later_parts, part_path
+from ..file.part_files import PART_RECORD, later_parts, part_path
 from ..mcap.mcap_writer import McapWriter
 from ..wal.ballast import Ballast
 from ..wal.wal import WriteAheadLog, wal_folder
 from .chunk_groups import chunk_group
-from .disk_thread import DiskThread
+from .disk_thread import DiskThread, FileDeletedError, PartStream
 from .mcap_sink import PROFILE, library_name, write_description, write_error
-from .part_stream import FileDeletedError, PartStream
 from .sink import Description
 
 CHUNK_SIZE = 1 << 19

@@ -17,8 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from ...common.arrays import FloatArray
 from ...common.errors import DataError
 from ..messages.cdr import Leaf, encode
-from ..messages.frame_messages import frame_message
-from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
+from ..messages.frames import (
+    FD_FRAME_DTYPE,
+    FD_FRAME_LAYOUT,
+    FRAME_DTYPE,
+    FRAME_LAYOUT,
+    FrameArray,
+    frame_message,
+)
 from ..messages.schemas import message_type
 
 Send = Callable[[int, int, bytes], None]

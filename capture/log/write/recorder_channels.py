@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from ...common.errors import DataError
 from ..messages.cdr import encode
-from ..messages.diagnostics import DiagnosticStatus
 from ..messages.schemas import message_type
+from ..messages.topics import DiagnosticStatus
 from .channels import Send, Template
 
 _TIME = struct.Struct("<iI")

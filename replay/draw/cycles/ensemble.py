@@ -3,7 +3,7 @@
 Samples are never folded. Each keeps its own time, and with it the phase that the controller logged
 (or that of the fitted rhythm, where none was logged). Over that phase a channel is fitted by
 harmonics and cut into whole cycles, which are averaged phase by phase
-(:func:`.analysis.compare.waveform.cycles_by_phase`); their scatter is the interval of the mean.
+(:func:`.analysis.compare.side.cycles_by_phase`); their scatter is the interval of the mean.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from undulog.analysis.compare.differences import from_runs
-from undulog.analysis.compare.waveform import PHASES, cycles_by_phase, phases_rad
+from undulog.analysis.compare.side import PHASES, cycles_by_phase, phases_rad
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series, clean

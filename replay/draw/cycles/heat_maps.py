@@ -22,7 +22,7 @@ from undulog.capture.common.palette import joint_colors
 
 from ...content.entities import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
 from ...samples.timeline import Clock
-from ..scene.colors import power_colors
+from ..scene.body import power_colors
 from .steps import cycle_times_ns, mean_power, together
 
 POWER = Quantity("power_milliwatt", "Power", "mW")

@@ -25,8 +25,7 @@ from ...content.entities import GREY, Color, MeanCycle, Places, Series
 from ...samples.quantities import mechanical_power, segment_power
 from ...samples.timeline import ENSEMBLE_CYCLE, Clock
 from ...samples.tracks import Track, read_columns
-from ..scene.body import capsule_columns, capsule_poses
-from ..scene.colors import power_colors
+from ..scene.body import capsule_columns, capsule_poses, power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
 
 ENSEMBLE = "/ensemble"

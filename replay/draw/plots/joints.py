@@ -18,9 +18,8 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane, Robot
 
-from ...content.entities import GREY, SCALARS, Color, Places, Series
-from ...samples.rounding import rounded
-from ...samples.sampling import mark_gaps
+from ...content.entities import GREY, SCALARS, TOTAL, Color, Places, Series
+from ...samples.sampling import mark_gaps, rounded
 from ...samples.timeline import Clock
 from ...samples.tracks import Table, Track, tables
 
@@ -253,3 +252,32 @@ def log_rows(
         column = rr.ComponentColumn(_DESCRIPTORS[component], batch)
         size = np.full(rows.stop - rows.start, values.shape[1])
         rec.send_columns(entity, times, [column.partition(size)])
+
+
+# Vermilion as on the body; violet is on no other map and reads on black and on white.
+_COLORS = {"mechanical": (255, 84, 48, 255), "electrical": (150, 124, 230, 255)}
+
+
+def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
+    """Say how the line of one kind of the body's power is drawn.
+
+    Args:
+        rec: The recording.
+        kind: ``mechanical`` or ``electrical``.
+    """
+    look = rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5)
+    rec.log(f"{TOTAL}/{kind}", look, static=True)
+
+
+def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> None:
+    """Write one kind of the body's power.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        kind: ``mechanical`` or ``electrical``.
+        whole: The body's power [W].
+    """
+    log_total_look(rec, kind)
+    t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
+    log_rows(rec, clock, f"{TOTAL}/{kind}", t_ns, values)

@@ -11,8 +11,7 @@ from undulog.capture.common.arrays import FloatArray
 
 from ...content.entities import COMMANDED, ERROR, MEASURED, SCALARS, TOTAL, Color, Places, Series
 from ...samples.quantities import SIGNALS, quantities
-from ...samples.rounding import plot_step
-from ...samples.sampling import mark_gaps
+from ...samples.sampling import mark_gaps, plot_step
 from ...samples.stretches import Span, Stretch
 from ...samples.survey import Survey
 from ...samples.timeline import Clock
@@ -24,10 +23,10 @@ from .joints import (
     joint_palette,
     log_look,
     log_rows,
+    log_total_look,
     part_entity,
     places_titles,
 )
-from .power import log_total_look
 
 _ANGLES = (COMMANDED, MEASURED, ERROR)
 

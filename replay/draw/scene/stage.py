@@ -14,10 +14,10 @@ from ...content.entities import Color, Places
 from ...samples.quantities import mechanical_power
 from ...samples.stretches import Span, Stretch
 from ...samples.timeline import Clock
-from . import body, markers, marks, ranges
+from . import body, markers, ranges
+from . import markers as marks
 from .motion import HeadPath, assemble, frames_of
-from .surroundings import log_surroundings, world_of
-from .trail import log_trail
+from .surroundings import log_surroundings, log_trail, world_of
 
 
 class Scene:

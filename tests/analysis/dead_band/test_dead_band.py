@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.analysis.dead_band.operator import fundamental_change, rested
+from undulog.analysis.dead_band.find import fundamental_change, rested
 
 shared = runpy.run_path(str(Path(__file__).with_name("resting.py")))
 Joint, found_in, play, STEP = (shared[name] for name in ("Joint", "found_in", "play", "STEP"))

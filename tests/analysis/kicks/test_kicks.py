@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from undulog.analysis.experiment.kicks.coupling import predict, valid_to
 from undulog.analysis.experiment.kicks.local import (
     Answers,
     Measured,
@@ -20,7 +21,6 @@ from undulog.analysis.experiment.kicks.runs import (
     missing_kicks,
     sort_kicks,
 )
-from undulog.analysis.experiment.kicks.validity import predict, valid_to
 from undulog.capture.common.errors import UsageError
 
 NAMES = ("head", "neck", "waist", "hip", "tail")

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from undulog.analysis.experiment.kick_answer import kick_answer
+from undulog.analysis.experiment.answer import kick_answer
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.experiment import KickExperiment
 from undulog.analysis.experiment.kicks.local import Answers
 from undulog.analysis.experiment.kicks.matrices import local_matrices
-from undulog.analysis.experiment.kicks.runs import Kick, Kind, sort_kicks
+from undulog.analysis.experiment.kicks.runs import Kick, KickExperiment, Kind, sort_kicks
 from undulog.analysis.experiment.kicks.scatter import run_errors
 
 tables = runpy.run_path(str(Path(__file__).parents[3] / "docs" / "kick_tables.py"))

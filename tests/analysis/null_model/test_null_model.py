@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from undulog.analysis.experiment.null_model.deviation import null_test
+from undulog.analysis.experiment.null_model.check import null_test
 from undulog.analysis.response.response import Response
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.null_model import NullModel, SharedParameter

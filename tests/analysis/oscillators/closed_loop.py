@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
 from undulog.analysis.oscillators.phase_log import read_phases
+from undulog.analysis.oscillators.predictions import felt_response, relax, relaxation, steady_bias
 from undulog.analysis.results.experiment import Experiment
 from undulog.capture import Session
 from undulog.sim import GaitTick, load_scenario

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from undulog.analysis.oscillators.chain import MOST_CONDITION, chain_coupling
-from undulog.analysis.oscillators.pieces import kicked_steps
+from undulog.analysis.oscillators.chain import MOST_CONDITION, chain_coupling, kicked_steps
 
 PERIOD_S = 0.01
 PARTS = ("K", "psi", "omega")

@@ -7,11 +7,23 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from undulog.analysis.oscillators.comparator import explicit_coupling, homogeneous, path_laplacian
-from undulog.analysis.oscillators.embodied import felt_response, relax, relaxation, steady_bias
-from undulog.analysis.oscillators.entrainment import entrainment
-from undulog.analysis.oscillators.laplacian import growth, intervals, spectrum
-from undulog.analysis.oscillators.pseudospectrum import pseudospectrum, smallest_singular
+from undulog.analysis.oscillators.laplacian import (
+    growth,
+    intervals,
+    pseudospectrum,
+    smallest_singular,
+    spectrum,
+)
+from undulog.analysis.oscillators.predictions import (
+    entrainment,
+    explicit_coupling,
+    felt_response,
+    homogeneous,
+    path_laplacian,
+    relax,
+    relaxation,
+    steady_bias,
+)
 
 
 @dataclass(frozen=True)

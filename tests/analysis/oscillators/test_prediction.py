@@ -14,8 +14,8 @@ from scipy.linalg import expm
 import undulog
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
 from undulog.analysis.experiment.kicks.prediction import closed_loop
-from undulog.analysis.oscillators.comparator import path_laplacian
 from undulog.analysis.oscillators.laplacian import of_deviations
+from undulog.analysis.oscillators.predictions import path_laplacian
 from undulog.analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of
 from undulog.capture.common.errors import DataError, UsageError
 

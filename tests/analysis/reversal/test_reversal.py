@@ -12,8 +12,7 @@ from scipy.stats import PermutationMethod, nct, ttest_ind
 from scipy.stats import t as t_distribution
 
 from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
-from undulog.analysis.experiment.reversal.modules import ordered_pairs, reversal_of
-from undulog.analysis.experiment.reversal.shares import variance_shares
+from undulog.analysis.experiment.reversal.modules import ordered_pairs, reversal_of, variance_shares
 from undulog.capture.common.errors import UsageError
 
 DOCS = Path(__file__).parents[3] / "docs"

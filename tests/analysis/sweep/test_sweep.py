@@ -14,8 +14,7 @@ from undulog.analysis.experiment.sweep.chain import (
     transfer,
 )
 from undulog.analysis.experiment.sweep.runs import CommandTones, find_sweep
-from undulog.analysis.experiment.sweep.tone_finder import common_step, find_tones
-from undulog.analysis.experiment.sweep.tones import fit_tones
+from undulog.analysis.experiment.sweep.tones import common_step, find_tones, fit_tones
 from undulog.capture.robot.model import Servo
 
 LINEAR = dataclasses.replace(Servo(), coulomb_friction=0.0)

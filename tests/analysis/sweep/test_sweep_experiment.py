@@ -10,7 +10,7 @@ import pytest
 
 import undulog
 from undulog.analysis.experiment.sweep.chain import servo_side
-from undulog.analysis.plan.sweep_designs import tones
+from undulog.analysis.plan.designs import tones
 from undulog.analysis.present.text.experiment import render_experiment
 from undulog.analysis.results.sweep import LinearCoupling, Route
 from undulog.capture import Session, SessionWriter, load_robot

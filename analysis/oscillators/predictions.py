@@ -1,0 +1,205 @@
+"""What the couplings of kicks predict, and what a homogeneous chain would do.
+
+A chain whose every joint is coupled to the others alike, by their distance only, has a P that is
+constant along its diagonals. The nearest such matrix to P (its diagonals' means), with rows scaled
+to sum to 1 and I - P scaled to the same norm, is compared with P.
+
+What generators that feel their own servos will do, predicted from open-loop kicks.
+
+    phi_i' = omega + eps (2 (q_i/A) cos phi_i - b_i) + explicit coupling
+
+Of q_i = g_i A sin(phi_i + Delta_i) a cycle leaves eps (g_i sin Delta_i - b_i). With the bias
+b_i = g_i sin Delta_i the gait goes on as it is; a small deviation d phi of the commands turns the
+responses by P d phi and changes their log amplitude by R d phi, so
+
+    d phi' = eps (diag(g cos Delta) (P - I) + diag(g sin Delta) R) d phi,
+
+which has no parameter to fit. It holds for eps well below the rates at which the body settles.
+
+P read as entrainment: each joint drawn by its own command, and by the other joints.
+
+    phi_i' = omega + Gamma_i sin(psi_c,i - phi_i) + sum_j K_ij sin(phi_j - phi_i - psi_ij)
+
+Small steady kicks of the commands then give (Gamma + L) d phi = Gamma d psi_c, with Gamma and L the
+slopes in the settled pattern, so
+
+    P = (Gamma + L)^-1 Gamma,      P^-1 - I = Gamma^-1 L.
+
+Settled phases tell coupling relative to the entrainment only: times of any size give the same P.
+Absolute rates need the way back from kicks (:mod:`.chain`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm, toeplitz
+from scipy.optimize import brentq
+from scipy.special import stdtrit
+
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+
+from ..estimators.intervals import CONFIDENCE, Noisy
+from .laplacian import STRONG, spectrum
+
+
+def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArray:
+    """The response as the generator hears of it.
+
+    Args:
+        ratio: H = a/c as measured, shape (m,).
+        omega: Of the gait [rad/s].
+        age_s: How old an angle is on average when it is used [s].
+
+    Returns:
+        g exp(j Delta), the age part of Delta, shape (m,).
+    """
+    return (ratio * np.exp(-1j * omega * age_s)).astype(np.complex128)
+
+
+def steady_bias(felt: ComplexArray) -> FloatArray:
+    """b_i = g_i sin Delta_i, which takes the steady part of the feedback away.
+
+    Args:
+        felt: g exp(j Delta), shape (m,).
+
+    Returns:
+        Shape (m,).
+    """
+    return felt.imag.copy()
+
+
+def relaxation(P: FloatArray, R: FloatArray, felt: ComplexArray) -> FloatArray:
+    """J / eps of d phi' = J d phi.
+
+    Args:
+        P: d psi / d psi_c of the open loop, shape (m, m).
+        R: d ln|a| / d psi_c of the open loop, shape (m, m).
+        felt: g exp(j Delta) of the open loop, shape (m,).
+
+    Returns:
+        Shape (m, m); P - I where there is no lag and a gain of 1.
+    """
+    return felt.real[:, None] * (P - np.eye(len(P))) + felt.imag[:, None] * R
+
+
+def relax(J: FloatArray, kick: FloatArray, times_s: FloatArray) -> FloatArray:
+    """Deviations after a kick, d phi(t) = exp(J t) d phi(0).
+
+    Args:
+        J: Rates [1/s], shape (m, m).
+        kick: d phi(0) [rad], shape (m,).
+        times_s: After the kick [s], shape (k,).
+
+    Returns:
+        Shape (k, m).
+    """
+    return np.array([expm(J * float(t)) @ kick for t in times_s])
+
+
+MOST_CONDITION = 1e6
+"""Condition number of P beyond which it isn't inverted."""
+
+
+@dataclass(frozen=True)
+class Entrainment:
+    """Gamma^-1 L.
+
+    Attributes:
+        relative: P^-1 - I: minus the coupling K_ij / Gamma_i off the diagonal; None where P is
+            singular; shape (m, m).
+        half: Half widths of the 95 % intervals, one by one, shape (m, m).
+        condition_number: Of P: what its inversion may multiply relative errors by.
+    """
+
+    relative: FloatArray | None
+    half: FloatArray | None
+    condition_number: float
+
+
+def entrainment(P: Noisy) -> Entrainment:
+    """Read P as an entrained chain.
+
+    Args:
+        P: d psi / d psi_c with standard errors.
+
+    Returns:
+        The reading. Intervals are to first order in P's errors E, d(P^-1) = -P^-1 E P^-1, with the
+        degrees of freedom of a sum of variances (Welch, Biometrika 34, 1947).
+    """
+    condition = float(np.linalg.cond(P.value))
+    if not condition < MOST_CONDITION:
+        return Entrainment(None, None, condition)
+    inverse = np.linalg.inv(P.value)
+    squared, error = np.square(inverse), np.square(P.error)
+    variance = squared @ error @ squared
+    scatter = np.square(squared) @ (np.square(error) / P.dof) @ np.square(squared)
+    dof = np.divide(
+        np.square(variance), scatter, out=np.full(variance.shape, P.dof.min()), where=scatter > 0
+    )
+    half = np.asarray(stdtrit(dof, 0.5 + CONFIDENCE / 2) * np.sqrt(variance), dtype=np.float64)
+    return Entrainment(inverse - np.eye(len(P.value)), half, condition)
+
+
+MOST_EXPLICIT = 1e6
+"""Explicit coupling beyond which no answer is looked for [eps]."""
+
+
+def homogeneous(P: FloatArray) -> FloatArray:
+    """The homogeneous comparator of a chain.
+
+    Args:
+        P: d psi / d psi_c, rows sum to 1, shape (m, m).
+
+    Returns:
+        Toeplitz but for its rows' scale: they sum to 1, and ||I - P|| is that of P (Frobenius).
+    """
+    m = len(P)
+    below = [float(np.diagonal(P, -k).mean()) for k in range(m)]
+    ahead = [float(np.diagonal(P, k).mean()) for k in range(m)]
+    means = np.asarray(toeplitz(below, ahead), dtype=np.float64)
+    off = np.eye(m) - means / means.sum(axis=1, keepdims=True)
+    scale = np.linalg.norm(np.eye(m) - P) / np.linalg.norm(off)
+    return np.eye(m) - scale * off
+
+
+def path_laplacian(m: int) -> FloatArray:
+    """Laplacian of a chain coupled to its next neighbours both ways, with open ends.
+
+    Args:
+        m: Oscillators.
+
+    Returns:
+        Shape (m, m); its eigenvalues are 4 sin^2(k pi / 2m), k = 0 .. m - 1.
+    """
+    L = 2.0 * np.eye(m) - np.eye(m, k=1) - np.eye(m, k=-1)
+    L[0, 0] = L[-1, -1] = 1.0
+    return L
+
+
+def explicit_coupling(P: FloatArray, rate: float = STRONG) -> float | None:
+    """What coupling between next neighbours must add to that through the body.
+
+    Args:
+        P: d psi / d psi_c, shape (m, m).
+        rate: That every mode but the uniform one is to have at least [eps].
+
+    Returns:
+        The smallest K [eps], both ways and the same for all pairs, for which the slowest mode of
+        I - P + K L has this rate, L the path's Laplacian; 0 where none is needed, None where none
+        is enough.
+    """
+    L = path_laplacian(len(P))
+
+    def lacking(K: float) -> float:
+        return spectrum(P - K * L).gap - rate
+
+    if lacking(0.0) >= 0.0:
+        return 0.0
+    enough = rate
+    while lacking(enough) < 0.0:
+        enough *= 2.0
+        if enough > MOST_EXPLICIT:
+            return None
+    return float(brentq(lacking, 0.0, enough, xtol=1e-6))

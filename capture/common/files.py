@@ -1,0 +1,192 @@
+"""Files: read whole, written whole or not at all, and those that come with the package."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from .console import refuse_existing
+from .errors import Fault, FaultyFileError, InputFileError, LogWriteError, UndulogError, UsageError
+from .interruption import StopRequest
+from .strict_table import listed
+
+
+def is_file(path: Path) -> bool:
+    """Whether a name, which a file may have given, is that of a file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        False also for a name that no file system takes.
+    """
+    try:
+        return path.is_file()
+    except OSError:  # too long
+        return False
+
+
+def read_input(path: Path) -> bytes:
+    """Read a file that the user named.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        InputFileError: If it isn't there or can't be read.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputFileError(path, "no such file") from error
+    except OSError as error:
+        raise InputFileError(path, f"can't be read: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True)
+class Description:
+    """The text of a description and where it comes from.
+
+    Attributes:
+        text: The TOML text.
+        source: For messages.
+        folder: Where its companions lie.
+    """
+
+    text: str
+    source: Path
+    folder: Traversable
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """One kind of description.
+
+    Attributes:
+        kind: What it is called in messages, e.g. ``robot``.
+        package: The package that ships them.
+        folder: The folder in that package.
+        error: Raised for a file that is no text.
+    """
+
+    kind: str
+    package: str
+    folder: str
+    error: type[FaultyFileError]
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the shipped ones, sorted."""
+        entries = (Path(entry.name) for entry in self._place().iterdir())
+        return tuple(sorted(entry.stem for entry in entries if entry.suffix == ".toml"))
+
+    def read(self, name_or_path: str | Path) -> Description:
+        """Read a shipped description by name, or a file by path.
+
+        Args:
+            name_or_path: One of :meth:`names`, or the path of a TOML file.
+
+        Returns:
+            Its text.
+
+        Raises:
+            UsageError: If there is none of that name.
+            InputFileError: If it is a path, and the file isn't there or can't be read.
+            FaultyFileError: If the file is not UTF-8 (the shelf's own kind of it).
+        """
+        if str(name_or_path) in self.names():
+            place = self._place()
+            text = (place / f"{name_or_path}.toml").read_text(encoding="utf-8")
+            return Description(text, Path(f"{name_or_path}.toml"), place)
+        path = Path(name_or_path)
+        is_path = bool(path.suffix) or len(path.parts) > 1
+        if not is_path and not is_file(path):
+            near = listed(self.names(), str(name_or_path))
+            raise UsageError(f"no {self.kind} {str(name_or_path)!r}: not a file, nor one of {near}")
+        try:
+            return Description(read_input(path).decode("utf-8"), path, path.parent)
+        except UnicodeDecodeError as error:
+            fault = Fault(f"byte {error.start}", "not UTF-8", "TOML is UTF-8 text")
+            raise self.error(path, [fault]) from error
+
+    def _place(self) -> Traversable:
+        return resources.files(self.package) / self.folder
+
+
+def check_output(output: Path, endings: Iterable[str], why: str, *, force: bool) -> None:
+    """Check an output path before any work is done.
+
+    Args:
+        output: The path.
+        endings: Any of which its name must have.
+        why: What to say if it has none of them.
+        force: Whether an existing file may be replaced.
+
+    Raises:
+        UsageError: If the name ends otherwise or its folder does not exist.
+        OutputExistsError: If it exists and ``force`` is not given.
+    """
+    if output.suffix.lower() not in tuple(endings):
+        raise UsageError(f"{output}: {why}")
+    refuse_existing(output, force=force)
+
+
+@contextmanager
+def part_file(output: Path) -> Generator[Path]:
+    """Write ``OUTPUT.part``, and rename it on leaving without an exception.
+
+    Args:
+        output: The file wanted; one of that name is replaced, so callers that must not replace it
+            ask :func:`.capture.common.console.refuse_existing` before they start.
+
+    Yields:
+        Where to write.
+
+    Raises:
+        LogWriteError: If it can't be written; nothing is left behind then.
+    """
+    part = output.with_name(f"{output.name}.part")
+    try:
+        yield part
+        part.replace(output)
+    except OSError as error:
+        if isinstance(error, UndulogError):
+            raise
+        raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):  # what stopped the writing may stop this too
+            part.unlink(missing_ok=True)
+
+
+def write_text(output: Path, text: str) -> None:
+    """Write a text file, which appears only when it is whole.
+
+    Args:
+        output: The file wanted; one of that name is replaced, as by :func:`part_file`.
+        text: Its content, for UTF-8.
+
+    Raises:
+        LogWriteError: If it can't be written; nothing is left behind then.
+    """
+    with part_file(output) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def check_stop(output: Path, stop: StopRequest | None) -> None:
+    """End the writing of a part file if an end was asked for.
+
+    Args:
+        output: The file wanted.
+        stop: The request to look at.
+
+    Raises:
+        LogWriteError: If an end was asked for.
+    """
+    if stop is not None and stop.requested:
+        raise LogWriteError(output, "stopped on request, nothing is written")
