@@ -58,7 +58,7 @@ def test_rerun_shows_the_named_joints_of_the_session(demo: Path) -> None:
 
 
 def test_the_replay_file_verifies(demo: Path) -> None:
-    run(RERUN, "rrd", "verify", demo / "undulog.replay.record.rrd")
+    run(RERUN, "rrd", "verify", demo / "replay.rrd")
 
 
 def test_the_result_has_the_papers_claim_with_an_interval(demo: Path) -> None:

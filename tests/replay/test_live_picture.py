@@ -36,7 +36,7 @@ def live(session_file, tmp_path_factory, read_back):
 @pytest.fixture(scope="module")
 def replay(session_file, tmp_path_factory, read_back):
     """The same session as a replay."""
-    path = tmp_path_factory.mktemp("replay") / "undulog.replay.record.rrd"
+    path = tmp_path_factory.mktemp("replay") / "replay.rrd"
     with Session.open(session_file) as session:
         write_recording(session, path)
     return read_back(path)
