@@ -9,7 +9,7 @@
         result = analyse_session(session)
     print(result.joints[0].lag_rad, result.warnings)
 
-Names are imported when first used, so that ``import analysis`` costs nothing.
+Names are imported when first used, so that ``import undulog.analysis`` costs nothing.
 """
 
 # pyright: reportUnusedImport=false

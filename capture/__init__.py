@@ -8,7 +8,7 @@
         measured = session.joints("/joint_states", "position")
         print(measured.names, measured.unit, session.warnings)
 
-Names are imported when first used, so that ``import capture`` costs nothing.
+Names are imported when first used, so that ``import undulog.capture`` costs nothing.
 """
 
 # pyright: reportUnusedImport=false

@@ -10,7 +10,7 @@
         recording = write_recording(session, Path("run.rrd"))
         print(recording.recording_id, recording.warnings)
 
-Names are imported when first used, so that ``import replay`` costs nothing.
+Names are imported when first used, so that ``import undulog.replay`` costs nothing.
 """
 
 # pyright: reportUnusedImport=false

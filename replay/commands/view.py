@@ -153,6 +153,7 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
             layer = computed(session, options)
         session.forget()
         bar.update(1, note="recording")
+        # Here, not above: Rerun takes memory that the analysis can use before.
         from ..layout.blueprint import build_blueprint
         from ..record.rrd import write_recording
 

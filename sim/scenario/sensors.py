@@ -64,7 +64,7 @@ class InfraredModel:
 
 @dataclass(frozen=True)
 class SonarModel:
-    """Ultrasonic range finders, :mod:`.sim.sensing.sonar`.
+    """Ultrasonic range finders, :mod:`.sim.sensing.ranging`.
 
     Attributes:
         rate_hz: Measurements a second.

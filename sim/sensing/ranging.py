@@ -1,4 +1,4 @@
-"""What infrared sensors and sonars share: rays from moving mounts, samples at due times.
+"""Infrared distance sensors and sonars: rays from moving mounts, samples at due times.
 
 Infrared distance sensors of the Sharp GP2Y0A02 kind, as the robot's computer reads them.
 
@@ -8,10 +8,18 @@ leaves the detector and the voltage falls back; the data sheet draws that branch
 here it is a parabola from nothing at d = 0 to the peak. The sensor takes a new value every 38 ms
 and holds it; an ADC reads it, and the computer turns it into a distance by inverting the falling
 branch. So what is nearer than the peak is told as farther than it is: that is the sensor's physics.
+
+Ultrasonic range finders: the nearest thing in a cone.
+
+The cone is a bundle of rays, spread so that their directions cover it evenly. The ground is left
+out: sound that grazes a smooth floor is reflected away from the sensor. Obstacles echo from
+whatever angle they are struck, which flatters smooth walls seen obliquely. The flight of the sound
+(23 ms for 4 m and back) is neglected.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -21,7 +29,7 @@ from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.steps import Steps
 from ..physics.vectors import out_of_frames
-from ..scenario.sensors import InfraredModel
+from ..scenario.sensors import InfraredModel, SonarModel
 from .contract import RangeSample
 from .mount import Mounts, Schedule, quantised
 from .rays import RayCaster
@@ -92,7 +100,7 @@ class Ranging:
         ]
 
 
-STREAM = 3
+IR_STREAM = 3
 """Number of the random stream that the sensors' noise is drawn from."""
 
 _SCALE, _SHIFT, _BIAS = 0.9005, 0.1346, 0.137  # V m, m, V
@@ -160,7 +168,7 @@ class Infrared:
         )
         self._model = model
         self._longest = np.array([one.range_max for one in sensors], dtype=np.float64)
-        self._random = np.random.default_rng([seed, STREAM])
+        self._random = np.random.default_rng([seed, IR_STREAM])
 
     def observe(self, steps: Steps, start: int) -> list[RangeSample]:
         """Measure what is due in one control period.
@@ -181,3 +189,80 @@ class Infrared:
         read = quantised(np.clip(volts, 0.0, model.adc_v), model.adc_v / (2**model.adc_bits - 1))
         told = decoded(read)
         return np.where(told > self._longest[which], np.inf, told)
+
+
+SONAR_STREAM = 4
+"""Number of the random stream that the sensors' noise is drawn from."""
+
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+def cone(count: int, angle: float) -> FloatArray:
+    """Directions spread evenly over a cone about x, on a sunflower spiral (Vogel 1979).
+
+    Args:
+        count: r; the first one is the axis, the last ones are on the rim.
+        angle: Full angle of the cone [rad].
+
+    Returns:
+        Unit vectors, shape (3, r).
+    """
+    turn = _GOLDEN_ANGLE * np.arange(count)
+    off = angle / 2 * np.sqrt(np.arange(count) / max(count - 1, 1))
+    return np.array([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)])
+
+
+class Sonar:
+    """A robot's sonars, mostly one."""
+
+    def __init__(
+        self,
+        model: SonarModel,
+        sensors: Sequence[Sensor],
+        robot: Robot,
+        caster: RayCaster,
+        *,
+        dt: float,
+        seed: int,
+    ) -> None:
+        """Start before the first control period.
+
+        Args:
+            model: How they measure.
+            sensors: The sensors.
+            robot: Who carries them.
+            caster: The world.
+            dt: Physics step [s].
+            seed: Of the noise.
+        """
+        self._ranging = Ranging(
+            sensors,
+            robot,
+            caster,
+            Schedule(1.0 / model.rate_hz, len(sensors), dt),
+            bundles=np.array([cone(model.rays, one.field_of_view or 0.0) for one in sensors]),
+            sees_ground=False,
+            dt=dt,
+        )
+        self._model = model
+        self._limits = np.array([(one.range_min, one.range_max) for one in sensors], np.float64)
+        self._random = np.random.default_rng([seed, SONAR_STREAM])
+
+    def observe(self, steps: Steps, start: int) -> list[RangeSample]:
+        """Measure what is due in one control period.
+
+        Args:
+            steps: Its physics steps, both ends included.
+            start: Number of the first one since the start of the run.
+
+        Returns:
+            The samples, in order of time; +inf beyond a sensor's range (REP 117), and its least
+            range for what is nearer.
+        """
+        return self._ranging.observe(steps, start, self._reported)
+
+    def _reported(self, distance: FloatArray, which: IntArray) -> FloatArray:
+        noise = self._model.noise * self._random.standard_normal(len(distance))
+        told = quantised(distance + noise, self._model.resolution)
+        shortest, longest = self._limits[which].T
+        return np.where(told > longest, np.inf, np.maximum(told, shortest))

@@ -13,9 +13,8 @@ from .accelerometer import Accelerometer
 from .compass import Compass
 from .contract import JointSample, RangeSample, SensorSample, VectorSample
 from .polling import JointPolling
-from .ranging import Infrared
+from .ranging import Infrared, Sonar
 from .rays import RayCaster
-from .sonar import Sonar
 
 
 class _Kind(Protocol):
