@@ -7,19 +7,18 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, say
 from undulog.capture.common.interruption import interruptible
 
-from ..overlay import words
-from ..overlay.alignment import Align
-from ..overlay.side import names_of
-from ..overlay.together import bring_together, steps
-from ..overlay.write import Beside, Place
 from ..viewer import viewer
+
+if TYPE_CHECKING:
+    from ..overlay.alignment import Align
+    from ..overlay.write import Beside, Place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +66,11 @@ def view_beside(
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
+    from ..overlay.alignment import Align
+    from ..overlay.side import names_of
+    from ..overlay.together import bring_together, steps
+    from ..overlay.write import Place
+
     names = names_of(files, None if options.names is None else options.names.split(","))
     how, place = Align(options.align or Align.TIME), Place(options.place or Place.START)
     if save is None and not web:
@@ -101,6 +105,8 @@ def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool
     if json:
         emit_json(_facts(beside, how, place, size))
         return
+    from ..overlay import words
+
     first, *others = [one.side for one in beside.shown]
     for other in others:
         say(f"{words.answer(first, other, beside.found[other.name])}.")
@@ -123,6 +129,8 @@ def _facts(beside: Beside, how: Align, place: Place, size: int) -> dict[str, Any
 
 
 def _session(beside: Beside, place: int) -> dict[str, Any]:
+    from ..overlay import words
+
     one, first = beside.shown[place], beside.shown[0].side
     side = one.side
     facts: dict[str, Any] = {

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-
-import rerun as rr
+from typing import TYPE_CHECKING
 
 from undulog.analysis.results.analysis import Analysis, GroupFacts
 from undulog.analysis.results.formats import utc
@@ -16,6 +15,9 @@ from undulog.capture.common.console import plain
 from ..content.content import Content
 from ..content.layer import Named
 from ..samples.timeline import ENSEMBLE_CYCLE
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 FACTS = "/session"
 
@@ -128,6 +130,8 @@ def log_facts(rec: rr.RecordingStream, text: str) -> None:
         rec: The recording.
         text: Markdown.
     """
+    import rerun as rr
+
     rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 

@@ -33,6 +33,25 @@ def test_help_lists_all_verbs_without_importing_any() -> None:
         assert word in done.stdout
 
 
+COMMANDS = sorted(
+    f"undulog.{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}"
+    for path in ROOT.glob("*/commands/*.py")
+    if path.stem != "__init__"
+)
+
+
+@pytest.mark.parametrize("module", COMMANDS)
+def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module: str) -> None:
+    # Rerun reads its log level when it's loaded, so `view` has to be able to set it before.
+    code = (
+        f"import sys, {module};"
+        "heavy = {'pybullet', 'rerun', 'matplotlib'} & set(sys.modules);"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert undulog.run(["analyze", "x.mcap"]) == 2
     said = capsys.readouterr().err
