@@ -12,6 +12,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -196,6 +197,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("-o", "--output", type=Path, default=Path("out/campaign"))
     options = parser.parse_args()
+    # Ignored by the caller (nohup, a job in the background), it would be ignored by every case.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     options.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="cmp", ignore_cleanup_errors=True) as name:
         return _run(options, Path(name))
