@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,8 @@ from .gait_base import BaseGait
 RATE_HZ = 100
 RAMP_S = 2.0
 """Time over which the amplitude grows from zero, if the settling leaves as much."""
+
+_LONGEST_STEM = 80
 
 
 def write_plan(
@@ -54,7 +57,7 @@ def write_plan(
         LogWriteError: If the folder or a file can't be written.
     """
     _check_limits(base, runs, like)
-    files = [folder / f"run{k:03d}-{run.label}.mcap" for k, run in enumerate(runs)]
+    files = [folder / f"run{k:03d}-{_file_stem(run.label)}.mcap" for k, run in enumerate(runs)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         there = [file for file in files if file.exists()]
@@ -92,6 +95,11 @@ def write_plan(
             for at_ns, row in zip(t_ns.tolist(), values, strict=True):
                 channel.write(start_ns + at_ns, row)
     return tuple(files)
+
+
+def _file_stem(label: str) -> str:
+    """Replace what has a meaning in paths, since joint names come from any log."""
+    return re.sub(r"[^\w.+-]", "_", label)[:_LONGEST_STEM]
 
 
 def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) -> FloatArray:

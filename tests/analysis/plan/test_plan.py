@@ -80,6 +80,26 @@ def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
         np.testing.assert_allclose(offset, np.linspace(-0.1, 0.1, 25), atol=1e-5)
 
 
+def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys):
+    names = ["../up", "/etc/x", "nul\0", "l" * 300]
+    with SessionWriter(tmp_path / "like.mcap", session_id="like", epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", names, unit="rad")
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        for k in range(300):
+            asked = np.real(BASE * np.exp(2j * np.pi * 0.8 * k / 50))
+            commands.write(EPOCH_NS + k * 20_000_000, asked)
+            states.write(EPOCH_NS + k * 20_000_000, asked)
+    folder = tmp_path / "deep" / "kicks"
+    words = ("--like", tmp_path / "like.mcap", "-o", folder, "--settle", 3, "--measure", 5)
+    files = planned(capsys, "phase-kicks", *words)
+    assert len(set(files)) == len(list(folder.iterdir())) == 4 * 4 + 6 + 3
+    kicked = set()
+    for file in files:
+        with Session.open(file) as session:
+            kicked.add(session.metadata["undulog.plan"].get("joint"))
+    assert set(names) <= kicked
+
+
 def test_a_reversal_alternates(like, tmp_path, capsys):
     words = ("--like", like, "-o", tmp_path / "both", "--runs", 2, "--settle", 2, "--measure", 5)
     files = planned(capsys, "reversal", *words)
