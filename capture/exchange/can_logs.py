@@ -109,9 +109,11 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
         with open_mf4(path) as log:
             yield _datable(log)
         return
-    reader = _reader(path)
+    problems: list[str] = []
+    with _noted("can", problems):
+        reader = _reader(path)
     try:
-        yield _datable(_python_can_log(path, reader, suffix))
+        yield _datable(_python_can_log(path, reader, suffix, problems))
     finally:
         reader.stop()
 
@@ -171,15 +173,18 @@ def _check_database(path: Path) -> None:
         raise ValueError(f"{count} rows have a number as data")
 
 
-def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
+def _python_can_log(
+    path: Path, reader: MessageReader, suffix: str, problems: list[str]
+) -> FrameLog:
     messages = _messages(path, reader)
     if suffix == ".asc":
         messages = map(_with_length_code, messages)
     odd = _Odd()
     messages = filter(odd.is_frame, messages)
-    first = next(messages, None)
+    with _noted("can", problems):
+        first = next(messages, None)
     if first is None:
-        raise ImportFormatError(path, "holds no CAN frames")
+        raise ImportFormatError(path, "; ".join(["holds no CAN frames", *problems[:1]]))
     relative = first.timestamp * 1e9 < EARLIEST_NS
     log = FrameLog(
         blocks=iter(()),
@@ -188,6 +193,7 @@ def _python_can_log(path: Path, reader: MessageReader, suffix: str) -> FrameLog:
         time="counted from the log's start, put at 2000-01-01T00:00:00Z; rounded to 1 us"
         if relative
         else "as recorded, rounded to 1 us",
+        problems=problems,
     )
     epoch_ns = RELATIVE_EPOCH_NS if relative else 0
     log.blocks = _blocks(
