@@ -104,7 +104,11 @@ def log_words(rec: rr.RecordingStream, clock: Clock, session: Session) -> bool:
     said: list[tuple[int, str]] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS and channel.is_ros2:
-            messages = [(t_ns, str(message.data)) for t_ns, message in session.messages(topic)]
+            messages = [
+                (t_ns, str(message.data))
+                for t_ns, message in session.messages(topic)
+                if hasattr(message, "data")  # a log's own definition of the type may lack it
+            ]
             turns = changes([word for _, word in messages])
             said += [(messages[i][0], f"{topic}: {messages[i][1]}") for i in turns]
     said.sort()
