@@ -92,7 +92,7 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
-	$(BIN)/python tests/replay/golden_pictures.py
+	$(BIN)/python tests/support/golden_pictures.py
 
 lock: $(READY)  ## renew requirements.lock (needs uv on the path)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import runpy
+import sys
 import tempfile
 from collections import defaultdict
 from pathlib import Path
@@ -30,14 +30,14 @@ from undulog.sim.scenario.engines import Kernels
 from undulog.sim.scenario.modules import Modules
 from undulog.sim.twin.recording import record
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support import twin_chains
+
 WEAKENED = (0.2, 0.1, 0.05)
 SCATTER = (0.05, 0.1, 0.3)
 """Of a run's lag [degrees], and of its log gain in the same measure."""
 
 SETS = 100
-
-CHAINS = Path(__file__).parents[1] / "tests" / "analysis" / "twin_chains.py"
-shared = runpy.run_path(str(CHAINS))
 
 
 def drawn(seed, folder):
@@ -53,7 +53,7 @@ def drawn(seed, folder):
         "mu_tangential": random.uniform(0.03, 0.1),
         "mu_normal": random.uniform(0.3, 0.8),
     }
-    text = shared["wave"](
+    text = twin_chains.wave(
         duration_s=10 / frequency,
         settle_s=5 / frequency,
         gait={"ramp_s": 1.0},
@@ -61,7 +61,7 @@ def drawn(seed, folder):
         world={"ground": ground},
         servo={"stall_torque": random.uniform(0.2, 0.5)},
     )
-    (folder / "chain.toml").write_text(shared["chain"](13))
+    (folder / "chain.toml").write_text(twin_chains.chain(13))
     forward = parse_scenario(text, folder / "random.toml")
     plane, wave = next(iter(forward.gait.planes.items()))
     turned = dataclasses.replace(wave, wave=Wave.TAIL_TO_HEAD)

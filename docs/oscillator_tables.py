@@ -9,7 +9,7 @@ minute to one and a half. ``--quick`` takes 3 yaw joints, only to see that it ru
 from __future__ import annotations
 
 import argparse
-import runpy
+import sys
 import tempfile
 from pathlib import Path
 
@@ -18,8 +18,8 @@ import numpy as np
 from undulog.analysis.oscillators.laplacian import spectrum
 from undulog.analysis.oscillators.predictions import homogeneous
 
-TESTS = Path(__file__).parents[1] / "tests" / "analysis" / "oscillators"
-shared = runpy.run_path(str(TESTS / "closed_loop.py"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support import closed_loop
 
 HELD_OUT = (0.05, 0.1, 0.15)
 
@@ -28,13 +28,13 @@ def print_chain(m, stall):
     """Print the figures of one chain."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shared["write_chain"](folder, m, stall)
-        experiment = shared["open_loop"](folder, m, HELD_OUT)
+        closed_loop.write_chain(folder, m, stall)
+        experiment = closed_loop.open_loop(folder, m, HELD_OUT)
         print(f"{m} yaw joints, {stall} N m")
         print("\n".join(f"  {line}" for line in coupling_lines(experiment.coupling)))
         print(f"  {experiment.oscillators.answer}")
-        found = shared["closed_loop"](folder, experiment)
-        print(f"  closed loop, eps {shared['EPS']}, {found.t_s[-1]:.1f} s after a kick:")
+        found = closed_loop.closed_loop(folder, experiment)
+        print(f"  closed loop, eps {closed_loop.EPS}, {found.t_s[-1]:.1f} s after a kick:")
         print(f"    moved by {found.moved[-1]:.1%} of it; prediction off by {found.error[-1]:.1%}")
         print(f"    of it, at most {found.error.max():.1%}", flush=True)
 

@@ -9,15 +9,12 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-TESTS = str(Path(__file__).parent)
-if TESTS not in sys.path:  # test folders are no packages: the fault zoo is imported by its name
-    sys.path.append(TESTS)
+pytest.register_assert_rewrite("support")
 
 # In the background of a script or under nohup these are ignored, and every process that a test
 # starts would inherit that. A handler is not inherited; this one goes on ignoring SIGHUP here.

@@ -1,19 +1,14 @@
 """Sessions of known truth, written with a foreign writer (mcap-ros2-support), not with ours;
 results built by hand; experiments with a linear chain."""
 
-import runpy
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
-from zoo.bags import JOINT_STATE
 
+from support import built_results, linear_chain
+from support.analysed import experiment
 from undulog.capture import SessionWriter
-
-built = runpy.run_path(str(Path(__file__).with_name("built_results.py")))
-chain = runpy.run_path(str(Path(__file__).with_name("linear_chain.py")))
-experiment = runpy.run_path(str(Path(__file__).with_name("analysed.py")))["experiment"]
+from zoo.bags import JOINT_STATE
 
 EPOCH_NS = 1_735_689_600_123_456_789
 
@@ -111,25 +106,25 @@ HOSTILE = "<script>alert('x')</script>$\\frac{a}{b$\x00&\"蛇"
 @pytest.fixture(scope="session")
 def snake():
     """25 joints, 13 yaw joints driven, like the twin with weak servos."""
-    return built["make_snake"]()
+    return built_results.make_snake()
 
 
 @pytest.fixture(scope="session")
 def hostile():
     """Names that try to leave their place in the markup."""
-    return built["make_snake"](path=HOSTILE, rename=lambda text: HOSTILE + text)
+    return built_results.make_snake(path=HOSTILE, rename=lambda text: HOSTILE + text)
 
 
 @pytest.fixture(scope="session")
 def still():
     """No gait, no robot, everything null."""
-    return built["make_still"]()
+    return built_results.make_still()
 
 
 @pytest.fixture(scope="session")
 def single():
     """One driven joint whose plane is unknown."""
-    return built["make_single"]()
+    return built_results.make_single()
 
 
 @pytest.fixture(scope="session")
@@ -157,7 +152,7 @@ def recorded(snake, tmp_path_factory):
 @pytest.fixture(scope="session")
 def both_ways_files(tmp_path_factory):
     """Six runs each way, in turn."""
-    return chain["both_ways"](tmp_path_factory.mktemp("ways"))
+    return linear_chain.both_ways(tmp_path_factory.mktemp("ways"))
 
 
 @pytest.fixture(scope="session")
@@ -169,10 +164,10 @@ def both_ways(both_ways_files):
 @pytest.fixture(scope="session")
 def kicked(tmp_path_factory):
     """Every joint's command kicked in phase and amplitude, and a pattern held out."""
-    return experiment(chain["kicked"](tmp_path_factory.mktemp("kicks")))
+    return experiment(linear_chain.kicked(tmp_path_factory.mktemp("kicks")))
 
 
 @pytest.fixture(scope="session")
 def swept(tmp_path_factory):
     """A lag sweep: the commands of the runs are the columns of a DFT."""
-    return experiment(chain["swept"](tmp_path_factory.mktemp("sweep")))
+    return experiment(linear_chain.swept(tmp_path_factory.mktemp("sweep")))

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-ROOT = Path(__file__).parents[2]
+from support.paths import ROOT
+
 SENDER = Path(__file__).with_name("sender.py")
 RECORD = 32
 AT_DATA = 24

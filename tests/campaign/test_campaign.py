@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from campaign.fuzz import Case, run_case
 
-ROOT = Path(__file__).parents[2]
+from campaign.fuzz import Case, run_case
+from support.paths import ROOT
+
 KEPT = sorted((Path(__file__).parent / "kept").glob("*.json"))
 
 

@@ -3,11 +3,10 @@
 import importlib.util
 import json
 import tempfile
-from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs"
+from support.paths import DOCS
 
 
 def page_module():

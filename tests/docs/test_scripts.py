@@ -3,13 +3,12 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import undulog
+from support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 RUN_ELSEWHERE = {"conf.py", "notebook_page.py"}
 """Run by Sphinx (``make docs``), the second by test_notebook.py, too."""

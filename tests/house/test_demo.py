@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
+from support.paths import ROOT
+
 RERUN = Path(sys.executable).parent / "rerun"
 JOINTS = [f"joint{i:02d}" for i in range(1, 26)]
 
@@ -20,7 +22,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
-    makefile = Path(__file__).parents[2] / "Makefile"
+    makefile = ROOT / "Makefile"
     recipe = re.findall(r"\$\(call undulog,(.*)\)\n", makefile.read_text())
     assert len(recipe) == 4
     for line in recipe:

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 import undulog
-
-ROOT = Path(__file__).parents[2]
+from support.paths import ROOT
 
 
 @pytest.mark.parametrize("verb", sorted(undulog.VERBS))

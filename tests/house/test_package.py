@@ -16,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from support.paths import ROOT
+
 FOLDERS = ("analysis", "capture", "replay", "sim")
 BUILD = [sys.executable, "-m", "hatchling", "build"]
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from support.paths import ROOT
+
 README = (ROOT / "README.md").read_text()
 COMMANDS = [
     line.removeprefix("$ ").partition("   #")[0].partition("  #")[0].strip()

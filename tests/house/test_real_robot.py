@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 import undulog
-
-TRACE = Path(__file__).parents[2].parent / "shared/data/arcsnake/linear_trajectory.candump.log"
+from support.paths import TRACE
 
 
 def test_a_ramp_is_imported_exported_and_has_no_gait(

@@ -18,6 +18,7 @@ import pytest
 from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
+from support.paths import ROOT
 from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.schemas import message_type, schema_text
 
@@ -42,7 +43,6 @@ NAMES = (
 TOPICS = (f"/t1{TITLE}", f"/t2{CLIPBOARD}\n{FORGED}", "/t3\r\x1b[2K[/]<b>")
 
 
-ROOT = Path(__file__).parents[2]
 COMMANDS = (
     "log info A",
     "log check A",

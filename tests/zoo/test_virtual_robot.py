@@ -8,10 +8,6 @@ import time
 from contextlib import closing, contextmanager
 
 import pytest
-from zoo.judging import judge
-from zoo.outputs import OUTPUTS, statements
-from zoo.planting import RESPONSE
-from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
 
 import undulog
 from undulog.capture import Session, load_robot
@@ -21,6 +17,10 @@ from undulog.sim.drive.driven import find_driven
 from undulog.sim.drive.link import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
 from undulog.sim.gait.contract import Readings
+from zoo.judging import judge
+from zoo.outputs import OUTPUTS, statements
+from zoo.planting import RESPONSE
+from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
 
 UNDULOG = [sys.executable, "-m", "undulog"]
 PATIENCE_S = 300

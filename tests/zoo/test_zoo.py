@@ -1,11 +1,11 @@
 """The zoo itself: bags that others can read, faults that are what they claim to be."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+
+from support.paths import DOCS
 from zoo.bags import write_bag
 from zoo.faults import FAULTS, plant
 from zoo.outputs import OUTPUTS
@@ -86,7 +86,7 @@ def test_there_are_faults_enough():
 
 
 def test_the_manual_lists_the_kinds_of_every_fault():
-    page = Path(__file__).parents[2] / "docs" / "faults.md"
+    page = DOCS / "faults.md"
     assert "\n".join(lines()) in page.read_text(), "renew it: python -m zoo.page"
 
 

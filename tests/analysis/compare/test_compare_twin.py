@@ -1,11 +1,9 @@
 """The twin with one weakened joint against itself: named first, with what was changed."""
 
-import runpy
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from support import twin_chains
 from undulog.analysis import compare_sessions
 from undulog.capture import Session
 from undulog.sim import load_scenario
@@ -13,13 +11,12 @@ from undulog.sim.twin.recording import record
 
 pytestmark = pytest.mark.slow
 
-shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
 
 WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}
 
 
 def wave(**tables):
-    return shared["wave"](
+    return twin_chains.wave(
         duration_s=7.0, settle_s=3.0, gait={"ramp_s": 0.5}, noise={"position": 0.002}, **tables
     )
 
@@ -28,7 +25,7 @@ def wave(**tables):
 def twins(tmp_path_factory):
     """A session as it is, one with other noise, one with a weak servo; and the first one's path."""
     folder = tmp_path_factory.mktemp("twins")
-    (folder / "chain.toml").write_text(shared["chain"](5, stall_torque=0.25))
+    (folder / "chain.toml").write_text(twin_chains.chain(5, stall_torque=0.25))
     path = []
 
     def follow(sample):

@@ -2,18 +2,15 @@
 
 import cmath
 import math
-import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.resting import STEP, Joint, found_in, play
 from undulog.analysis.dead_band.find import fundamental_change, rested
 
-shared = runpy.run_path(str(Path(__file__).with_name("resting.py")))
-Joint, found_in, play, STEP = (shared[name] for name in ("Joint", "found_in", "play", "STEP"))
 JOINTS = 6
 
 

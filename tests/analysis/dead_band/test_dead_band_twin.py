@@ -2,19 +2,15 @@
 
 import dataclasses
 import math
-import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from support.resting import STEP, found_in
 from undulog.capture import load_robot
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Scenario, Serpentine, World
 from undulog.sim.twin.twin import Twin
-
-shared = runpy.run_path(str(Path(__file__).with_name("resting.py")))
-found_in, STEP = shared["found_in"], shared["STEP"]
 
 
 @dataclasses.dataclass

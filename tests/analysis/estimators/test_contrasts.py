@@ -1,9 +1,6 @@
 """Contrasts between joints whose noise is shared: intervals against planted truth."""
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
+import contrast_tables
 import numpy as np
 import pytest
 
@@ -13,14 +10,12 @@ from undulog.analysis.estimators.harmonic_moments import HarmonicModel
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import residual_noise, residual_spectrum
 
-DOCS = Path(__file__).parents[3] / "docs"
-TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "contrast_tables.py")))
-RATE, OMEGA, JOINTS = TABLES.RATE, TABLES.OMEGA, TABLES.JOINTS
+RATE, OMEGA, JOINTS = contrast_tables.RATE, contrast_tables.OMEGA, contrast_tables.JOINTS
 
 
 def judged(*case, **more):
     """Share of 95 % intervals of the contrasts that hold zero: of gain and of lag, each (11,)."""
-    return TABLES.judged(*case, **more)[0]
+    return contrast_tables.judged(*case, **more)[0]
 
 
 @pytest.mark.parametrize("shared", ["nothing", "additive", "modulation"])

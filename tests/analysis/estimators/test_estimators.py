@@ -1,14 +1,9 @@
 """Lag, gain and their intervals over the grid: noise, rate, length, skew, lost samples."""
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
+import estimator_tables
 import numpy as np
 import pytest
 
-DOCS = Path(__file__).parents[3] / "docs"
-TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "estimator_tables.py")))
 GUESS = 2 * np.pi * 1.002  # the truth is 1 Hz
 
 
@@ -22,7 +17,7 @@ GUESS = 2 * np.pi * 1.002  # the truth is 1 Hz
 def test_lag_and_gain_reach_the_bound(rate, cycles, skew_s, lost, sigma):
     """Rife & Boorstyn 1974: at known omega var phase >= 1/(eta N), eta = A^2/(2 sigma^2)."""
     draws = 3000
-    data = TABLES.sampled(
+    data = estimator_tables.sampled(
         np.random.default_rng(7),
         draws=draws,
         cycles=cycles,
@@ -31,7 +26,7 @@ def test_lag_and_gain_reach_the_bound(rate, cycles, skew_s, lost, sigma):
         skew_s=skew_s,
         lost=lost,
     )
-    lag, gain, _ = TABLES.fitted(*data, GUESS)
+    lag, gain, _ = estimator_tables.fitted(*data, GUESS)
     samples = round(0.8 * cycles * rate) if lost else round(cycles * rate)
     assert data[3].shape == (draws, samples)
     amplitude = 0.9 * 0.5
@@ -48,14 +43,14 @@ def test_lag_and_gain_reach_the_bound(rate, cycles, skew_s, lost, sigma):
 @pytest.mark.parametrize("cycles", [7.0, 7.4, 10.0, 20.0])
 def test_intervals_cover(cycles, ar, lost):
     """4,000 draws: the coverage's own standard error is 0.35 %."""
-    lag, gain = TABLES.coverage(cycles, ar, lost=lost)
+    lag, gain = estimator_tables.coverage(cycles, ar, lost=lost)
     assert 0.93 < lag < 0.97
     assert 0.93 < gain < 0.97
 
 
 def test_common_ways_are_worse():
     """Off a whole number of cycles; the fit alone reaches the bound."""
-    rows = TABLES.compared(draws=400)
+    rows = estimator_tables.compared(draws=400)
     ours, *others = rows.values()
     assert ours[2] < 1.1  # RMSE of the lag over its bound; 400 draws: standard error 3.5 %
     assert all(other[2] > 1.5 for other in others)

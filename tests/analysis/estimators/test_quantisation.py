@@ -1,9 +1,6 @@
 """Rounded channels: the step that is found, and intervals against planted truth."""
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
+import estimator_tables
 import numpy as np
 import pytest
 from scipy.special import stdtrit
@@ -18,9 +15,7 @@ from undulog.analysis.estimators.quantisation import lattice_step
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import ResidualBins, residual_spectrum
 
-DOCS = Path(__file__).parents[3] / "docs"
-TABLES = SimpleNamespace(**runpy.run_path(str(DOCS / "estimator_tables.py")))
-STEP = TABLES.STEP
+STEP = estimator_tables.STEP
 
 
 def turn(amplitude, count=500, phase=0.3):
@@ -66,22 +61,22 @@ def test_no_step_in_few_levels():
 )
 def test_intervals_of_rounded_channels(name):
     """500 draws: the standard error of the coverage is 1 %."""
-    covered, _, width = TABLES.rounded(**TABLES.ROUNDED[name], draws=500)
+    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], draws=500)
     assert np.all(covered > 0.91)
     assert np.all(width < 3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(TABLES.ROUNDED))
+@pytest.mark.parametrize("name", list(estimator_tables.ROUNDED))
 def test_intervals_of_all_rounded_cases(name):
-    covered, _, width = TABLES.rounded(**TABLES.ROUNDED[name], seed=2)
+    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], seed=2)
     assert np.all(covered > 0.91)
     assert np.all(width < 3)
 
 
 def test_the_residual_alone_does_not_show_the_error():
     """Else the rounding again would not be needed."""
-    assert np.all(TABLES.rounded(draws=100)[1] < 0.1)
+    assert np.all(estimator_tables.rounded(draws=100)[1] < 0.1)
 
 
 def test_noise_that_is_not_rounded_keeps_its_intervals():

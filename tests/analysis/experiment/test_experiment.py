@@ -3,21 +3,18 @@
 import dataclasses
 import json
 import math
-import runpy
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import undulog
+from support.analysed import experiment
 from undulog.analysis.present.text.experiment import render_experiment
 from undulog.analysis.session.runs import mirror_fault
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Plane
-
-experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
 EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")

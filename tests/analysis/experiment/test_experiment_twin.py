@@ -2,28 +2,26 @@
 
 import json
 import math
-import runpy
-from pathlib import Path
 
 import pytest
 
 import undulog
+from support import twin_chains
+from support.analysed import experiment
 from undulog.sim import load_scenario
 from undulog.sim.twin.recording import record
 
 pytestmark = pytest.mark.slow
 
-shared = runpy.run_path(str(Path(__file__).parents[1] / "twin_chains.py"))
-experiment = runpy.run_path(str(Path(__file__).parents[1] / "analysed.py"))["experiment"]
 
-ROBOT = shared["chain"](7, stall_torque=0.25)
+ROBOT = twin_chains.chain(7, stall_torque=0.25)
 """Four yaw joints in two mirror pairs."""
 
 WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}
 
 
 def wave(way="head-to-tail", noise=0.005, **tables):
-    return shared["wave"](
+    return twin_chains.wave(
         duration_s=8.0,
         settle_s=4.0,
         gait={"ramp_s": 1.0},

@@ -1,12 +1,9 @@
 """Generators with feedback, coupled by the body alone, do what open-loop kicks foretell."""
 
-import runpy
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-shared = runpy.run_path(str(Path(__file__).with_name("closed_loop.py")))
+from support import closed_loop
 
 pytestmark = pytest.mark.slow
 
@@ -14,9 +11,9 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("m", [5, 9, 13])
 def test_kicked_generators_relax_as_foretold(tmp_path, m):
     """Yaw joints in contact, 12 s after a kick, with nothing fitted."""
-    shared["write_chain"](tmp_path, m, 0.25)
-    experiment = shared["open_loop"](tmp_path, m)
-    found = shared["closed_loop"](tmp_path, experiment)
+    closed_loop.write_chain(tmp_path, m, 0.25)
+    experiment = closed_loop.open_loop(tmp_path, m)
+    found = closed_loop.closed_loop(tmp_path, experiment)
     kick = np.linalg.norm(found.off[0]) / m**0.5
     assert 0.08 < kick < 0.15  # evenly drawn up to 0.2 rad
     assert found.t_s[-1] > 11.5

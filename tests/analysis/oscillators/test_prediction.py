@@ -3,15 +3,17 @@
 import dataclasses
 import json
 import math
-import runpy
-from pathlib import Path
 
+import kick_tables
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import undulog
+from support import linear_chain
+from support.kick_runs import kicked
+from support.linear_chain import CHAIN, WAVE
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
 from undulog.analysis.experiment.kicks.prediction import closed_loop
 from undulog.analysis.oscillators.laplacian import of_deviations
@@ -19,22 +21,17 @@ from undulog.analysis.oscillators.predictions import path_laplacian
 from undulog.analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of
 from undulog.capture.common.errors import DataError, UsageError
 
-HERE = Path(__file__).parent
-tables = runpy.run_path(str(HERE.parents[2] / "docs" / "kick_tables.py"))
-scatter = runpy.run_path(str(HERE.parent / "kicks" / "test_scatter.py"))
-chain = runpy.run_path(str(HERE.parent / "linear_chain.py"))
-
 EPS = 0.3
 
 
 def measured(random=None, scatter_deg=0.0, m=5):
     """A kick experiment on a linear chain, analysed."""
-    H, c = tables["chain"](m)
-    experiment = scatter["kicked"](
+    H, c = kick_tables.chain(m)
+    experiment = kicked(
         random or np.random.default_rng(1),
         H,
         c,
-        tables["plan"](m),
+        kick_tables.plan(m),
         math.radians(scatter_deg),
         noise=1e-6 if scatter_deg == 0.0 else None,
     )
@@ -163,7 +160,7 @@ def test_what_can_not_be_predicted():
 def result(tmp_path_factory):
     """The result file of a kick experiment, and one of its sessions."""
     folder = tmp_path_factory.mktemp("kicked")
-    files = chain["kicked"](folder)
+    files = linear_chain.kicked(folder)
     words = ["analyse", *map(str, files), "-o", str(folder / "kicks.json")]
     assert undulog.run(words) == 0
     return folder / "kicks.json", files
@@ -177,8 +174,8 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
     assert undulog.run(["predict", *map(str, sessions), "--eps", "0.3", "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(found["J"], again["J"], atol=1e-12)
-    coupling = chain["CHAIN"] * chain["WAVE"][None, :] / (chain["CHAIN"] @ chain["WAVE"])[:, None]
-    felt = (chain["CHAIN"] @ chain["WAVE"]) / chain["WAVE"]
+    coupling = CHAIN * WAVE[None, :] / (CHAIN @ WAVE)[:, None]
+    felt = (CHAIN @ WAVE) / WAVE
     J = felt.real[:, None] * (coupling.real - np.eye(5)) - felt.imag[:, None] * coupling.imag
     np.testing.assert_allclose(found["J"], 0.3 * J, atol=0.02)
     output = tmp_path / "predicted.json"

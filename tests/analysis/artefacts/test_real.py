@@ -1,0 +1,121 @@
+"""A real joint whose reader was at fault: ArcSnake's joint 7, by both of its positions."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+
+from support.paths import ARCSNAKE
+from undulog.analysis.session.analyse import analyse_session
+from undulog.analysis.signals.stretch import Options
+from undulog.capture import Session, SessionWriter
+
+EPOCH_NS = 1_735_689_600_000_000_000
+GEAR = 22
+RUNS = [
+    ("joint7_no_load.csv", 10.25),
+    ("joint7_load_jointonly.csv", 10.25),
+    ("joint7_load_fullsegment_amp0.2pi.csv", 16.35),
+]
+
+
+def session_of(name, path):
+    """The joint's angle by its motor (wrapped and unwrapped) and as its reader told it."""
+    if not ARCSNAKE.exists():
+        pytest.skip(f"the ArcSnake data are not at {ARCSNAKE}")
+    raw = np.genfromtxt(ARCSNAKE / name, delimiter=",", names=True)
+    channels = {
+        "/wrapped": raw["s_pos"],
+        "/motor": np.unwrap(raw["s_pos"], period=4 * math.pi) / GEAR,
+        "/reader": raw["m_pos"] / GEAR,
+    }
+    with SessionWriter(path, session_id=name, epoch_ns=EPOCH_NS) as writer:
+        opened = {t: writer.joint_state(t, ["joint7"], unit="rad", velocity=True) for t in channels}
+        for k, t in enumerate(raw["time"]):
+            t_ns = EPOCH_NS + round(t * 1e9)
+            for topic, values in channels.items():
+                opened[topic].write(t_ns, values[k : k + 1], raw["speed"][k : k + 1])
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "period"), RUNS)
+def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path):
+    path = session_of(name, tmp_path / "joint7.mcap")
+
+    def analysed(topic, reference=None):
+        with Session.open(path) as session:
+            options = Options(response_topic=topic, reference_topic=reference)
+            return analyse_session(session, options)
+
+    def of_sensors(result):
+        return [one for one in result.artefacts if one.about == "sensor"]
+
+    motor = analysed("/motor", "/motor")
+    assert of_sensors(motor) == []
+    assert motor.gait.frequency_hz.value == pytest.approx(1 / period, rel=0.01)
+
+    (found,) = of_sensors(analysed("/reader", "/motor"))
+    assert (found.flag, found.quantity) == ("scale_mismatch", "position")
+    assert found.topic == "/reader"
+    told = float(found.note.split(" ")[0])
+    assert 0.87 < told < 0.91  # it tells about 10 % too little
+    (first, last) = found.spans_s[0][0], found.spans_s[-1][1]
+    with Session.open(path) as session:
+        assert last - first > 0.95 * session.duration_s
+
+    (found,) = of_sensors(analysed("/wrapped"))
+    assert (found.flag, found.note) == ("wrapped", "turn of 12.57 rad")
+    assert len(found.spans_s) >= 10
+
+
+SO101 = ARCSNAKE.with_name("so101") / "coupled_joints"
+JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+
+
+def rows(name, *columns):
+    """Times [ns] and vectors of one file of the SO-101."""
+    if not SO101.exists():
+        pytest.skip(f"the SO-101 data are not at {SO101}")
+    with (SO101 / name).open(newline="") as file:
+        read = list(csv.DictReader(file))
+    t_ns = [EPOCH_NS + round(float(row["timestamp"]) * 1e3) for row in read]
+    return t_ns, [np.array([json.loads(row[one]) for row in read]) for one in columns]
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    """The SO-101 with its six joints, analysed."""
+    path = tmp_path_factory.mktemp("so101") / "arm.mcap"
+    asked_ns, (asked,) = rows("control.csv", "positions")
+    seen_ns, seen = rows("state_motor.csv", "positions", "velocities", "torques")
+    with SessionWriter(path, session_id="so101", epoch_ns=EPOCH_NS) as writer:
+        command = writer.joint_state("/joint_commands", JOINTS, unit="rad")
+        state = writer.joint_state("/joint_states", JOINTS, unit="rad", velocity=True, effort=True)
+        for k, t_ns in enumerate(asked_ns):
+            command.write(t_ns, asked[k])
+        for k, t_ns in enumerate(seen_ns):
+            state.write(t_ns, *(one[k] for one in seen))
+    with Session.open(path) as session:
+        return analyse_session(session)
+
+
+def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
+    assert all(joint.gain.value is not None for joint in arm.joints)
+    wrong = {(one.joint, one.quantity, one.flag) for one in arm.artefacts if one.about == "sensor"}
+    assert wrong == {("Jaw", "velocity", "scale_mismatch")}  # by 2.343: of the data set itself
+
+
+def test_their_dead_bands_explain_their_gains(arm):
+    found = {joint.name: joint for joint in arm.joints if joint.dead_band is not None}
+    assert set(found) == set(JOINTS) - {"Jaw"}  # whose band is below four steps of its encoder
+    for joint in found.values():
+        band = joint.dead_band
+        for end in (band.top, band.bottom):
+            assert end.travel_ci95[0] < end.travel_rad < end.travel_ci95[1]
+            assert 0.2 < end.rest_s < 1.0
+        # Without its band each of these servos follows at full size.
+        assert joint.gain.value / band.gain_change == pytest.approx(1.0, abs=0.03)
+        assert 0 < band.lag_change_rad < joint.lag_rad.value

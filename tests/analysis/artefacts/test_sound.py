@@ -1,0 +1,56 @@
+"""Sound sessions of unusual motion: resonances and joints that hardly follow are no artefacts."""
+
+import numpy as np
+import pytest
+
+from support import planted_artefacts
+from support.planted_artefacts import DRIVEN, OMEGA
+
+TONES = OMEGA * np.array([1.0, 2.2, 3.4])
+"""As `undulog plan multisine` has them; their amplitudes are equal here."""
+
+
+def multisine(seed, steps, response):
+    """Tones in all driven joints at once, which answer by ``response(rng)``, over TONES each."""
+    snake = planted_artefacts.Snake(seed, steps)
+    command, position, velocity = (np.zeros_like(snake.command) for _ in range(3))
+    for j in DRIVEN:
+        c = 0.05 * np.exp(1j * snake.rng.uniform(-np.pi, np.pi, TONES.size))
+        wave = np.exp(1j * snake.t[:, None] * TONES)
+        a = response(snake.rng) * c
+        command[:, j] = (wave @ c).imag
+        position[:, j] = (wave @ a).imag
+        velocity[:, j] = (wave @ (1j * TONES * a)).imag
+    snake.command, snake.velocity = command, velocity + snake.rng.normal(0, 0.002, velocity.shape)
+    snake.position = snake.told(position + snake.rng.normal(0, 1e-4, position.shape))
+    return snake
+
+
+def resonance(rng):
+    """A light damping, and a frequency among the tones."""
+    w = TONES / (OMEGA * rng.uniform(1.3, 4.0))
+    return 1.0 / (1.0 - w**2 + 2j * rng.uniform(0.1, 0.3) * w)
+
+
+def hardly(rng):
+    """A small gain: a few steps of a coarse encoder."""
+    return rng.uniform(0.05, 0.3) * np.exp(-1j * rng.uniform(0.0, 0.5, TONES.size))
+
+
+@pytest.mark.parametrize("response", [resonance, hardly])
+@pytest.mark.parametrize("seed", range(6))
+def test_no_artefact_is_found(response, seed, tmp_path):
+    snake = multisine(seed, (2 * np.pi / 4096, 0.005), response)
+    assert planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap")) == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_joint_that_answers_upside_down_at_all_tones_is_told(seed, tmp_path):
+    snake = multisine(seed, (0.0,), lambda rng: rng.uniform(0.8, 1.1) * np.exp(-0.01j * TONES))
+    j = snake.joint()
+    snake.position[:, j] *= -1
+    snake.velocity[:, j] *= -1
+    (found,) = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
+    assert (found.joint, found.quantity) == (snake.robot.joint_names[j], "position")
+    assert found.flag == "wrong_sign"
+    assert found.spans_s == (pytest.approx((0.0, snake.t[-1])),)

@@ -1,0 +1,213 @@
+"""Sessions with kicks as one experiment: written to files, answered by a planted matrix."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import undulog
+from support.analysed import experiment
+from undulog.analysis.present.text.experiment import render_experiment
+from undulog.analysis.results.coupling import LocalCoupling
+from undulog.capture import SessionWriter
+
+EPOCH_NS = 1_735_689_600_000_000_000
+NAMES = ("j1", "j2", "j3", "j4", "j5")
+M = len(NAMES)
+BASE = 0.4 * np.exp(-1j * np.pi / 3 * np.arange(M))
+PLACE = np.arange(M)
+H = np.diag(np.full(M, 0.9 * np.exp(-0.3j))) + 0.12 * np.exp(
+    -np.abs(PLACE[:, None] - PLACE[None, :]) + 0.5j * PLACE[None, :]
+)
+TRUTH = H * BASE[None, :] / (H @ BASE)[:, None]
+SIGMA = 0.002
+
+
+def write_run(path, off, seed):
+    """Six cycles at 50 Hz, started at any time, without physics."""
+    rng = np.random.default_rng(seed)
+    command = BASE * np.exp(off + 1j * rng.uniform(-np.pi, np.pi))
+    answer = H @ command
+    with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad")
+        for k in range(300):
+            turn = np.exp(2j * np.pi * k / 50)
+            t_ns = EPOCH_NS + k * 20_000_000
+            commands.write(t_ns, np.real(command * turn))
+            states.write(t_ns, np.real(answer * turn) + rng.normal(0.0, SIGMA, M))
+    return path
+
+
+def deviations(*, amplitude=True, patterns=True):
+    found = {"run00": np.zeros(M, dtype=complex)}
+    for step in (0.05j, 0.05) if amplitude else (0.05j,):
+        for joint in range(M):
+            for sign in (1, -1):
+                off = np.zeros(M, dtype=complex)
+                off[joint] = sign * step
+                found[f"run{len(found):02d}"] = off
+    if patterns:
+        rng = np.random.default_rng(4)
+        for _ in range(2):
+            found[f"run{len(found):02d}"] = 1j * rng.uniform(-0.15, 0.15, M)
+    return found
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("kicks")
+    return {
+        name: write_run(folder / f"{name}.mcap", off, seed)
+        for seed, (name, off) in enumerate(deviations().items())
+    }
+
+
+@pytest.fixture(scope="module")
+def result(sessions):
+    return experiment(sessions.values())
+
+
+def test_the_matrices_are_those_planted(result):
+    coupling = result.coupling
+    assert isinstance(coupling, LocalCoupling)
+    assert coupling.identifiable
+    assert (coupling.base_runs, coupling.kicked_runs) == (1, 4 * M)
+    inside = 0
+    truths = (TRUTH.real, -TRUTH.imag, TRUTH.real, TRUTH.imag)
+    for matrix, truth in zip((coupling.P, coupling.R, coupling.G, coupling.S), truths, strict=True):
+        # A central difference of 0.05 keeps curvature of third order, 4e-4 here.
+        off = np.abs(np.array(matrix.value) - truth)
+        inside += np.sum(off <= np.array(matrix.ci95_half) + 5e-4)
+        assert off.max() < 5 * np.max(matrix.standard_error) + 5e-4
+    assert inside >= 0.9 * 4 * M * M
+    # sigma sqrt(2/N)/|a| a run, two runs a difference, over 0.1.
+    expected = SIGMA * math.sqrt(2 / 300) / np.abs(H @ BASE) * math.sqrt(2) / 0.1
+    ratio = np.mean(coupling.P.standard_error, axis=1) / expected
+    # Never below the noise within runs; above it by what nine combinations of runs tell.
+    assert ratio.min() > 0.7
+    assert ratio.max() < 2.0
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.25)
+    assert coupling.checks_pass
+    for rows, total in ((coupling.phase_rows, 1.0), (coupling.gain_rows, 0.0)):
+        assert all(row.expected == total for row in rows)
+        assert all(abs(row.total.value - total) < 5 * row.standard_error + 5e-4 for row in rows)
+
+
+def test_a_linear_chain_is_told_as_linear(result):
+    coupling = result.coupling
+    assert coupling.nonlinearity.value < 0.02
+    assert coupling.nonlinearity.ci95[0] == 0.0
+    assert coupling.lti.condition_number == pytest.approx(np.linalg.cond(H), rel=0.02)
+    error = 4 * np.max(coupling.P.standard_error)  # of P; |a_i / c_j| is about 1
+    np.testing.assert_allclose(np.array(coupling.lti.real), H.real, atol=error)
+    np.testing.assert_allclose(np.array(coupling.lti.imag), H.imag, atol=error)
+    X = np.linalg.inv(H)
+    off = X - np.diag(np.diag(X))
+    low, high = coupling.lti.asymmetry.ci95
+    assert low <= np.linalg.norm(off - off.T) / np.linalg.norm(off) <= high
+    near = np.triu(np.tril(off, 1), -1)
+    low, high = coupling.lti.within_1.ci95
+    assert low <= (np.linalg.norm(near) / np.linalg.norm(off)) ** 2 <= high
+
+
+def parts(value):
+    return value.real, value.imag
+
+
+def test_what_oscillators_would_do_on_this_body(result):
+    body = result.oscillators
+    truth = np.linalg.eigvals(np.eye(M) - TRUTH.real)
+    truth = truth[np.abs(truth) > 1e-9]
+    assert len(body.modes) == M - 1
+    # These rates lie close together: what holds of each is the level that noise allows.
+    grid = np.array(body.pseudospectrum.real), np.array(body.pseudospectrum.imag)
+    level = np.array(body.pseudospectrum.level)
+    for rate in truth:
+        k, q = (int(np.argmin(np.abs(x - at))) for x, at in zip(grid, parts(rate), strict=True))
+        off = abs(grid[0][k] - rate.real) + abs(grid[1][q] - rate.imag)
+        assert level[k, q] <= body.pseudospectrum.noise + off
+    assert body.slowest.value == min(mode.real.value for mode in body.modes)
+    relative = np.array(body.entrainment.value) - (np.linalg.inv(TRUTH.real) - np.eye(M))
+    half = np.array(body.entrainment.ci95_half) + 1e-3
+    assert np.mean(np.abs(relative) <= half) >= 0.84  # 25 of 95 %: 3 standard deviations below
+    assert body.entrainment.condition_number == pytest.approx(np.linalg.cond(TRUTH.real), rel=0.05)
+    assert level.shape == (len(body.pseudospectrum.real), len(body.pseudospectrum.imag))
+    assert "explicit coupling" in body.answer
+    text = render_experiment(result)
+    assert f"Oscillators that feel their servos: {body.answer}." in text.splitlines()
+    assert json.dumps(result.to_dict()["oscillators"], allow_nan=False)
+
+
+def test_held_out_runs_are_predicted(result):
+    coupling = result.coupling
+    assert [one.session for one in coupling.held_out] == ["run21.mcap", "run22.mcap"]
+    for one in coupling.held_out:
+        assert 2 * one.error < one.error_kept
+        assert 0.05 < one.size <= 0.2
+    assert coupling.valid_to == max(one.size for one in coupling.held_out)
+
+
+def test_roles_warnings_and_text(result, sessions):
+    assert [run.role for run in result.runs] == ["base"] + ["kick"] * 4 * M + ["held-out"] * 2
+    assert all(run.why is None for run in result.runs)
+    assert result.warnings == ()
+    assert result.reversal is None
+    text = render_experiment(result).splitlines()
+    assert text[0].startswith("23 sessions: coupling around this gait: j")
+    assert "nonlinearity" in text[0]
+    assert any("Time shift: rows of P sum to 1" in line and "pass" in line for line in text)
+    assert any("condition number" in line and "linear time-invariant" in line for line in text)
+    assert any(line.startswith("Valid for deviations up to 0.") for line in text)
+    method = "Method: local kicks, 20 runs around 1 without a kick"
+    assert any(line.startswith(method) for line in text)
+
+
+def test_the_json_object(sessions, capsys):
+    assert undulog.run(["analyse", *map(str, sessions.values()), "--json"]) == 0
+    coupling = json.loads(capsys.readouterr().out)["coupling"]
+    assert coupling["identifiable"] is True
+    assert coupling["record"] is None
+    assert coupling["matrix"] == coupling["P"]["value"]
+    assert coupling["condition_number"] == coupling["lti"]["condition_number"]
+    for name in "PRGS":
+        for field in ("value", "standard_error", "ci95_half"):
+            assert np.shape(coupling[name][field]) == (M, M)
+
+
+def test_the_order_of_the_files_does_not_matter(result, sessions):
+    paths = list(sessions.values())
+    again = experiment(paths[::-1]).coupling
+    np.testing.assert_allclose(again.P.value, result.coupling.P.value, atol=1e-9)
+    assert again.checks_pass
+
+
+def test_phase_kicks_alone_give_p_and_r(sessions):
+    paths = list(sessions.values())[: 1 + 2 * M]
+    result = experiment(paths)
+    coupling = result.coupling
+    assert coupling.identifiable
+    assert (coupling.G, coupling.S, coupling.nonlinearity.value) == (None, None, None)
+    assert any("G, S and the nonlinearity are null" in one for one in result.warnings)
+    assert any("record held-out runs" in one for one in result.warnings)
+    assert json.dumps(result.to_dict(), allow_nan=False)
+
+
+def test_one_sided_kicks_are_not_identifiable(sessions):
+    paths = list(sessions.values())
+    result = experiment([*paths[:4], *paths[5 : 1 + 2 * M]])
+    coupling = result.coupling
+    assert not coupling.identifiable
+    assert coupling.matrix is None
+    assert "kicked is j2 only up" in coupling.why
+    assert "phase-kicks around this gait" in coupling.record
+    assert result.answer.startswith("coupling not identifiable from these kicks: central")
+    assert any("Coupling: not identifiable" in x for x in render_experiment(result).splitlines())
+
+
+def test_runs_of_one_gait_stay_not_identifiable(sessions):
+    coupling = experiment(list(sessions.values())[:1]).coupling
+    assert not coupling.identifiable
+    assert not isinstance(coupling, LocalCoupling)
+    assert "one gait gives 5 complex numbers for 25 unknown couplings" in coupling.why

@@ -1,0 +1,145 @@
+"""Sessions whose joints run at several frequencies: numbers, text, page and experiments."""
+
+import json
+
+import numpy as np
+import pytest
+
+import undulog
+from support.analysed import analysed, experiment
+from undulog.analysis.present.notebook.files import load
+from undulog.capture import SessionWriter
+
+EPOCH_NS = 1_735_689_600_000_000_000
+RATE = 50
+
+
+def write(path, omegas, group, waves, modules, *, seconds=15.0, seed=0, sigma=0.002):
+    """A chain of linear joints, each at the frequency of its group, that hold on to neighbours."""
+    rng = np.random.default_rng(seed)
+    count = len(group)
+    names = [f"joint{k + 1:02d}" for k in range(count)]
+    place = np.arange(count)
+    body = 0.1 * np.exp(-np.abs(place[:, None] - place) + 0.5j) * (1 - np.eye(count))
+    epoch_ns = EPOCH_NS + seed * 60_000_000_000
+    with SessionWriter(path, session_id=path.stem, epoch_ns=epoch_ns) as writer:
+        commands = writer.joint_state("/joint_commands", names, unit="rad")
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        for k in range(round(seconds * RATE)):
+            turned = [waves * np.exp(1j * omega * k / RATE) for omega in omegas]
+            command = sum(np.where(group == g, one, 0) for g, one in enumerate(turned))
+            answer = modules * ((0.95 * np.exp(-0.2j)) * command + body @ command)
+            t_ns = epoch_ns + k * 20_000_000
+            commands.write(t_ns, np.real(command))
+            states.write(t_ns, np.real(answer) + sigma * rng.normal(size=count))
+    return path
+
+
+@pytest.fixture(scope="module")
+def slither(tmp_path_factory):
+    """16 joints, odd ones at 1.432 Hz, even ones at 0.954 Hz."""
+    path = tmp_path_factory.mktemp("slither") / "slither.mcap"
+    group = np.arange(16) % 2
+    waves = 0.4 * np.exp(-0.8j * np.arange(16))
+    omegas = 2 * np.pi * np.array([1.432, 0.954])
+    return write(path, omegas, group, waves, np.ones(16))
+
+
+def test_every_joint_is_compared_at_its_own_frequency(slither):
+    result = analysed(slither)
+    assert [len(one.joints) for one in result.gait.groups] == [8, 8]
+    found = {one.joints[0]: one for one in result.gait.groups}
+    for joint, frequency in (("joint01", 1.432), ("joint02", 0.954)):
+        group = found[joint]
+        assert group.frequency_hz.value == pytest.approx(frequency, rel=1e-9)
+        (window,) = group.windows
+        assert window.cycles == np.floor(15.0 * frequency)
+        assert group.wave == "head-to-tail"
+        assert group.lag_per_joint_rad == {"chain": pytest.approx(-1.6)}
+    assert result.gait.frequency_hz == result.gait.groups[0].frequency_hz
+    for joint in result.joints:
+        own = result.gait.groups[joint.group]
+        assert joint.name in own.joints
+        assert joint.frequency_hz == own.frequency_hz.value
+        # Its own command and, at its frequency, its group's other joints through the body.
+        assert joint.gain.value == pytest.approx(0.95, abs=0.05)
+        assert joint.lag_rad.value == pytest.approx(0.2, abs=0.05)
+        assert joint.lag_rad.ci95[1] - joint.lag_rad.ci95[0] < np.radians(0.2)
+    assert {"gain_cv_group0", "gain_cv_group1"} <= set(result.heterogeneity)
+    assert "gain_cv" not in result.heterogeneity
+    assert all(
+        result.heterogeneity[f"{kind}_group{k}"].value is not None
+        for kind in ("gain_cv", "lag_sd", "boundary_contrast_lag")
+        for k in (0, 1)
+    )
+
+
+def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, capsys):
+    assert undulog.run(["analyse", str(slither)]) == 0
+    text = capsys.readouterr().out
+    assert "1.432" in text
+    assert "0.954" in text
+    assert "(8 joints)" in text
+    assert "falls on" in text  # 3 x 0.954 Hz - 1.432 Hz within 1.5/T of 1.432 Hz
+    file = tmp_path / "result.json"
+    assert undulog.run(["analyse", str(slither), "-o", str(file)]) == 0
+    data = json.loads(file.read_text())
+    first = data["gait"]["groups"][0]
+    assert first["frequency_hz"] == data["gait"]["frequency_hz"]
+    assert first["frequency_ci95"] == data["gait"]["frequency_ci95"]
+    assert {joint["group"] for joint in data["joints"]} == {0, 1}
+    assert load(file).gait == analysed(slither).gait
+    page = tmp_path / "page.html"
+    capsys.readouterr()
+    assert undulog.run(["report", str(slither), "-o", str(page)]) == 0
+    html = page.read_text()
+    assert "frequency [Hz]" in html
+    assert "(8 joints)" in html
+
+
+def runs(folder, *, weak, apart=False):
+    """A chain of 9: every other joint at 0.8 Hz, the rest at 0.5 Hz; six runs each way.
+
+    The groups are their own mirror images. Joint 3 is weak; where ``apart``, only one group turns.
+    """
+    group = np.arange(9) % 2
+    modules = np.ones(9, dtype=complex)
+    modules[2] = weak
+    omegas = 2 * np.pi * np.array([0.8, 0.5])
+    paths = []
+    for k in range(6):
+        for way in (-1, 1):
+            turns = np.where((group == 1) & apart, -1, way)
+            waves = 0.4 * np.exp(0.7j * turns * np.arange(9)) * np.where(group == 1, 1j**k, 1)
+            path = folder / f"{k}{'+' if way > 0 else '-'}.mcap"
+            paths.append(write(path, omegas, group, waves, modules, seed=len(paths), sigma=0.003))
+    return paths
+
+
+def test_the_reversal_takes_all_groups_together(tmp_path):
+    result = experiment(runs(tmp_path, weak=0.95 * np.exp(-0.03j)))
+    assert result.reversal is not None
+    assert result.reversal.p < 0.01
+    assert [one.name for one in result.reversal.joints][:4] == [f"joint0{k}" for k in range(1, 5)]
+    assert min(result.reversal.joints, key=lambda one: one.p).name in ("joint03", "joint07")
+
+
+def test_a_reversal_of_one_group_only_is_none(tmp_path):
+    result = experiment(runs(tmp_path, weak=1.0, apart=True))
+    assert result.reversal is None
+    assert any("in some groups only" in text for text in result.warnings)
+
+
+def test_compared_at_their_own_frequencies(tmp_path, capsys):
+    group = np.arange(8) // 4
+    omegas = 2 * np.pi * np.array([0.8, 0.5])
+    waves = 0.4 * np.exp(-0.8j * np.arange(8))
+    weak = np.where(np.arange(8) == 6, 0.8, 1.0)
+    a = write(tmp_path / "a.mcap", omegas, group, waves, np.ones(8), seed=1)
+    b = write(tmp_path / "b.mcap", omegas, group, waves * np.where(group, 1j, 1), weak, seed=2)
+    file = tmp_path / "c.json"
+    assert undulog.run(["compare", str(a), str(b), "-o", str(file)]) == 0
+    assert "joint07" in capsys.readouterr().out
+    slow = write(tmp_path / "slow.mcap", 0.99 * omegas, group, waves, weak, seed=3)
+    assert undulog.run(["compare", str(a), str(slow)]) == 1
+    assert "Hz" in capsys.readouterr().err

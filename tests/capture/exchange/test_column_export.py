@@ -1,0 +1,230 @@
+"""Joint columns for pandas: read by pandas and pyarrow, held against the session's own reader."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import undulog
+from support.paths import TRACE as RECORDING
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.common.errors import (
+    DataError,
+    LogWriteError,
+    MissingChannelError,
+    MissingExtraError,
+    UsageError,
+)
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.column_export import TABLE_FORMATS, export_columns
+from undulog.capture.exchange.column_map import column_map_from_options
+from undulog.capture.exchange.csv_import import import_csv
+
+S = 1_000_000_000
+T0 = 1_700_000_000 * S
+NAMES = ("joint01", "joint02", "joint03")
+READ = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
+
+
+@pytest.fixture(scope="module")
+def polled(tmp_path_factory):
+    """Three joints asked in turn, 2 ms apart, every 10 ms; one misses some rounds."""
+    path = tmp_path_factory.mktemp("polled") / "run.mcap"
+    rng = np.random.default_rng(2)
+    with SessionWriter(path, session_id="s", epoch_ns=T0) as writer:
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
+        offsets = writer.joint_state("/joint_sample_offset", NAMES, unit="s")
+        current = writer.joint_state("/joint_current", NAMES, unit="A")
+        gait = writer.joint_state("/gait", ["horizontal.A"], unit="")
+        for k in range(200):
+            t_ns = T0 + k * 10_000_000
+            position = rng.normal(size=3)
+            if k % 50 == 7:
+                position[1] = np.nan
+            offsets.write(t_ns, [0.0, 0.002, 0.004 + 1e-9 * k])
+            states.write(t_ns, position, rng.normal(size=3) * 1e-12)
+            current.write(t_ns, rng.normal(size=3))
+            gait.write(t_ns, [0.4])
+    return path
+
+
+def assert_same_samples(table, session, topic, field, column):
+    signals = session.joints(topic, field)
+    rows = table[table["topic"] == topic]
+    assert len(rows) == sum(map(len, signals.t_ns))
+    assert (np.diff(rows["t_ns"]) >= 0).all()
+    for name, t_ns, values in zip(signals.names, signals.t_ns, signals.values, strict=True):
+        own = rows[rows["joint"] == name]
+        np.testing.assert_array_equal(own["t_ns"], t_ns)
+        np.testing.assert_array_equal(own[column], values)  # bit for bit, NaN where NaN
+    assert table[column][table["topic"] != topic].isna().all()
+
+
+@pytest.mark.parametrize("rows_per_block", [100_000, 10])
+@pytest.mark.parametrize("suffix", TABLE_FORMATS)
+def test_each_sample_has_a_row_at_its_own_time(
+    suffix, rows_per_block, polled, tmp_path: Path, monkeypatch
+):
+    monkeypatch.setattr("undulog.capture.exchange.column_export._ROWS_PER_BLOCK", rows_per_block)
+    output = tmp_path / f"x{suffix}"
+    report = export_columns(polled, output)
+    assert report.rows == {"/joint_states": 600, "/joint_current": 600}
+    assert report.warnings == []
+    table = READ[suffix](output)
+    assert list(table.columns) == report.columns
+    assert report.columns == [
+        "t_ns",
+        "topic",
+        "joint",
+        "joint_states.position [rad]",
+        "joint_states.velocity [rad/s]",
+        "joint_current [A]",
+    ]
+    assert table["t_ns"].dtype == np.int64
+    with Session.open(polled) as session:
+        for topic, field, column in (
+            ("/joint_states", "position", "joint_states.position [rad]"),
+            ("/joint_states", "velocity", "joint_states.velocity [rad/s]"),
+            ("/joint_current", "position", "joint_current [A]"),
+        ):
+            assert_same_samples(table, session, topic, field, column)
+    first = table[table["topic"] == "/joint_states"].head(3)
+    assert first["joint"].tolist() == list(NAMES)
+    assert (first["t_ns"] - T0).tolist() == [0, 2_000_000, 4_000_000]
+
+
+def test_topics_can_be_chosen(polled, tmp_path: Path):
+    report = export_columns(polled, tmp_path / "x.csv", topics=["/gait", "/joint_current", "/gait"])
+    assert report.rows == {"/gait": 200, "/joint_current": 600}
+    table = pd.read_csv(tmp_path / "x.csv")
+    assert set(table["joint"][table["topic"] == "/gait"]) == {"horizontal.A"}
+    with pytest.raises(MissingChannelError, match="has no /no; it has /gait, /joint_current"):
+        export_columns(polled, tmp_path / "y.csv", topics=["/no"])
+    with SessionWriter(tmp_path / "t.mcap", session_id="s", epoch_ns=T0) as writer:
+        writer.string("/gait/mode").write(T0, "walk")
+    with pytest.raises(DataError, match="/gait/mode is std_msgs/msg/String, not"):
+        export_columns(tmp_path / "t.mcap", tmp_path / "y.csv", topics=["/gait/mode"])
+    with pytest.raises(MissingChannelError, match="has no joint topics; it has /gait/mode"):
+        export_columns(tmp_path / "t.mcap", tmp_path / "y.csv")
+    assert not (tmp_path / "y.csv").exists()
+
+
+@pytest.mark.parametrize("suffix", TABLE_FORMATS)
+def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
+    # One message a servo, some without velocity: the fields don't share times.
+    from mcap.writer import Writer
+
+    from undulog.capture.log.messages.cdr import encode
+    from undulog.capture.log.messages.schemas import message_type, schema_text
+
+    kind = message_type("sensor_msgs/msg/JointState")
+    with (tmp_path / "run.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(kind.name, "ros2msg", schema_text(kind.name).encode())
+        channel = writer.register_channel("/servo/states", "cdr", schema)
+        for k in range(40):
+            t_ns = T0 + k * 1_000_000
+            values = {
+                "header": {"stamp": {"sec": t_ns // S, "nanosec": t_ns % S}},
+                "name": [f"servo{k % 2}"],
+                "position": [k * 0.1],
+                "velocity": [k * 0.2] if k % 4 < 2 else [],
+            }
+            writer.add_message(channel, t_ns, encode(kind, values), t_ns)
+        writer.finish()
+    report = export_columns(tmp_path / "run.mcap", tmp_path / f"x{suffix}")
+    assert report.rows == {"/servo/states": 60}
+    table = READ[suffix](tmp_path / f"x{suffix}")
+    position = table.dropna(subset=["servo/states.position [rad]"])
+    assert position["servo/states.position [rad]"].tolist() == [k * 0.1 for k in range(40)]
+    assert (position["t_ns"] - T0).tolist() == [k * 1_000_000 for k in range(40)]
+    velocity = table.dropna(subset=["servo/states.velocity [rad/s]"])
+    assert velocity["joint"].tolist() == ["servo0", "servo1"] * 10
+    expected = [k * 0.2 for k in range(40) if k % 4 < 2]
+    assert velocity["servo/states.velocity [rad/s]"].tolist() == expected
+
+
+def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path: Path):
+    import pyarrow.parquet as pq
+
+    export_columns(polled, tmp_path / "x.parquet")
+    table = pq.read_table(tmp_path / "x.parquet")
+    assert [str(kind) for kind in table.schema.types[:4]] == [
+        "int64",
+        *["dictionary<values=string, indices=int32, ordered=0>"] * 2,
+        "double",
+    ]
+    assert table["joint_states.position [rad]"].null_count == 600 + 4
+
+
+def test_a_csv_of_one_joint_can_be_imported_again(tmp_path: Path):
+    if not RECORDING.exists():
+        pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
+    robot = load_robot("arcsnake-joint")
+    import_can(RECORDING, tmp_path / "run.mcap", robot)
+    report = export_columns(tmp_path / "run.mcap", tmp_path / "all.csv")
+    table = pd.read_csv(tmp_path / "all.csv")
+    with Session.open(tmp_path / "run.mcap") as session:
+        assert sum(report.rows.values()) == len(table)
+        for topic, column in zip(report.rows, report.columns[3:], strict=True):
+            assert_same_samples(table, session, topic, "position", column)
+        states = session.joints("/joint_states").signal("joint01")
+    export_columns(tmp_path / "run.mcap", tmp_path / "x.csv", topics=["/joint_states"])
+    options = ["t_ns=time:ns", "joint_states.position [rad]=joint01.position:rad"]
+    import_csv(
+        tmp_path / "x.csv", tmp_path / "back.mcap", robot, column_map_from_options(options, robot)
+    )
+    with Session.open(tmp_path / "back.mcap") as session:
+        back = session.joints("/joint_states").signal("joint01")
+    np.testing.assert_array_equal(back.t_ns, states.t_ns)
+    np.testing.assert_array_equal(back.values, states.values)
+
+
+def test_the_verb(polled, tmp_path: Path, capsys):
+    output = tmp_path / "x.csv"
+    arguments = ["log", "export", str(polled), "-o", str(output)]
+    assert undulog.run(arguments) == 0
+    assert capsys.readouterr().out == f"{output}: 1200 rows of /joint_states, /joint_current\n"
+    assert undulog.run(arguments) == 2
+    assert "x.csv exists already" in capsys.readouterr().err
+    assert undulog.run([*arguments, "--force", "--json", "--topics", "/gait"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["rows"], said["topics"], said["warnings"]) == (200, {"/gait": 200}, [])
+    assert undulog.run([*arguments, "--force", "--bus", "can0"]) == 2
+    assert "--bus is for CAN frames; a .csv file has joint columns" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_named(polled, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtraError):
+        export_columns(polled, tmp_path / "x.parquet")
+    assert undulog.run(["log", "export", str(polled), "-o", str(tmp_path / "x.parquet")]) == 2
+    assert "a .parquet table needs the package pyarrow" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_fails_leaves_nothing_behind(polled, tmp_path: Path, monkeypatch):
+    for suffix in TABLE_FORMATS:
+        output = tmp_path / f"x{suffix}"
+        output.write_text("precious")
+        with pytest.raises(UsageError, match="exists already"):
+            export_columns(polled, output)
+        stop = StopRequest()
+        stop.signal = 15
+        with pytest.raises(LogWriteError, match="stopped on request"):
+            export_columns(polled, output, force=True, stop=stop)
+        with monkeypatch.context() as patch:
+            patch.setattr("undulog.capture.exchange.column_export._sorted_blocks", full_disk)
+            with pytest.raises(LogWriteError, match="can't be written: No space left"):
+                export_columns(polled, output, force=True)
+        assert output.read_text() == "precious"
+    assert len(list(tmp_path.iterdir())) == len(TABLE_FORMATS)
+
+
+def full_disk(*_):
+    raise OSError(28, "No space left on device")

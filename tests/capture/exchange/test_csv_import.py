@@ -1,0 +1,258 @@
+"""CSV logs by a column map: real joint recordings, and every kind of fault."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.paths import ARCSNAKE
+from undulog.capture import Session, load_robot
+from undulog.capture.common.errors import FaultyFileError, ImportFormatError, UsageError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.exchange.column_map import column_map_from_options, read_column_map
+from undulog.capture.exchange.csv_import import import_csv, is_frame_csv
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
+
+GEAR = 22
+JOINT7 = f"""
+[time]
+column = "time"
+unit = "s"
+
+[[columns]]
+column = "s_pos"
+joint = "joint01"
+quantity = "position"
+unit = "rad"
+wrap = {4 * math.pi!r}
+scale = {1 / GEAR!r}
+
+[[columns]]
+column = "torque"
+joint = "joint01"
+quantity = "current"
+unit = "A"
+"""
+
+
+def load(path, name, tmp_path, toml=JOINT7):
+    (tmp_path / "map.toml").write_text(toml)
+    robot = load_robot("arcsnake-joint")
+    output = tmp_path / "run.mcap"
+    report = import_csv(path / name, output, robot, read_column_map(tmp_path / "map.toml", robot))
+    return report, output
+
+
+@pytest.mark.skipif(not ARCSNAKE.exists(), reason=f"the ArcSnake data are not at {ARCSNAKE}")
+@pytest.mark.parametrize(
+    ("name", "period", "amplitude"),
+    [
+        ("joint7_no_load.csv", 10.25, 0.3 * math.pi),
+        ("joint7_load_jointonly.csv", 10.25, 0.3 * math.pi),
+        ("joint7_load_fullsegment_amp0.2pi.csv", 16.35, 0.2 * math.pi),
+    ],
+)
+def test_the_arcsnake_joint_becomes_a_smooth_slow_sine(name, period, amplitude, tmp_path: Path):
+    raw = np.genfromtxt(ARCSNAKE / name, delimiter=",", names=True)
+    assert np.abs(np.diff(raw["s_pos"])).max() > 12  # it does wrap around
+    report, output = load(ARCSNAKE, name, tmp_path)
+    assert report.verdict == "good"
+    with Session.open(output) as session:
+        angle = session.joints("/joint_states").signal("joint01")
+        current = session.joints("/joint_current").signal("joint01")
+        assert session.attachments["columns.toml"].decode().startswith('delimiter = ","')
+    np.testing.assert_array_equal(angle.t_ns - RELATIVE_EPOCH_NS, np.rint(raw["time"] * 1e9))
+    np.testing.assert_allclose(current.values, raw["torque"])
+    # Smooth: no step is more than the joint can do in one sample, and the sine that the authors
+    # drove (its amplitude is in a file's name) is all but 0.2 % of the variance.
+    assert np.abs(np.diff(angle.values)).max() < 0.01
+    t = (angle.t_ns - angle.t_ns[0]) * 1e-9
+    wave = [np.sin(2 * np.pi * t / period), np.cos(2 * np.pi * t / period)]
+    basis = np.stack([np.ones_like(t), t, *wave], axis=1)
+    parts, (misfit,), *_ = np.linalg.lstsq(basis, angle.values)
+    assert misfit < 0.002 * np.var(angle.values) * len(t)
+    assert np.hypot(*parts[2:]) == pytest.approx(amplitude, rel=0.005)
+    # Whole periods of the wrap, and nothing else, were added to the cells.
+    added = (angle.values * GEAR - raw["s_pos"]) / (4 * np.pi)
+    np.testing.assert_allclose(added, np.rint(added), atol=1e-9)
+
+
+def csv_file(tmp_path, text):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    return path
+
+
+def run(tmp_path, text, *options, robot="snake13"):
+    described = load_robot(robot)
+    source = csv_file(tmp_path, text)
+    column_map = column_map_from_options(("t=time:s", *options), described)
+    return import_csv(source, tmp_path / "run.mcap", described, column_map)
+
+
+def test_columns_of_several_joints_and_quantities(tmp_path: Path):
+    report = run(
+        tmp_path,
+        "t,a2,a1,v2,cmd,T\n0.00,20,10,1,5,293.15\n0.01,,11,,6,\n0.02,,,,7,294.15\n",
+        "a2=joint02.position:deg",
+        "a1=joint01.position:deg,scale=-2,offset=1",
+        "v2=joint02.velocity:rpm",
+        "cmd=joint03.command:deg",
+        "T=joint02.temperature:K",
+    )
+    assert report.samples == {"/joint_commands": 3, "/joint_states": 2, "/joint_temperature": 2}
+    assert report.notes == [
+        "column 'a2': 2 cells without a value",
+        "column 'a1': 1 cells without a value",
+        "column 'v2': 2 cells without a value",
+        "column 'T': 1 cells without a value",
+    ]
+    with Session.open(tmp_path / "run.mcap") as session:
+        states = session.joints("/joint_states")
+        assert states.names == ("joint01", "joint02")
+        np.testing.assert_allclose(states.values[0], np.radians([-19, -21]))
+        np.testing.assert_allclose(states.values[1], [math.radians(20), np.nan])
+        velocity = session.joints("/joint_states", "velocity")
+        np.testing.assert_allclose(velocity.values[1], [2 * math.pi / 60, np.nan])
+        assert np.isnan(velocity.values[0]).all()
+        temperature = session.joints("/joint_temperature").signal("joint02")
+        np.testing.assert_allclose(temperature.values, [20, 21])
+        assert (temperature.t_ns - RELATIVE_EPOCH_NS).tolist() == [0, 20_000_000]
+        assert session.joints("/joint_commands").names == ("joint03",)
+
+
+def test_velocity_without_position_has_its_own_topic(tmp_path: Path):
+    report = run(tmp_path, "t,v\n0,1\n", "v=joint01.velocity:rad/s")
+    assert report.samples == {"/joint_velocity": 1}
+
+
+def test_unix_times_are_kept_to_the_nanosecond(tmp_path: Path):
+    run(tmp_path, "t,a\n1717639553.000000123,1\n1717639553.000000124,1\n", "a=joint01.position:rad")
+    with Session.open(tmp_path / "run.mcap") as session:
+        t_ns = session.joints("/joint_states").t_ns[0].tolist()
+    assert t_ns == [1717639553_000000123, 1717639553_000000124]
+
+
+def test_unwrapping_passes_over_gaps(tmp_path: Path):
+    run(
+        tmp_path,
+        "t,a\n0,170\n1,\n2,-170\n3,-150\n",
+        "a=joint01.position:deg,wrap=360,scale=0.5",
+    )
+    with Session.open(tmp_path / "run.mcap") as session:
+        values = session.joints("/joint_states").values[0]
+    np.testing.assert_allclose(np.degrees(values[~np.isnan(values)]), [85, 95, 105])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,a\n0,1\n1,x\n", "log.csv: row 3, column 'a': 'x' is not a number"),
+        ("t,a\n0,1\n1,inf\n", "log.csv: row 3, column 'a': 'inf' is not a finite number"),
+        ("t,a\nnow,1\n", "log.csv: row 2, column 't': 'now' is not a time"),
+        ("t,a\nnan,1\n", "log.csv: row 2, column 't': 'nan' is not a time"),
+        ("t,a\n1,1\n0.5,1\n", "log.csv: row 3, column 't': time goes back, from 1"),
+        ("t,a\n0,1,2\n", "log.csv: row 2 has 3 cells, the header 2"),
+        ("t,A1,b\n0,1,2\n", "log.csv: has no column 'a'; it has t, A1, b"),
+        ("t,a,a\n0,1,2\n", "log.csv: has 2 columns 'a'; it has t, a, a"),
+        ("t,a\n", "log.csv: has no rows below its header"),
+        ("", "log.csv: has no column 't'; it has none"),
+    ],
+)
+def test_faults_of_a_log_name_file_row_and_column(text, message, tmp_path: Path):
+    with pytest.raises(ImportFormatError) as caught:
+        run(tmp_path, text, "a=joint01.position:rad")
+    assert str(caught.value).endswith(message) or message in str(caught.value)
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_all_faults_of_a_map_are_listed(tmp_path: Path):
+    path = tmp_path / "map.toml"
+    path.write_text(
+        """
+delimiter = "|"
+[time]
+column = "t"
+unit = "min"
+[[columns]]
+column = "a"
+joint = "joint99"
+quantity = "positon"
+unit = "deg"
+[[columns]]
+column = "b"
+joint = "joint01"
+quantity = "velocity"
+unit = "deg"
+wrap = -1
+gain = 2
+"""
+    )
+    with pytest.raises(FaultyFileError) as caught:
+        read_column_map(path, load_robot("arcsnake-joint"))
+    assert [str(fault) for fault in caught.value.faults] == [
+        r'delimiter: found "|"; valid: "," ";" "\t" " "',
+        'time.unit: found "min"; valid: s, ms, us, ns',
+        'columns[0].joint: found "joint99"; valid: joint01 (did you mean joint01?)',
+        (
+            'columns[0].quantity: found "positon"; valid: command, position, velocity, effort, '
+            "current, voltage, temperature (did you mean position?)"
+        ),
+        (
+            'columns[1].unit: found "deg"; valid: for velocity: rad/s, deg/s, rev/s, rpm '
+            "(did you mean deg/s?)"
+        ),
+        "columns[1].wrap: found -1; valid: a finite number > 0",
+        (
+            "columns[1].gain: found an unknown key; valid: column, joint, quantity, unit, wrap, "
+            "scale, offset"
+        ),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("a", "--map 'a' is not of the form COLUMN=time:UNIT or COLUMN=JOINT.QUANTITY:UNIT"),
+        ("a=joint01:rad", "is not of the form"),
+        ("a=joint01.position", "is not of the form"),
+        ("a=joint01.position:rad,wrap", "'wrap' is not KEY=NUMBER"),
+        ("a=joint01.position:rad,wrap=x", "'wrap=x' is not KEY=NUMBER"),
+        ("a=joint1.position:rad", 'columns[0].joint: found "joint1"'),
+        ("a=joint01.position:m", 'columns[0].unit: found "m"; valid: for position: rad'),
+        ("a=joint01.range:m", 'columns[0].quantity: found "range"'),
+    ],
+)
+def test_faults_of_options(option, message):
+    with pytest.raises(UsageError) as caught:
+        column_map_from_options(("t=time:s", option), load_robot("snake13"))
+    assert message in str(caught.value)
+
+
+def test_options_and_file_say_the_same(tmp_path: Path):
+    robot = load_robot("snake13")
+    options = column_map_from_options(
+        ("t [s]=time:ms", "a=b=joint01.position:deg,wrap=360,scale=0.5,offset=-1"), robot
+    )
+    assert options.columns[0].column == "a=b"
+    (tmp_path / "map.toml").write_text(options.toml())
+    assert read_column_map(tmp_path / "map.toml", robot) == options
+
+
+def test_a_csv_of_can_frames_is_told_from_others(tmp_path: Path):
+    header = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
+    assert is_frame_csv(csv_file(tmp_path, header))
+    assert not is_frame_csv(csv_file(tmp_path, "time,a\n"))
+
+
+def test_a_stopped_import_leaves_a_whole_file(tmp_path: Path):
+    robot = load_robot("snake13")
+    source = csv_file(tmp_path, "t,a\n" + "".join(f"{i},1\n" for i in range(10_000)))
+    stop = StopRequest()
+    stop.signal = 2
+    column_map = column_map_from_options(("t=time:ms", "a=joint01.position:rad"), robot)
+    report = import_csv(source, tmp_path / "run.mcap", robot, column_map, stop=stop)
+    assert (report.complete, report.verdict) == (False, "degraded")
+    with Session.open(tmp_path / "run.mcap") as session:
+        assert session.warnings == []

@@ -1,0 +1,420 @@
+"""Traces for other tools: back through the import, and through readers of other makes."""
+
+import itertools
+import json
+import struct
+import zlib
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+import undulog
+from support.paths import TRACE as RECORDING
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.common.errors import LogWriteError, UsageError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.log_export import export_log
+from undulog.capture.log.messages.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    REMOTE_FLAG,
+    empty_frames,
+)
+
+S = 1_000_000_000
+T0 = 1_700_000_003_250_000_000
+CAN_MSGS_FRAME = (
+    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\n"
+    "uint8 dlc\nuint8[8] data\n"
+)
+
+
+def every_kind(step_ns=1_000_000, start_ns=T0):
+    """Each identifier, kind, way and length that classic CAN has, one frame a step."""
+    rng = np.random.default_rng(3)
+    kinds = list(
+        itertools.product(
+            (0x000, 0x14B, 0x7FF, EXTENDED_FLAG, EXTENDED_FLAG | 0x1FFF_FFFF),
+            (0, REMOTE_FLAG),
+            (DIR_RX, DIR_TX),
+            range(9),
+        )
+    )
+    kinds += itertools.product((0x80, 0x1FFF_FFFF), (ERROR_FLAG,), (DIR_RX, DIR_TX), range(9))
+    frames = empty_frames(len(kinds))
+    for k, (identifier, flags, way, dlc) in enumerate(kinds):
+        frames[k]["id_flags"] = identifier | flags
+        frames[k]["dir"], frames[k]["dlc"] = way, dlc
+        if not flags & REMOTE_FLAG:
+            frames[k]["data"][:dlc] = list(rng.bytes(dlc))
+    frames = frames[rng.permutation(len(frames))]
+    frames["t_host_ns"] = start_ns + step_ns * np.arange(len(frames))
+    return frames
+
+
+def write_session(path, frames_of_bus, batch=37, **metadata):
+    with SessionWriter(path, session_id="s-1", epoch_ns=T0, metadata=metadata) as writer:
+        messages = [
+            (int(frames["t_host_ns"][start : start + batch].max()), bus, frames, start)
+            for bus, frames in frames_of_bus.items()
+            for start in range(0, len(frames), batch)
+        ]
+        channels = {bus: writer.frames(f"/can/{bus}") for bus in frames_of_bus}
+        for log_ns, bus, frames, start in sorted(messages, key=lambda message: message[0]):
+            channels[bus].write(log_ns, frames[start : start + batch])
+    return path
+
+
+def imported(trace, folder, bus="can0"):
+    run = folder / "back.mcap"
+    import_can(trace, run, load_robot("snake13"), force=True)
+    with Session.open(run) as session:
+        return session.frames(f"/can/{bus}")
+
+
+def masks(frames):
+    error = (frames["id_flags"] & ERROR_FLAG) != 0
+    return error, ~error
+
+
+@pytest.fixture(scope="module")
+def session_of_every_kind(tmp_path_factory):
+    frames = every_kind()
+    return write_session(tmp_path_factory.mktemp("kinds") / "run.mcap", {"can0": frames}), frames
+
+
+# What each format loses of the 36 error frames: 18 were sent, 32 have data.
+LOST = {
+    ".log": [],
+    ".blf": ["18 error frames lose their direction"],
+    ".asc": [
+        "32 error frames lose their data",
+        "18 error frames lose their direction",
+        "36 error frames lose their identifier",
+        "32 error frames lose their length code",
+    ],
+}
+
+
+KEPT_OF_ERRORS = {
+    ".log": ("id_flags", "dlc", "data", "dir"),
+    ".blf": ("id_flags", "dlc", "data"),
+    ".asc": (),
+}
+
+
+@pytest.mark.parametrize("suffix", LOST)
+def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path: Path):
+    source, frames = session_of_every_kind
+    report = export_log(source, tmp_path / f"x{suffix}")
+    assert report.buses == {"can0": len(frames)}
+    back = imported(tmp_path / f"x{suffix}", tmp_path)
+    error, other = masks(frames)
+    for name in ("id_flags", "dlc", "data", "dir"):
+        assert back[name][other].tolist() == frames[name][other].tolist()
+    assert ((back["id_flags"] & ERROR_FLAG) != 0).tolist() == error.tolist()
+    # ASC has times since its date, which it gives as local time; imports leave the date alone.
+    start_ns = T0 // S * S - RELATIVE_EPOCH_NS if suffix == ".asc" else 0
+    assert (back["t_host_ns"] + start_ns).tolist() == frames["t_host_ns"].tolist()
+    for name in KEPT_OF_ERRORS[suffix]:
+        assert back[name][error].tolist() == frames[name][error].tolist()
+    assert report.warnings == LOST[suffix]
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".asc"])
+def test_python_can_reads_them(suffix, session_of_every_kind, tmp_path: Path):
+    source, frames = session_of_every_kind
+    trace = tmp_path / f"x{suffix}"
+    export_log(source, trace)
+    options = {"relative_timestamp": False} if suffix == ".asc" else {}
+    reader = {".blf": can.BLFReader, ".asc": can.ASCReader}[suffix](trace, **options)
+    messages = list(reader)
+    reader.stop()
+    times = [round(message.timestamp * 1e6) for message in messages]
+    assert times == (frames["t_host_ns"] // 1000).tolist()
+    assert {message.channel for message in messages} == {0}
+    for message, frame in zip(messages, frames, strict=True):
+        id_flags = int(frame["id_flags"])
+        assert message.is_error_frame == bool(id_flags & ERROR_FLAG)
+        if message.is_error_frame:
+            continue
+        assert message.is_rx == (frame["dir"] == DIR_RX)
+        assert message.arbitration_id == id_flags & 0x1FFF_FFFF
+        assert message.is_extended_id == bool(id_flags & EXTENDED_FLAG)
+        assert message.is_remote_frame == bool(id_flags & REMOTE_FLAG)
+        assert message.dlc == frame["dlc"]
+        if not message.is_remote_frame:
+            assert bytes(message.data) == bytes(frame["data"][: message.dlc])
+
+
+def blf_times(path):
+    """Object times [ns since the file's start], read by the definition of the format."""
+    data, inside, at = path.read_bytes(), b"", 144
+    while at < len(data):
+        signature, header, _, size, kind = struct.unpack_from("<4sHHII", data, at)
+        assert (signature, kind) == (b"LOBJ", 10)
+        method, _ = struct.unpack_from("<HxxxxxxI", data, at + header)
+        body = data[at + header + 16 : at + size]
+        inside += zlib.decompress(body) if method == 2 else body
+        at += size + size % 4
+    times, at = [], 0
+    while at < len(inside):
+        signature, _, _, size, _ = struct.unpack_from("<4sHHII", inside, at)
+        assert signature == b"LOBJ"
+        times.append(struct.unpack_from("<IHHQ", inside, at + 16)[3])
+        at += size + size % 4
+    return times
+
+
+def test_a_blf_has_each_nanosecond(tmp_path: Path):
+    frames = every_kind(step_ns=12_345_679, start_ns=T0 + 7)
+    frames["t_host_ns"][5] = frames["t_host_ns"][0] - 3 * S  # a time may go back
+    frames["t_host_ns"][-1] += 3600 * S
+    source = write_session(tmp_path / "run.mcap", {"can0": frames}, batch=len(frames))
+    export_log(source, tmp_path / "x.blf")
+    start_ns = int(frames["t_host_ns"].min()) // S * S
+    assert blf_times(tmp_path / "x.blf") == (frames["t_host_ns"] - start_ns).tolist()
+    header = struct.unpack_from("<8H", (tmp_path / "x.blf").read_bytes(), 40)
+    assert header == (2023, 11, 2, 14, 22, 13, 20, 0)  # UTC, as python-can and Vector's library
+
+
+def test_asc_rounds_to_microseconds_and_says_so(tmp_path: Path):
+    frames = every_kind(step_ns=1_000_100)
+    frames = frames[~masks(frames)[0]]
+    source = write_session(tmp_path / "run.mcap", {"can0": frames})
+    report = export_log(source, tmp_path / "x.asc")
+    back = imported(tmp_path / "x.asc", tmp_path)["t_host_ns"] + (T0 // S * S - RELATIVE_EPOCH_NS)
+    difference = back.astype(np.int64) - frames["t_host_ns"].astype(np.int64)
+    assert abs(difference).max() <= 500
+    remote = (frames["id_flags"] & REMOTE_FLAG) != 0
+    counts = [int((difference[kind] != 0).sum()) for kind in (~remote, remote)]
+    assert report.warnings == [
+        f"{counts[0]} data frames lose their time below 1 us",
+        f"{counts[1]} remote frames lose their time below 1 us",
+    ]
+    text = (tmp_path / "x.asc").read_text()
+    first, base, events, trigger, *_ = text.splitlines()
+    assert first.replace("date", "Begin Triggerblock") == trigger
+    assert (base, events) == ("base hex  timestamps absolute", "internal events logged")
+    export_log(source, tmp_path / "x.asc", force=True)
+    assert (tmp_path / "x.asc").read_text() == text  # no clock of this machine in it
+
+
+def test_what_no_format_but_candump_has_is_counted(tmp_path: Path):
+    frames = empty_frames(3)
+    frames["t_host_ns"], frames["id_flags"] = T0, [5, 6, 7]
+    frames["dlc"], frames["t_device_ns"] = [11, 8, 8], [0, T0, 5]
+    source = write_session(tmp_path / "run.mcap", {"can0": frames})
+    device = "1 frame loses its device time"
+    assert export_log(source, tmp_path / "x.log").warnings == [device]
+    assert " can0 005#0000000000000000_B R\n" in (tmp_path / "x.log").read_text()
+    report = export_log(source, tmp_path / "x.blf")
+    assert report.warnings == [device]
+    assert imported(tmp_path / "x.blf", tmp_path)["dlc"].tolist() == [11, 8, 8]
+    report = export_log(source, tmp_path / "x.asc")
+    assert report.warnings == ["1 data frame loses its length code", device]
+
+
+# -- ROS 2 ---------------------------------------------------------------------------------
+
+
+def test_ros_messages_hold_everything(session_of_every_kind, tmp_path: Path):
+    source, frames = session_of_every_kind
+    report = export_log(source, tmp_path / "x.mcap")
+    assert report.warnings == []
+    found = {}
+    with (tmp_path / "x.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            assert schema.name == "can_msgs/msg/Frame"
+            assert decoded.header.frame_id == "can0"
+            stamp_ns = decoded.header.stamp.sec * S + decoded.header.stamp.nanosec
+            assert message.log_time == message.publish_time == stamp_ns
+            flags = (
+                decoded.is_extended * EXTENDED_FLAG
+                | decoded.is_rtr * REMOTE_FLAG
+                | decoded.is_error * ERROR_FLAG
+            )
+            way = {"/can0/from_can_bus": DIR_RX, "/can0/to_can_bus": DIR_TX}[channel.topic]
+            data = bytes(decoded.data)
+            found[message.sequence] = (stamp_ns, decoded.id | flags, decoded.dlc, way, data)
+    assert [found[k] for k in range(len(frames))] == [
+        (int(f["t_host_ns"]), int(f["id_flags"]), int(f["dlc"]), int(f["dir"]), bytes(f["data"]))
+        for f in frames
+    ]
+
+
+def test_rosbags_reads_them(session_of_every_kind, tmp_path: Path):
+    source, frames = session_of_every_kind
+    export_log(source, tmp_path / "x.mcap")
+    store = get_typestore(Stores.EMPTY)
+    full = get_typestore(Stores.ROS2_HUMBLE)
+    full.register(get_types_from_msg(CAN_MSGS_FRAME, "can_msgs/msg/Frame"))
+    with AnyReader([tmp_path / "x.mcap"], default_typestore=store) as reader:
+        messages = [
+            (t, full.deserialize_cdr(data, connection.msgtype))
+            for connection, t, data in reader.messages()
+        ]
+    assert [t for t, _ in messages] == frames["t_host_ns"].tolist()
+    assert [m.id for _, m in messages] == (frames["id_flags"] & 0x1FFF_FFFF).tolist()
+    assert [bytes(m.data) for _, m in messages] == [bytes(row) for row in frames["data"]]
+
+
+def test_names_that_a_format_has_not_are_told(tmp_path: Path):
+    frames = every_kind()[:20]
+    buses = {"can3": frames, "left-arm": frames, "0": frames}
+    source = write_session(tmp_path / "run.mcap", buses)
+    report = export_log(source, tmp_path / "x.mcap")
+    assert report.warnings == [
+        "topics can't be named after bus 0: its are in /can_0",
+        "topics can't be named after bus left-arm: its are in /left_arm",
+    ]
+    report = export_log(source, tmp_path / "x.asc", bus="left-arm")
+    assert "it has no names: bus left-arm is channel 1" in report.warnings
+    assert channel_numbers(["can3", "left-arm", "0", "can0", "can01"]) == [3, 1, 2, 0, 4]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "words"), [(".blf", "written as received"), (".mcap", "on from_can_bus")]
+)
+def test_directions_that_are_none_are_told(suffix, words, tmp_path: Path):
+    facts = {"import.directions": "none"}
+    source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:20]}, **facts)
+    report = export_log(source, tmp_path / f"x{suffix}")
+    assert f"no directions were recorded: all frames are {words}" in report.warnings
+
+
+def test_a_trace_without_a_date(tmp_path: Path):
+    frames = every_kind(start_ns=100 * S)
+    source = write_session(tmp_path / "run.mcap", {"can0": frames})
+    report = export_log(source, tmp_path / "x.blf")
+    assert report.warnings[0] == (
+        "its dates begin in 1990: the times are those since 1970, without a date"
+    )
+    back = imported(tmp_path / "x.blf", tmp_path)["t_host_ns"] - RELATIVE_EPOCH_NS
+    assert back.tolist() == frames["t_host_ns"].tolist()
+
+
+# -- several buses, a stretch at a time ----------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", FRAME_FORMATS)
+def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
+    rng = np.random.default_rng(1)
+    buses = {}
+    for bus in ("can0", "can1", "can2"):
+        frames = every_kind()
+        frames["t_host_ns"] = T0 + 1000 * np.sort(rng.integers(0, 9_000_000, len(frames)))
+        buses[bus] = frames
+    source = write_session(tmp_path / "run.mcap", buses, batch=3)
+    whole = export_log(source, tmp_path / f"whole{suffix}")
+    monkeypatch.setattr("undulog.capture.exchange.frame_blocks._MESSAGES_PER_BLOCK", 7)
+    parts = export_log(source, tmp_path / f"parts{suffix}")
+    assert (whole.buses, whole.warnings) == (parts.buses, parts.warnings)
+    assert whole.buses == dict.fromkeys(buses, len(every_kind()))
+    assert (tmp_path / f"whole{suffix}").read_bytes() == (tmp_path / f"parts{suffix}").read_bytes()
+    if suffix == ".log":
+        times = [line.split()[0] for line in (tmp_path / "parts.log").read_text().splitlines()]
+        assert times == sorted(times)
+    for bus, frames in buses.items() if suffix != ".mcap" else ():
+        back = imported(tmp_path / f"parts{suffix}", tmp_path, bus)
+        keep = masks(frames)[1]
+        for name in ("id_flags", "dlc", "data", "dir"):
+            assert back[name][keep].tolist() == frames[name][keep].tolist()
+
+
+# -- a real trace --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def arcsnake(tmp_path_factory):
+    if not RECORDING.exists():
+        pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
+    path = tmp_path_factory.mktemp("arcsnake") / "run.mcap"
+    import_can(RECORDING, path, load_robot("arcsnake-joint"))
+    with Session.open(path) as session:
+        return path, session.frames("/can/can0")
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
+def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
+    path, frames = arcsnake
+    report = export_log(path, tmp_path / f"x{suffix}")
+    assert (report.buses, report.warnings) == ({"can0": 19_297}, [])
+    back = imported(tmp_path / f"x{suffix}", tmp_path)
+    for name in ("id_flags", "dlc", "data", "dir"):
+        np.testing.assert_array_equal(back[name], frames[name])
+    start_ns = int(frames["t_host_ns"][0]) // S * S - RELATIVE_EPOCH_NS if suffix == ".asc" else 0
+    np.testing.assert_array_equal(back["t_host_ns"] + start_ns, frames["t_host_ns"])
+
+
+def test_a_real_trace_as_ros_messages(arcsnake, tmp_path: Path):
+    path, frames = arcsnake
+    export_log(path, tmp_path / "x.mcap")
+    with Session.open(tmp_path / "x.mcap") as session:
+        assert session.warnings == []
+        for topic, way in (("/can0/from_can_bus", DIR_RX), ("/can0/to_can_bus", DIR_TX)):
+            table, own = session.table(topic), frames[frames["dir"] == way]
+            assert table.index.tolist() == own["t_host_ns"].tolist()
+            assert table["id"].tolist() == own["id_flags"].tolist()
+            assert table["dlc"].tolist() == own["dlc"].tolist()
+            data = table[[f"data[{k}]" for k in range(8)]].to_numpy()
+            np.testing.assert_array_equal(data, own["data"])
+
+
+# -- the verb ------------------------------------------------------------------------------
+
+
+def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path: Path, capsys):
+    source, frames = session_of_every_kind
+    output = tmp_path / "x.blf"
+    assert undulog.run(["log", "export", str(source), "-o", str(output)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{output}: {len(frames)} frames of can0, in the format of Vector BLF",
+        "  warning: 18 error frames lose their direction",
+    ]
+    arguments = ["log", "export", str(source), "-o", str(output), "--force", "--json"]
+    assert undulog.run(arguments) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["warnings"] == ["18 error frames lose their direction"]
+    assert said["buses"] == {"can0": len(frames)}
+    arguments = ["log", "export", str(source), "-o", str(output), "--force", "--topics", "/x"]
+    assert undulog.run(arguments) == 2
+    assert "--topics is for tables; a .blf file has CAN frames" in capsys.readouterr().err
+
+
+def test_what_fails_leaves_nothing_behind(session_of_every_kind, tmp_path: Path, monkeypatch):
+    source, _ = session_of_every_kind
+    for suffix in FRAME_FORMATS:
+        output = tmp_path / f"x{suffix}"
+        output.write_text("precious")
+        with pytest.raises(UsageError, match="exists already"):
+            export_log(source, output)
+        stop = StopRequest()
+        stop.signal = 15
+        with pytest.raises(LogWriteError, match="stopped on request"):
+            export_log(source, output, force=True, stop=stop)
+        with monkeypatch.context() as patch:
+            patch.setattr(type(FRAME_FORMATS[suffix]), "kept", full_disk)
+            with pytest.raises(LogWriteError, match="can't be written: No space left"):
+                export_log(source, output, force=True)
+        assert output.read_text() == "precious"
+    assert len(list(tmp_path.iterdir())) == len(FRAME_FORMATS)
+    with pytest.raises(UsageError, match="is the session itself"):
+        export_log(source, source, force=True)
+
+
+def full_disk(*_):
+    raise OSError(28, "No space left on device")

@@ -1,0 +1,137 @@
+"""Edits of logs, cut or merged: the same bytes each time, bounded memory, whole or not at all."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from support.edited_logs import (
+    EPOCH_NS,
+    MS,
+    STRING,
+    in_file_order,
+    in_window,
+    read,
+    ticks,
+    write_log,
+)
+from undulog.capture.common.errors import UndulogError
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.messages.schemas import schema_text
+
+# -- both ------------------------------------------------------------------------------------
+
+
+def test_the_same_edit_gives_the_same_bytes(tmp_path: Path):
+    logs = [write_log(tmp_path / f"{k}.mcap", ticks(50, topics=(f"/{k}",))) for k in range(2)]
+    for k in range(2):
+        cut_log(logs[0], tmp_path / f"cut{k}.mcap", stop_s=0.3)
+        merge_logs(logs, tmp_path / f"both{k}.mcap")
+    for name in ("cut", "both"):
+        first, second = ((tmp_path / f"{name}{k}.mcap").read_bytes() for k in range(2))
+        assert first == second
+
+
+def test_a_topic_by_topic_log_is_edited_in_its_own_order(tmp_path: Path):
+    said = [(topic, t * 10 * MS, f"{topic} {t}" + "y" * 40) for topic in "abc" for t in range(100)]
+    whole = write_log(tmp_path / "whole.mcap", [(f"/{topic}", t, word) for topic, t, word in said])
+    cut_log(whole, tmp_path / "cut.mcap", start_s=0.2, stop_s=0.8)
+    assert in_file_order(tmp_path / "cut.mcap") == in_window(in_file_order(whole), 200, 800)
+    other = write_log(tmp_path / "other.mcap", ticks(50, topics=("/d",)))
+    merge_logs([whole, other], tmp_path / "both.mcap")
+    assert sorted(read(tmp_path / "both.mcap")) == sorted(read(whole) + read(other))
+
+
+def test_memory_holds_a_few_chunks_however_long_the_log(tmp_path: Path):
+    logs = []
+    for k in range(3):
+        logs.append(tmp_path / f"{k}.mcap")
+        with logs[-1].open("wb") as stream:
+            writer = Writer(stream, chunk_size=1 << 20)
+            writer.start(profile="ros2")
+            schema = writer.register_schema(STRING, "ros2msg", schema_text(STRING).encode())
+            channel = writer.register_channel(f"/{k}", "cdr", schema)
+            for tick in range(500):
+                writer.add_message(channel, EPOCH_NS + tick * MS, bytes(1 << 16), 0)
+            writer.finish()
+    tracemalloc.start()
+    cut_log(logs[0], tmp_path / "cut.mcap")
+    cut_peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    merge_logs(logs, tmp_path / "merged.mcap")
+    merge_peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert cut_peak < 10 << 20  # of 31 MiB
+    assert merge_peak < 16 << 20  # of 94 MiB
+
+
+def test_a_stop_leaves_nothing(tmp_path: Path):
+    logs = [write_log(tmp_path / f"{k}.mcap", ticks(20, topics=(f"/{k}",))) for k in range(2)]
+    stop = StopRequest()
+    stop.signal = signal.SIGTERM
+    said = "stopped by SIGTERM; nothing was written"
+    with pytest.raises(UndulogError, match=said):
+        cut_log(logs[0], tmp_path / "x.mcap", stop=stop)
+    with pytest.raises(UndulogError, match=said):
+        merge_logs(logs, tmp_path / "x.mcap", stop=stop)
+    assert sorted(tmp_path.iterdir()) == logs
+
+
+SLOW = """
+import sys, time, undulog
+from undulog.capture.log.edit import edit
+write = edit.EditedLog.write
+def slowly(*arguments):
+    print("writing", flush=True)
+    time.sleep(0.001)
+    write(*arguments)
+edit.EditedLog.write = slowly
+sys.exit(undulog.run(sys.argv[1:]))
+"""
+
+
+def test_sigterm_leaves_no_half_file_and_the_former_one_whole(tmp_path: Path):
+    whole = write_log(tmp_path / "whole.mcap", ticks(5000))
+    former = tmp_path / "cut.mcap"
+    former.write_bytes(b"former")
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLOW, "log", "cut", str(whole), "-o", str(former), "--force"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "writing\n"
+    assert (tmp_path / "cut.mcap.part").exists()
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert said == "error: stopped by SIGTERM; nothing was written\n"
+    assert former.read_bytes() == b"former"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path):
+    messages = [("/a", k * MS, np.random.default_rng(k).bytes(200).hex()) for k in range(200)]
+    whole = write_log(tmp_path / "whole.mcap", messages)
+    code = (
+        "import resource, sys, undulog;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096));"
+        "sys.exit(undulog.run(sys.argv[1:]))"
+    )
+    run = ["log", "cut", str(whole), "-o", str(tmp_path / "cut.mcap")]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *run], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "cut.mcap: can't be written: File too large" in done.stderr
+    assert list(tmp_path.iterdir()) == [whole]

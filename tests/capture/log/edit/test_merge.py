@@ -1,0 +1,232 @@
+"""Merged logs against other readers: each message once, in order, and what differs is told."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+import undulog
+from support.edited_logs import (
+    EPOCH_NS,
+    MAKES,
+    MS,
+    STRING,
+    in_file_order,
+    read,
+    records,
+    text,
+    ticks,
+    write_log,
+)
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.messages.schemas import schema_text
+
+# -- merge -----------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    times=st.lists(st.integers(0, 60), min_size=3, max_size=80),
+    bounds=st.lists(st.integers(0, 61), min_size=3, max_size=3, unique=True).map(sorted),
+    make=st.sampled_from(sorted(MAKES)),
+)
+def test_cuts_side_by_side_make_the_whole_again(tmp_path_factory, times, bounds, make):
+    folder = tmp_path_factory.mktemp("cuts")
+    first = min(times)
+    a, b, c = bounds
+    inside = [t - first for t in times]
+    if not (any(a <= t < b for t in inside) and any(b <= t < c for t in inside)):
+        return  # an empty cut is refused
+    said = [(f"/{'abc'[k % 3]}", t * MS, f"{k}" * (k % 40)) for k, t in enumerate(times)]
+    facts = [
+        ("undulog", {"session_id": "s", "robot": "r"}),
+        ("undulog.health", {"verdict": "good"}),
+    ]
+    whole = write_log(
+        folder / "whole.mcap", said, metadata=facts, attachments=[("x", b"x")], **MAKES[make]
+    )
+    for name, start, stop in [("ab", a, b), ("bc", b, c), ("ac", a, c)]:
+        cut_log(whole, folder / f"{name}.mcap", start_s=start / 1e3, stop_s=stop / 1e3)
+    report = merge_logs([folder / "ab.mcap", folder / "bc.mcap"], folder / "merged.mcap")
+    assert read(folder / "merged.mcap") == read(folder / "ac.mcap")
+    merged, cut = records(folder / "merged.mcap"), records(folder / "ac.mcap")
+    assert merged[1] == cut[1]
+    assert merged[0]["undulog"] == cut[0]["undulog"]
+    assert merged[0]["undulog.health"] == cut[0]["undulog.health"]
+    assert report.warnings == [w for w in report.warnings if "overlap" not in w]
+
+
+def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path: Path):
+    one = write_log(tmp_path / "one.mcap", [("/a", t * MS, f"one {t}") for t in (0, 2, 2, 4, 9)])
+    two = write_log(
+        tmp_path / "two.mcap",
+        [("/b", t * MS, f"two {t}") for t in (1, 2, 4, 5)],
+        use_chunking=False,
+    )
+    three = write_log(tmp_path / "three.mcap", [("/c", 2 * MS, "three")], **MAKES["lz4"])
+    merge_logs([one, two, three], tmp_path / "all.mcap")
+    found = in_file_order(tmp_path / "all.mcap")
+    assert [(m[1], (m[0] - EPOCH_NS) // MS) for m in found] == [
+        *[("/a", 0), ("/b", 1), ("/a", 2), ("/a", 2), ("/b", 2), ("/c", 2)],
+        *[("/a", 4), ("/b", 4), ("/b", 5), ("/a", 9)],
+    ]
+    everything = [m for path in (one, two, three) for m in read(path)]
+    assert sorted(found) == sorted(everything)
+
+
+def test_a_topic_of_several_logs_becomes_one_channel(tmp_path: Path):
+    one = write_log(tmp_path / "one.mcap", ticks(50))
+    two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=5000))
+    report = merge_logs([one, two], tmp_path / "both.mcap")
+    assert report.warnings == []
+    assert report.messages == {"/a": 50, "/b": 50}
+    with (tmp_path / "both.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert sorted(c.topic for c in summary.channels.values()) == ["/a", "/b"]
+    assert len(summary.schemas) == 1
+    assert read(tmp_path / "both.mcap") == read(one) + read(two)
+
+
+def test_a_merge_warns_when_the_same_topics_overlap(tmp_path: Path):
+    one = write_log(tmp_path / "one.mcap", ticks(50))
+    two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=405))
+    warnings = merge_logs([one, two], tmp_path / "both.mcap").warnings
+    assert len(warnings) == 1
+    assert "overlap by 0.09 s" in warnings[0]
+
+
+def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path: Path):
+    health = [{"verdict": "good", "reasons": "[]"}, {"verdict": "bad", "reasons": '["hot"]'}]
+    logs = [
+        write_log(
+            tmp_path / f"{name}.mcap",
+            ticks(20, start_ms=1000 * k),
+            attachments=[("same.txt", b"="), ("cal.v1.yaml", name.encode())],
+            metadata=[
+                ("undulog", {"session_id": name, "epoch_ns": str(900 + k), "operator": "Ada"}),
+                ("place", {"room": name}),
+                ("undulog.health", health[k]),
+            ],
+        )
+        for k, name in enumerate(["one", "two"])
+    ]
+    report = merge_logs(logs, tmp_path / "both.mcap")
+    cut_log(tmp_path / "both.mcap", tmp_path / "cut.mcap", stop_s=1.1)
+    merge_logs([tmp_path / "cut.mcap", logs[1]], tmp_path / "again.mcap")
+    edits = {k: v["verb"] for k, v in records(tmp_path / "again.mcap")[0].items() if "edit" in k}
+    assert edits == {"undulog.edit.1": "merge", "undulog.edit.2": "cut", "undulog.edit": "merge"}
+    stored, attached = records(tmp_path / "both.mcap")
+    assert [a[:2] for a in attached] == [
+        *[("same.txt", b"="), ("cal.v1.yaml", b"one"), ("cal.v1-2.yaml", b"two")]
+    ]
+    assert any("kept as cal.v1-2.yaml" in warning for warning in report.warnings)
+    edit = stored["undulog.edit"]
+    assert json.loads(edit["session_ids"]) == ["one", "two"]
+    digests = [hashlib.sha256(log.read_bytes()).hexdigest() for log in logs]
+    assert json.loads(edit["sha256"]) == digests
+    assert stored["undulog"]["operator"] == "Ada"
+    assert stored["undulog"]["epoch_ns"] == "900"
+    assert stored["undulog"]["session_id"].startswith("merge-")
+    assert stored["undulog.source.2"]["session_id"] == "two"
+    assert (stored["place"], stored["place.2"]) == ({"room": "one"}, {"room": "two"})
+    assert stored["undulog.health"]["verdict"] == "bad"
+    assert json.loads(stored["undulog.health"]["reasons"]) == [
+        *["one.mcap: good", "two.mcap: bad", "two.mcap: hot"]
+    ]
+
+
+def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path: Path, capsys):
+    one = write_log(tmp_path / "one.mcap", ticks(20), units={"/b": "rad"})
+    two = write_log(tmp_path / "two.mcap", ticks(20), units={"/b": "deg"})
+    with pytest.raises(DataError, match=r"^/b is in rad in .*one.mcap and in deg in .*two"):
+        merge_logs([one, two], tmp_path / "both.mcap")
+    silent = write_log(tmp_path / "silent.mcap", ticks(20))  # of another make, without units
+    merge_logs([one, silent], tmp_path / "both.mcap")
+    (tmp_path / "both.mcap").unlink()
+    path = tmp_path / "three.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        kind = "sensor_msgs/msg/Range"
+        schema = writer.register_schema(kind, "ros2msg", schema_text(kind).encode())
+        writer.add_message(writer.register_channel("/a", "cdr", schema), EPOCH_NS, b"", 0)
+        writer.finish()
+    assert (
+        undulog.run(["log", "merge", *map(str, [one, path]), "-o", str(tmp_path / "x.mcap")]) == 1
+    )
+    said = capsys.readouterr().err
+    assert "/a is std_msgs/msg/String" in said
+    assert "sensor_msgs/msg/Range in" in said
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        *["one.mcap", "silent.mcap", "three.mcap", "two.mcap"]
+    ]
+
+
+def test_a_definition_with_other_comments_is_the_same_type(tmp_path: Path):
+    logs = []
+    for k, definition in enumerate(["string data", "# what is said\nstring   data  # a word\n"]):
+        logs.append(tmp_path / f"{k}.mcap")
+        with logs[-1].open("wb") as stream:
+            writer = Writer(stream)
+            writer.start(profile="ros2")
+            schema = writer.register_schema(STRING, "ros2msg", definition.encode())
+            channel = writer.register_channel("/a", "cdr", schema)
+            writer.add_message(channel, EPOCH_NS + k, text(f"{k}"), 0)
+            writer.finish()
+    merge_logs(logs, tmp_path / "both.mcap")
+    with Session.open(tmp_path / "both.mcap") as session:
+        assert [m.data for _, m in session.messages("/a")] == ["0", "1"]
+    merge_logs(logs[::-1], tmp_path / "other.mcap")
+    write_other = tmp_path / "other_type.mcap"
+    with write_other.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"float64 data")
+        writer.add_message(writer.register_channel("/a", "cdr", schema), EPOCH_NS, b"", 0)
+        writer.finish()
+    with pytest.raises(DataError, match="the same name with another definition"):
+        merge_logs([logs[0], write_other], tmp_path / "never.mcap")
+
+
+def test_a_merge_of_different_robots_must_be_told_which(tmp_path: Path, capsys):
+    for k, name in enumerate(["snake13", "snake25"]):
+        with SessionWriter(
+            tmp_path / f"{name}.mcap", session_id=name, epoch_ns=EPOCH_NS, robot=load_robot(name)
+        ) as writer:
+            writer.string(f"/said{k}").write(EPOCH_NS + k, name)
+    run = ["log", "merge", *(str(tmp_path / f"{n}.mcap") for n in ("snake13", "snake25"))]
+    run += ["-o", str(tmp_path / "both.mcap")]
+    for extra in ([], ["--force"]):
+        assert undulog.run([*run, *extra]) == 2
+        assert "different robots: snake13 (" in capsys.readouterr().err
+    assert undulog.run([*run, "--robot", "snake7"]) == 2
+    assert "robots are: snake13, snake25" in capsys.readouterr().err
+    assert undulog.run([*run, "--robot", "snake25"]) == 0
+    assert "warning: robot.toml of" in capsys.readouterr().out
+    with Session.open(tmp_path / "both.mcap") as session:
+        assert session.robot is not None
+        assert session.robot.name == "snake25"
+        assert session.metadata["undulog"]["robot"] == "snake25"
+        assert b"snake13" in session.attachments["robot-2.toml"]
+    with AnyReader([tmp_path / "both.mcap"]) as reader:
+        assert reader.message_count == 2
+
+
+def test_a_merge_refuses_one_log_and_the_same_log(tmp_path: Path):
+    one = write_log(tmp_path / "one.mcap", ticks(20))
+    (tmp_path / "copy.mcap").write_bytes(one.read_bytes())
+    with pytest.raises(UsageError, match="two logs or more"):
+        merge_logs([one], tmp_path / "both.mcap")
+    with pytest.raises(UsageError, match="byte for byte"):
+        merge_logs([one, tmp_path / "copy.mcap"], tmp_path / "both.mcap")

@@ -1,0 +1,591 @@
+"""Sessions whose recorder was killed, or lost its power, or still runs: each message, once."""
+
+import contextlib
+import json
+import os
+import random
+import select
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+import undulog
+from support import durable_child as recorder
+from support.read_back import read
+from undulog.capture import Session, SessionWriter
+from undulog.capture.common.errors import (
+    LogError,
+    NotALogError,
+    OutputExistsError,
+    UndulogError,
+    UsageError,
+)
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.edit.recover import recover_log, recovered_path
+from undulog.capture.log.health.session_check import check_session
+
+CHILD = recorder.__file__
+
+
+def fingerprint(folder):
+    """Every file below a folder and its bytes."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def start(path, **options):
+    """A recorder in a process of its own."""
+    options = {
+        "segment_size": 1 << 16,
+        "ballast": 1 << 16,
+        "sync_interval_s": 0.05,
+        "flush_interval_s": 0.2,
+        **options,
+    }
+    command = [sys.executable, str(CHILD), str(path), json.dumps(options)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE)
+
+
+def last_told(told):
+    """How many messages a recorder told as accepted."""
+    whole = len(told) // 8 * 8
+    return int.from_bytes(told[whole - 8 : whole], "little")
+
+
+def kill_at(path, seconds, **options):
+    """Run a recorder and kill it that long after its first message; messages told as accepted."""
+    with start(path, **options) as child:
+        try:
+            pipe = child.stdout.fileno()
+            told = os.read(pipe, 1 << 16)
+            deadline = time.monotonic() + seconds
+            while (left := deadline - time.monotonic()) > 0:
+                if select.select([pipe], [], [], left)[0]:
+                    told += os.read(pipe, 1 << 16)
+        finally:
+            child.kill()
+        while rest := os.read(pipe, 1 << 16):
+            told += rest
+    assert child.returncode == -9
+    assert told, "the child did not start"
+    return last_told(told)
+
+
+def unfinished(path, count, **options):
+    """A session whose recorder died after so many messages, the disk having what it could."""
+    with start(path, count=count, flush_interval_s=60.0, **options) as child:
+        told, _ = child.communicate(timeout=120)
+    assert child.returncode == -9
+    assert last_told(told) == count
+    return path
+
+
+def check_killed(path, accepted):
+    """Everything that was accepted is read, once, and nothing on the disk is changed by it."""
+    before = fingerprint(path.parent)
+    found, warnings = read(path)
+    # The child may have been killed between accepting and telling.
+    assert len(found) in (accepted, accepted + 1)
+    assert found == recorder.truth(len(found))
+    assert fingerprint(path.parent) == before
+    return warnings
+
+
+# -- the kill ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("run", "split_size", "split_every"),
+    [(0, None, 0), (1, None, 0), (2, 1 << 18, 0), (3, None, 700)],
+)
+def test_a_killed_session_reads_as_if_it_had_been_closed(tmp_path, run, split_size, split_every):
+    seconds = random.Random(run).uniform(0.1, 0.8)
+    path = tmp_path / "run.mcap"
+    accepted = kill_at(path, seconds, split_size=split_size, split_every=split_every)
+    warnings = check_killed(path, accepted)
+    assert "the recorder did not finish" in warnings[0]
+    assert "none is missing" in warnings[0]
+    assert all("no whole records" in text for text in warnings[1:])  # it was being written
+    with Session(path) as session:
+        assert session.session_id == "killed"
+        total = sum(channel.count for channel in session.channels.values())
+        assert total in (accepted, accepted + 1)
+        assert sum(len(list(session.messages(topic))) for topic in session.channels) == total
+
+
+@pytest.mark.slow
+def test_thirty_kills_lose_no_accepted_message(tmp_path):
+    rng = random.Random(5)
+    for run in range(30):
+        path = tmp_path / str(run) / "run.mcap"
+        path.parent.mkdir()
+        options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
+        options["split_every"] = rng.choice([0, 0, 300])
+        accepted = kill_at(path, rng.uniform(0.0, 1.5), **options)
+        warnings = check_killed(path, accepted)
+        assert any("none is missing" in text for text in warnings)
+        output = path.with_name("whole.mcap")
+        report = recover_log(path, output)
+        assert report.missing == 0
+        found, warnings = read(output)
+        assert found == recorder.truth(len(found))
+        assert warnings == []
+        shutil.rmtree(path.parent)
+
+
+@pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.slow)])
+def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
+    rng = random.Random(8)
+    whole = 0
+    for run in range(runs):
+        path = tmp_path / str(run) / "run.mcap"
+        path.parent.mkdir()
+        splits = [3000] if run % 2 else []
+        with start(path, count=6000, splits=splits, close=True) as child:
+            told = b""
+            while len(told) < 6000 * 8:
+                told += os.read(child.stdout.fileno(), 1 << 16)
+            time.sleep(rng.uniform(0.0, 0.04))
+            child.kill()
+            child.stdout.read()
+        before = fingerprint(path.parent)
+        found, warnings = read(path)
+        assert found == recorder.truth(6000)
+        assert fingerprint(path.parent) == before
+        if warnings:
+            assert "none is missing" in warnings[0] or "can't be told" in warnings[0]
+        with Session(path) as session:  # what was known at the end is in the log before it
+            whole += session.verdict == "good"
+        shutil.rmtree(path.parent)
+    assert whole > 0
+
+
+def test_a_recording_that_runs_can_be_read(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = recorder.open_sink(path, segment_size=1 << 16)
+    for count in range(1, 3001):
+        recorder.write(sink, count - 1)
+        if count % 500 == 0:
+            found, warnings = read(path)
+            assert found == recorder.truth(count)
+            assert len(warnings) == 1
+            assert f"this recording is running: its first {count} messages are read" in warnings[0]
+    assert check_session(path).file.running
+    with pytest.raises(LogError, match="is running; end it first"):
+        recover_log(path, tmp_path / "out.mcap")
+    sink.close(())
+    assert read(path) == (recorder.truth(3000), [])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap"]
+
+
+@pytest.mark.parametrize("looks", [5, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_recording_can_be_read_at_any_moment(tmp_path, looks):
+    """A reader that comes while the recorder writes and splits in another process."""
+    path = tmp_path / "run.mcap"
+    with start(path, split_size=1 << 17) as child:
+        try:
+            os.read(child.stdout.fileno(), 8)
+            counts = []
+            for _ in range(looks):
+                found, _ = read(path)
+                assert found == recorder.truth(len(found))
+                counts.append(len(found))
+                os.read(child.stdout.fileno(), 1 << 16)  # let it go on
+        finally:
+            child.kill()
+            child.stdout.read()
+    assert counts == sorted(counts)
+
+
+def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp_path):
+    """A reader that had the first segment before those behind it went."""
+    sink = recorder.open_sink(tmp_path / "run.mcap", segment_size=1 << 16, sync_interval_s=0.01)
+    folder = tmp_path / "run.mcap.wal"
+    for number in range(1000):
+        recorder.write(sink, number)
+    early = {path.name: path.read_bytes() for path in sorted(folder.glob("0*.seg"))[:1]}
+    for number in range(1000, 8000):
+        recorder.write(sink, number)
+    deadline = time.monotonic() + 30
+    while (folder / next(iter(early))).exists():
+        assert time.monotonic() < deadline, "the first segment was never let go of"
+        sink.tick()
+        time.sleep(0.01)
+    copy = tmp_path / "copy"
+    (copy / folder.name).mkdir(parents=True)
+    for name, data in early.items():
+        (copy / folder.name / name).write_bytes(data)
+    for left in sorted(folder.iterdir()):  # as a reader comes to them: the log, then the file
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copy(left, copy / folder.name)
+    shutil.copy(tmp_path / "run.mcap", copy)
+    sink.close(())
+    found, warnings = read(copy / "run.mcap")
+    assert found == recorder.truth(8000)
+    assert "none is missing" in warnings[0]
+
+
+# -- power loss and damage -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("left", ["missing", "empty", "magic"])
+def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, left):
+    path = unfinished(tmp_path / "run.mcap", 100)
+    with path.open("rb+") as stream:
+        stream.truncate({"missing": 0, "empty": 0, "magic": 8}[left])
+    if left == "missing":
+        path.unlink()
+    found, warnings = read(path)
+    assert found == recorder.truth(100)
+    assert any("100 of them from its write-ahead log; none is missing" in w for w in warnings)
+    with Session(path) as session:
+        assert session.metadata["undulog"]["session_id"] == "killed"
+        assert session.profile == "ros2"
+    with Session(tmp_path) as session:  # the folder
+        assert session.session_id == "killed"
+
+
+def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(tmp_path):
+    """Power is lost: of the file's last chunks, which were not synced, only some is there."""
+    path = unfinished(tmp_path / "run.mcap", 4000, segment_size=8 << 20)  # nothing released
+    whole = path.read_bytes()
+    assert len(whole) > 300_000
+    rng = random.Random(3)
+    for size in [0, 7, 8, 50, *(rng.randrange(len(whole)) for _ in range(30)), len(whole)]:
+        path.write_bytes(whole[:size])
+        found, warnings = read(path)
+        assert sorted(found, key=lambda m: m[2]) == recorder.truth(4000), size
+        assert any("none is missing" in text for text in warnings)
+
+
+def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 8000, segment_size=16 << 20)
+    whole = path.read_bytes()
+    rng = random.Random(4)
+    for _ in range(20):
+        raw = bytearray(whole)
+        at = rng.randrange(2000, len(raw) - 5000)
+        raw[at : at + 4096] = bytes(4096)  # a page that never reached the disk
+        path.write_bytes(raw)
+        found, _ = read(path)
+        assert sorted(found, key=lambda m: m[2]) == recorder.truth(8000)
+
+
+def test_what_is_in_neither_is_counted(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 6000)
+    segments = sorted((tmp_path / "run.mcap.wal").glob("0*.seg"))
+    assert len(segments) > 3
+    segments[1].unlink()
+    os.truncate(path, 0)  # or it may have them by now: that is the disk's affair
+    found, warnings = read(path)
+    lost = 6000 - len(found)
+    assert lost > 0
+    kept = {m[2] for m in found}
+    assert found == [m for m in recorder.truth(6000) if m[2] in kept]
+    assert any(f"{lost} of 6000 are missing" in text for text in warnings)
+    health = check_session(path)
+    assert health.verdict == "bad"
+    assert f"{lost} of 6000 messages that the recorder accepted are missing" in health.reasons
+
+
+def test_a_session_that_nothing_is_missing_of_is_degraded_at_most(tmp_path):
+    health = check_session(unfinished(tmp_path / "run.mcap", 6000))
+    assert health.file.truncated
+    assert health.file.damage == ()
+    assert any(
+        text.startswith("the recorder did not finish: 6000 messages are read")
+        for text in health.reasons
+    )
+    assert not any("cut short" in text for text in (*health.reasons, *health.notes))
+
+
+def test_without_its_write_ahead_log_a_cut_file_is_what_it_was(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 6000)
+    shutil.rmtree(tmp_path / "run.mcap.wal")
+    found, warnings = read(path)
+    assert found == recorder.truth(len(found))
+    assert 0 < len(found) < 6000
+    assert any("no footer" in text for text in warnings)
+
+
+# -- log recover ---------------------------------------------------------------------------------
+
+
+def test_log_recover_writes_one_whole_file(tmp_path, capsys):
+    path = unfinished(tmp_path / "run.mcap", 5000, splits=(1500, 3000))
+    before = fingerprint(tmp_path)
+    assert undulog.run(["log", "recover", str(path)]) == 0
+    output = tmp_path / "run.recovered.mcap"
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"{output}: 5000 messages over 5.00 s, ")
+    assert "none is missing" in printed
+    after = fingerprint(tmp_path)
+    recovered = after.pop(output.name)
+    assert after == before
+    assert read(output) == (recorder.truth(5000), [])
+    health = check_session(output)
+    assert health.file.damage == ()
+    assert health.file.indexed
+    with Session(output) as session:
+        facts = session.metadata["undulog.recovered"]
+        assert facts["messages"] == "5000"
+        assert facts["missing"] == "0"
+        assert json.loads(facts["sources"]) == ["run.mcap", "run_0002.mcap", "run_0003.mcap"]
+        assert "undulog.part" not in session.metadata
+        assert session.session_id == "killed"
+    assert undulog.run(["log", "recover", str(path)]) == 2  # it is there
+    assert "exists already" in capsys.readouterr().err
+    assert output.read_bytes() == recovered
+    assert (
+        undulog.run(["log", "recover", str(tmp_path / "run_0002.mcap"), "--json", "--force"]) == 0
+    )
+    report = json.loads(capsys.readouterr().out)
+    assert (sum(report["messages"].values()), report["missing"]) == (5000, 0)
+    assert output.read_bytes() == recovered
+
+
+def test_a_recovered_file_opens_in_foreign_readers(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 500)
+    output = recovered_path(path)
+    recover_log(path, output)
+    truth = recorder.truth(500)
+    with output.open("rb") as stream:
+        read_by_mcap = [
+            (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+            for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
+        ]
+    assert read_by_mcap == truth
+    with AnyReader([output]) as reader:
+        read_by_rosbags = [
+            (connection.topic, t_ns, reader.deserialize(data, connection.msgtype).data)
+            for connection, t_ns, data in reader.messages()
+        ]
+    assert read_by_rosbags == [(m[0], m[2], m[4][8:-1].decode()) for m in truth]
+
+
+@pytest.mark.slow
+def test_rerun_finds_nothing_wrong_with_a_recovered_file(tmp_path):
+    rerun = Path(sys.executable).with_name("rerun")
+    if not rerun.exists():
+        pytest.skip("rerun is not installed")
+    path = unfinished(tmp_path / "run.mcap", 500)
+    output = recovered_path(path)
+    recover_log(path, output)
+    done = subprocess.run(
+        [str(rerun), "mcap", "check", str(output)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = recorder.open_sink(path)
+    for number in range(6000):
+        recorder.write(sink, number)
+    sink.close(())
+    raw = bytearray(path.read_bytes())
+    third = len(raw) // 3
+    raw[third : third + 100_000] = bytes(100_000)
+    path.write_bytes(raw[:-2000])
+    report = recover_log(path, tmp_path / "out.mcap")
+    assert report.missing is None
+    assert report.warnings
+    found, warnings = read(tmp_path / "out.mcap")
+    assert warnings == []
+    times = {m[2] for m in found}
+    assert found == [m for m in recorder.truth(6000) if m[2] in times]
+    assert 1000 < len(found) < 6000
+
+
+def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, capsys):
+    """Another session is copied over a killed one; what that had can still be recovered."""
+    path = unfinished(tmp_path / "run.mcap", 3000)
+    wal = path.with_name("run.mcap.wal")
+    other = tmp_path / "other.mcap"
+    with SessionWriter(other, session_id="other", epoch_ns=recorder.EPOCH_NS) as writer:
+        channel = writer.string("/gait/mode")
+        for k in range(100):
+            channel.write(recorder.EPOCH_NS + k * 10_000_000, f"mode {k}")
+    truth, _ = read(other)
+    path.unlink()
+    shutil.copy(other, path)
+    found, warnings = read(path)
+    assert found == truth
+    assert len(warnings) == 1
+    assert warnings[0].startswith("run.mcap.wal is the write-ahead log of another session (killed)")
+    health = check_session(path)
+    assert (health.file.unfinished, health.file.damage) == ("", ())
+    assert warnings[0] in health.file.notes
+    assert undulog.run(["log", "recover", str(path), "-o", str(tmp_path / "out.mcap")]) == 0
+    assert warnings[0] in capsys.readouterr().out
+    assert read(tmp_path / "out.mcap")[0] == truth
+    wal.rename(tmp_path / "old.mcap.wal")  # as the warning says
+    assert undulog.run(["log", "recover", str(tmp_path / "old.mcap")]) == 0
+    rescued, warnings = read(tmp_path / "old.recovered.mcap")
+    assert warnings == []
+    assert rescued == [m for m in recorder.truth(3000) if m in rescued]
+    assert recorder.truth(3000)[-1] in rescued
+
+
+def test_a_recovery_gives_no_advice_to_recover_and_asks_for_what_a_copy_left_behind(
+    tmp_path, capsys
+):
+    (tmp_path / "copy").mkdir()
+    path = unfinished(tmp_path / "run.mcap", 6000)
+    with Session(path) as session:
+        assert any("'undulog log recover'" in text for text in session.warnings)
+    assert undulog.run(["log", "recover", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "the recorder did not finish" in out
+    assert "log recover" not in out
+    copy = tmp_path / "copy" / "run.mcap"
+    shutil.copy(path, copy)
+    with Session(copy) as session:
+        assert len(session.warnings) == 1
+    assert undulog.run(["log", "recover", str(copy)]) == 0
+    out = capsys.readouterr().out
+    assert "note: there is no run.mcap.wal beside run.mcap" in out
+    shutil.copytree(path.with_name("run.mcap.wal"), copy.with_name("run.mcap.wal"))
+    assert undulog.run(["log", "recover", str(copy), "--force"]) == 0
+    assert "; none is missing" in capsys.readouterr().out
+    assert read(copy.with_name("run.recovered.mcap")) == (recorder.truth(6000), [])
+
+
+def test_a_whole_file_needs_no_recovery(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = recorder.open_sink(path)
+    recorder.write(sink, 0)
+    sink.close(())
+    report = recover_log(path, tmp_path / "out.mcap")
+    assert report.notes == ["the log was whole: nothing had to be recovered"]
+
+
+def test_a_recovery_refuses_to_write_over_its_sources(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 300, splits=(100,))
+    before = fingerprint(tmp_path)
+    for output in (path, tmp_path / "run_0002.mcap"):
+        with pytest.raises(UsageError, match="is a source"):
+            recover_log(tmp_path / "run.mcap", output, force=True)
+    (tmp_path / "out.mcap").write_bytes(b"mine")
+    with pytest.raises(OutputExistsError):
+        recover_log(path, tmp_path / "out.mcap")
+    (tmp_path / "out.mcap").unlink()
+    assert fingerprint(tmp_path) == before
+
+
+def test_where_nothing_is_left_that_is_told(tmp_path):
+    (tmp_path / "run.mcap").touch()
+    (tmp_path / "run.mcap.wal").mkdir()
+    with pytest.raises(NotALogError):
+        Session(tmp_path / "run.mcap")
+    with pytest.raises(NotALogError):
+        recover_log(tmp_path / "run.mcap", tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_edits_take_an_unfinished_session_as_it_is(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 1000, splits=(400,))
+    cut_log(path, tmp_path / "cut.mcap", start_s=0.3, stop_s=0.9)
+    assert read(tmp_path / "cut.mcap")[0] == recorder.truth(1000)[300:900]
+    with Session(tmp_path / "cut.mcap") as session:
+        assert "undulog.part" not in session.metadata
+        assert "did not finish" in session.metadata["undulog.edit"]["warnings"]
+    merge_logs([path, tmp_path / "cut.mcap"], tmp_path / "merged.mcap")
+    assert len(read(tmp_path / "merged.mcap")[0]) == 1600
+
+
+def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = recorder.open_sink(path)
+    for number in range(12_000):
+        recorder.write(sink, number)
+    sink.close(())
+    raw = path.read_bytes()
+    with path.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    assert len(chunks) > 4
+    truth = recorder.truth(12_000)
+    for broken in (1, 2, len(chunks) - 2):  # the first one has the channels
+        index = chunks[broken]
+        whole = bytearray(raw[:-1000])  # nor is there a summary
+        at = index.chunk_start_offset
+        for length in (0, 1 << 40, index.chunk_length // 3):
+            whole[at + 1 : at + 9] = length.to_bytes(8, "little")
+            path.write_bytes(whole)
+            found, warnings = read(path)
+            first = (index.message_start_time - recorder.EPOCH_NS) // 10**6
+            last = (index.message_end_time - recorder.EPOCH_NS) // 10**6
+            rest = [m for m in found if not first <= (m[2] - recorder.EPOCH_NS) // 10**6 <= last]
+            assert rest == truth[:first] + truth[last + 1 :], (broken, length)
+            assert set(found) <= set(truth)
+            assert any("is damaged and was skipped" in text for text in warnings)
+
+
+def damage(rng, folder):
+    """Damage up to three files of a session in one of several ways each."""
+    files = [path for path in sorted(folder.rglob("*")) if path.suffix in (".mcap", ".seg")]
+    for path in rng.sample(files, rng.randint(1, 3)):
+        raw = bytearray(path.read_bytes())
+        at, length = rng.randrange(len(raw) + 1), rng.choice([1, 8, 64, 4096])
+        kind = rng.randrange(6)
+        if kind == 0:  # some bytes
+            for _ in range(rng.randint(1, 20) if raw else 0):  # a part may have no byte yet
+                raw[rng.randrange(len(raw))] = rng.randrange(256)
+        elif kind == 1:
+            raw[at : at + length] = rng.choice([bytes(length), b"\xff" * length])
+        elif kind == 2:
+            del raw[at:]
+        elif kind == 3:
+            del raw[at : at + length]
+        elif kind == 4:
+            raw[at:at] = rng.randbytes(length)
+        else:
+            path.unlink()
+            continue
+        path.write_bytes(raw)
+
+
+@pytest.mark.parametrize("runs", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_told(tmp_path, runs):
+    source = tmp_path / "source"
+    source.mkdir()
+    unfinished(source / "run.mcap", 2400, splits=[900, 1800])
+    truth = set(recorder.truth(2400))
+    place = tmp_path / "damaged"
+    outcomes = {"all": 0, "some": 0, "none": 0}
+    rng = random.Random(runs)
+    for run in range(runs):
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(source, place)
+        damage(rng, place)
+        try:
+            found, warnings = read(place / "run.mcap")
+            check_session(place)
+            report = recover_log(place, tmp_path / "out.mcap", force=True)
+        except UndulogError:
+            outcomes["none"] += 1
+            continue
+        assert set(found) <= truth, run
+        assert len(set(found)) == len(found), run
+        assert sum(report.messages.values()) == len(found), run
+        # What the damaged log itself can't tell any more is not counted.
+        assert report.missing is None or report.missing <= 2400 - len(found), run
+        assert len(found) == 2400 or warnings, run
+        outcomes["all" if len(found) == 2400 else "some"] += 1
+    assert outcomes["none"] <= runs // 20
+    assert outcomes["all"] > 0
+    assert outcomes["some"] > 0

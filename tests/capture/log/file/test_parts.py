@@ -1,0 +1,324 @@
+"""Split sessions: parts that are read as one, and told when one is missing."""
+
+import hashlib
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+import undulog
+from support import durable_child as recorder
+from support.read_back import read
+from undulog.capture import Session, SessionWriter
+from undulog.capture.common.errors import LogError, LogWriteError, NotALogError, OutputExistsError
+from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.file.part_files import later_parts, part_path, split_part_path
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.sinks.durable_sink import DurableSink
+
+EPOCH_NS = recorder.EPOCH_NS
+
+
+def split_session(path, count=900, parts=3, **options):
+    """A finished session of that many parts, of the same number of messages each."""
+    sink = recorder.open_sink(path, **options)
+    for number in range(count):
+        if number and number % (count // parts) == 0:
+            sink.split()
+        recorder.write(sink, number)
+    sink.close(())
+    return path
+
+
+def records(path, name):
+    with path.open("rb") as stream:
+        found = {}
+        for record in make_reader(stream).iter_metadata():
+            if record.name == name:
+                found |= record.metadata
+        return found
+
+
+# -- names ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", ["run.mcap", "a_b.mcap", "2024_0001.mcap", "x.y.mcap"])
+def test_names_of_parts_go_there_and_back(tmp_path, first):
+    path = tmp_path / first
+    assert part_path(path, 1) == path
+    for number in (2, 17, 9999, 12345):
+        assert split_part_path(part_path(path, number)) == (path, number)
+    for number in (12, 2, 100000):
+        part_path(path, number).touch()
+    assert later_parts(path) == [part_path(path, number) for number in (2, 12, 100000)]
+
+
+def test_a_name_without_a_number_is_no_later_part():
+    for name in ("run.mcap", "run_2.mcap", "run_0001.mcap", "run_0000.mcap", "_0002.mcap"):
+        assert split_part_path(Path(name)) == (Path(name), 1)
+
+
+# -- writing -------------------------------------------------------------------------------------
+
+
+def test_each_part_explains_itself_and_names_its_neighbours(tmp_path):
+    split_session(tmp_path / "run.mcap")
+    names = ["run.mcap", "run_0002.mcap", "run_0003.mcap"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    found = [records(tmp_path / name, "undulog.part") for name in names]
+    digests = [hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() for name in names]
+    assert found == [
+        {"part": "1", "next": "run_0002.mcap"},
+        {
+            "part": "2",
+            "previous": "run.mcap",
+            "previous_sha256": digests[0],
+            "next": "run_0003.mcap",
+        },
+        {"part": "3", "previous": "run_0002.mcap", "previous_sha256": digests[1], "parts": "3"},
+    ]
+    assert [records(tmp_path / n, "undulog")["session_id"] for n in names] == ["killed"] * 3
+    for part, name in enumerate(names):
+        with (tmp_path / name).open("rb") as stream:  # a foreign reader, one file at a time
+            messages = [
+                (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+                for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
+            ]
+        assert messages == recorder.truth(900)[300 * part : 300 * (part + 1)]
+
+
+def test_a_session_that_was_never_split_says_nothing_of_parts(tmp_path):
+    path = split_session(tmp_path / "run.mcap", parts=1)
+    assert records(path, "undulog.part") == {}
+
+
+def test_parts_by_size(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap", split_size=200_000)
+    for number in range(8000):
+        recorder.write(sink, number)
+    sink.close(())
+    sizes = [path.stat().st_size for path in sorted(tmp_path.iterdir())]
+    assert len(sizes) == sink.part > 2
+    assert all(200_000 <= size < 200_000 + 600_000 for size in sizes[:-1])  # and one chunk
+    assert sum(sizes) == sink.bytes_written
+    assert read(tmp_path) == (recorder.truth(8000), [])
+
+
+def test_parts_by_time_hold_equal_times(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap", split_ns=250_000_000)  # a message a ms
+    for number in [*range(1000), *range(1600, 2000)]:  # then a pause longer than a part
+        recorder.write(sink, number)
+    sink.close(())
+    spans = []
+    for path in [tmp_path / "run.mcap", *later_parts(tmp_path / "run.mcap")]:
+        with path.open("rb") as stream:
+            times = [m.log_time - EPOCH_NS for _, _, m in make_reader(stream).iter_messages()]
+        spans.append((min(times) // 10**6, max(times) // 10**6))
+    assert spans == [(0, 249), (250, 499), (500, 749), (750, 999), (1600, 1749), (1750, 1999)]
+
+
+def test_an_empty_part_is_not_split_again(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap")
+    assert sink.split() == tmp_path / "run.mcap"
+    recorder.write(sink, 0)
+    assert sink.split() == tmp_path / "run_0002.mcap"
+    assert sink.split() == tmp_path / "run_0002.mcap"
+    sink.close(())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run_0002.mcap"]
+    assert read(tmp_path) == (recorder.truth(1), [])
+
+
+def test_channels_opened_late_have_the_same_number_in_all_parts(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = DurableSink(path)
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+        writer.attach("scenario.toml", "application/toml", b"x = 1\n")
+        early = writer.string("/early")
+        early.write(EPOCH_NS, "0")
+        sink.split()
+        early.write(EPOCH_NS + 1, "1")
+        late = writer.joint_state("/late", ["a"], unit="V")
+        late.write(EPOCH_NS + 2, [1.5])
+        sink.split()
+        late.write(EPOCH_NS + 3, [2.5])
+        early.write(EPOCH_NS + 4, "2")
+        writer.set_verdict("degraded", ["because"])
+    with Session(path) as session:
+        assert [m.data for _, m in session.messages("/early")] == ["0", "1", "2"]
+        assert [float(v[0]) for v in session.table("/late")[["position[0]"]].to_numpy()] == [
+            1.5,
+            2.5,
+        ]
+        assert session.verdict == "degraded"
+        assert session.attachments == {"scenario.toml": b"x = 1\n"}
+        assert session.warnings == []
+    health = check_session(path)
+    assert health.file.damage == ()
+    assert all(each.sequence.dropped in (0, None) for each in health.channels)
+
+
+def test_a_next_part_that_is_there_already_costs_no_message(tmp_path):
+    path = tmp_path / "run.mcap"
+    sink = recorder.open_sink(path, split_ns=100_000_000)
+    (tmp_path / "run_0002.mcap").write_bytes(b"somebody else's")
+    for number in range(250):
+        recorder.write(sink, number)
+    assert isinstance(sink.split_trouble, OutputExistsError)
+    assert sink.part == 1
+    with pytest.raises(OutputExistsError):
+        sink.split()
+    (tmp_path / "run_0002.mcap").unlink()
+    for number in range(250, 500):
+        recorder.write(sink, number)
+    assert sink.split_trouble is None
+    sink.close(())
+    assert read(path) == (recorder.truth(500), [])
+
+
+def test_a_file_that_somebody_deletes_is_told_before_the_end(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap", flush_interval_s=0.01)
+    recorder.write(sink, 0)
+    (tmp_path / "run.mcap").unlink()
+
+    def go_on():
+        number = 1
+        while True:
+            recorder.write(sink, number)
+            number += 1
+            time.sleep(0.001)
+
+    with pytest.raises(LogWriteError, match=r"run\.mcap: was deleted while it was being written"):
+        go_on()
+    with pytest.raises(
+        LogWriteError, match=r"was deleted .*; only what .*run\.mcap\.wal still has"
+    ):
+        sink.close(())
+
+
+def test_a_folder_that_is_gone_is_told(tmp_path):
+    place = tmp_path / "gone"
+    place.mkdir()
+    sink = recorder.open_sink(place / "run.mcap")
+    recorder.write(sink, 0)
+    shutil.rmtree(place)
+    with pytest.raises(LogWriteError, match="No such file"):
+        sink.split()
+    with pytest.raises(LogWriteError, match="deleted"):
+        sink.close(())
+
+
+# -- reading -------------------------------------------------------------------------------------
+
+
+def test_naming_any_part_or_the_folder_opens_the_whole(tmp_path, capsys):
+    path = split_session(tmp_path / "run.mcap")
+    for name in ("run.mcap", "run_0002.mcap", "run_0003.mcap", "."):
+        found, warnings = read(tmp_path / name)
+        assert found == recorder.truth(900)
+        assert warnings == []
+        with Session(tmp_path / name) as session:
+            assert session.channels["/rare"].count == 18
+            assert len(session.table("/a")) == 450
+            window = session.table(
+                "/b", start_ns=EPOCH_NS + 299 * 10**6, stop_ns=EPOCH_NS + 302 * 10**6
+            )
+            assert len(window) == 1
+            assert session.duration_s == pytest.approx(0.899)
+        assert undulog.run(["log", "info", str(tmp_path / name)]) == 0
+        assert "900 messages" in capsys.readouterr().out
+        health = check_session(tmp_path / name)
+        assert health.file.damage == ()
+        assert health.file.indexed
+        assert health.file.chunks == health.file.checked == 3
+    assert read(path)[0] == recorder.truth(900)
+
+
+def test_a_folder_with_other_sessions_is_refused_and_part_names_are_not_enough(tmp_path):
+    split_session(tmp_path / "run.mcap")
+    (tmp_path / "x").mkdir()
+    with pytest.raises(NotALogError, match="no session"):
+        Session(tmp_path / "x")
+    split_session(tmp_path / "other.mcap", parts=1)
+    with pytest.raises(LogError, match=r"2 sessions .* name one: other\.mcap, run\.mcap"):
+        Session(tmp_path)
+    # A file that only looks like a part is a session of its own.
+    (tmp_path / "other.mcap").rename(tmp_path / "alone_0002.mcap")
+    assert read(tmp_path / "alone_0002.mcap") == (recorder.truth(900), [])
+
+
+@pytest.mark.parametrize(
+    ("gone", "told"),
+    [
+        (1, r"part 1 (run.mcap) is missing"),
+        (2, r"part 2 (run_0002.mcap) is missing"),
+        (3, r"part 3 (run_0003.mcap) is missing; whether more followed it can't be told"),
+    ],
+)
+def test_a_missing_part_is_told(tmp_path, gone, told):
+    path = split_session(tmp_path / "run.mcap")
+    part_path(path, gone).unlink()
+    truth = recorder.truth(900)
+    del truth[300 * (gone - 1) : 300 * gone]
+    for number in {1, 2, 3} - {gone}:
+        assert read(part_path(path, number)) == (truth, [told])
+    assert read(tmp_path) == (truth, [told])
+    with Session(tmp_path) as session:
+        assert session.warnings == [told]
+    health = check_session(tmp_path)
+    assert health.verdict == "bad"
+    assert told in health.reasons
+
+
+def test_a_part_of_another_session_is_left_out(tmp_path):
+    split_session(tmp_path / "run.mcap")
+    with SessionWriter(
+        tmp_path / "x.mcap",
+        session_id="other",
+        epoch_ns=EPOCH_NS,
+        sink=(sink := DurableSink(tmp_path / "x.mcap")),
+    ) as writer:
+        channel = writer.string("/a")
+        channel.write(EPOCH_NS, "0")
+        sink.split()
+        channel.write(EPOCH_NS, "1")
+    (tmp_path / "x_0002.mcap").replace(tmp_path / "run_0002.mcap")
+    found, warnings = read(tmp_path / "run.mcap")
+    assert found == recorder.truth(900)[:300] + recorder.truth(900)[600:]
+    assert warnings == ["run_0002.mcap is of another session: left out"]
+
+
+def test_a_part_that_was_exchanged_is_told_by_log_check(tmp_path):
+    path = split_session(tmp_path / "run.mcap")
+    split_session(tmp_path / "x.mcap", count=1200)
+    (tmp_path / "x_0002.mcap").replace(tmp_path / "run_0002.mcap")
+    health = check_session(path)
+    assert health.verdict == "bad"
+    assert (
+        "run_0002.mcap is not the file that run_0003.mcap was recorded after: its hash is another"
+        in health.reasons
+    )
+
+
+def test_damage_in_a_part_names_it(tmp_path):
+    path = split_session(tmp_path / "run.mcap")
+    second = tmp_path / "run_0002.mcap"
+    raw = bytearray(second.read_bytes())
+    raw[len(raw) // 2] ^= 1
+    second.write_bytes(raw)
+    health = check_session(path)
+    assert any(text.startswith("run_0002.mcap: the chunk at byte") for text in health.file.damage)
+    found, warnings = read(path)
+    assert len(found) == 600
+    assert any("run_0002.mcap" in text for text in warnings)
+
+
+def test_edits_take_all_parts(tmp_path):
+    path = split_session(tmp_path / "run.mcap")
+    cut_log(tmp_path / "run_0003.mcap", tmp_path / "cut.mcap", start_s=0.25, stop_s=0.65)
+    assert read(tmp_path / "cut.mcap") == (recorder.truth(900)[250:650], [])
+    assert records(tmp_path / "cut.mcap", "undulog.part") == {}
+    merge_logs([path, tmp_path / "cut.mcap"], tmp_path / "merged.mcap")
+    assert len(read(tmp_path / "merged.mcap")[0]) == 1300

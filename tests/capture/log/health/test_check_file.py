@@ -1,0 +1,204 @@
+"""`undulog log check` against faults planted in the file, and logs of other makes."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType
+from mcap_ros2.writer import Writer as RosWriter
+
+import undulog
+from support.checked_sessions import (
+    EPOCH_NS,
+    JOINT_STATE,
+    NAMES,
+    ROBOT,
+    TICKS,
+    at,
+    gait,
+    timing_of,
+    write_raw,
+)
+from undulog.capture import SessionWriter
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.mcap.chunk import walk_records
+from undulog.capture.log.messages.schemas import schema_text
+
+
+def chunk_spans(path: Path, topic: str) -> list[tuple[int, int]]:
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    (key,) = (key for key, channel in summary.channels.items() if channel.topic == topic)
+    return [
+        (index.chunk_start_offset, index.chunk_length)
+        for index in summary.chunk_indexes
+        if key in index.message_index_offsets
+    ]
+
+
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.9])
+def test_a_flipped_bit_is_found_and_bad(clean: Path, tmp_path: Path, part: float) -> None:
+    start, length = chunk_spans(clean, "/joint_states")[0]
+    data = bytearray(clean.read_bytes())
+    data[start + 60 + int(part * (length - 60))] ^= 0x10
+    (tmp_path / "s.mcap").write_bytes(data)
+    health = check_session(tmp_path / "s.mcap")
+    assert health.verdict == "bad"
+    assert health.file.checked == health.file.chunks - 1
+    assert len(health.file.damage) == 1
+    assert "the chunk at byte" in health.file.damage[0]
+    left = timing_of(health).count
+    assert 0 < left < TICKS
+    held = re.search(r"; it held (\d+) messages: (\d+) of /joint_states$", health.file.damage[0])
+    assert held is not None  # the index tells it, whatever is around it in the file
+    assert int(held[1]) == int(held[2]) == TICKS - left
+    assert timing_of(health, "/joint_commands").count == TICKS
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
+    tmp_path: Path, compression: CompressionType, indexed: bool
+) -> None:
+    kinds = IndexType.ALL if indexed else IndexType.NONE
+    options = {"compression": compression, "chunk_size": 20_000, "index_types": kinds}
+    path = write_raw(tmp_path / "s.mcap", list(range(500)), **options)
+    data = bytearray(path.read_bytes())
+    chunks = [span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 6]
+    assert check_session(path).file.damage == ()
+    _, start, stop = chunks[2]
+    data[(start + stop) // 2] ^= 0x10
+    path.write_bytes(data)
+    health = check_session(path)
+    assert health.verdict == "bad"
+    assert len(health.file.damage) == 1
+    assert health.file.indexed is indexed
+
+
+def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "s.mcap", list(range(100)))
+    data = bytearray(path.read_bytes())
+    _, start, _ = next(span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 7)
+    data[start + 14 : start + 22] = data[start + 30 : start + 38]  # no CRC covers it
+    path.write_bytes(data)
+    health = check_session(path)
+    assert health.verdict == "bad"
+    assert "does not list its messages" in health.file.damage[0]
+
+
+def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "s.mcap", list(range(100)), enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    counts = struct.pack("<HQHQ", 1, 100, 2, 100)
+    assert data.count(counts) == 1
+    at_count = data.index(counts) + 2
+    data[at_count : at_count + 8] = struct.pack("<Q", 107)
+    path.write_bytes(data)
+    assert check_session(path).file.damage == (
+        "the summary counts 107 messages of /joint_commands, 100 are in the file",
+    )
+
+
+def test_a_flipped_bit_in_an_attachment_is_found(clean: Path, tmp_path: Path) -> None:
+    data = bytearray(clean.read_bytes())
+    data[data.index(b"+-30 degrees")] ^= 1
+    (tmp_path / "s.mcap").write_bytes(data)
+    health = check_session(tmp_path / "s.mcap")
+    assert health.verdict == "bad"
+    assert "the attachment" in health.file.damage[0]
+
+
+def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Path) -> None:
+    start, length = chunk_spans(clean, "/joint_states")[0]
+    (tmp_path / "s.mcap").write_bytes(clean.read_bytes()[: start + length // 2])
+    health = check_session(tmp_path / "s.mcap")
+    assert health.file.truncated
+    assert health.verdict == "degraded"
+    assert health.reasons[0].startswith("the file is cut short")
+    assert 0 < timing_of(health).count < TICKS
+
+
+def test_a_file_without_index_is_degraded(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False)
+    health = check_session(path)
+    assert not health.file.truncated
+    assert not health.file.indexed
+    assert health.verdict == "degraded"
+    assert timing_of(health).count == 300
+
+
+def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
+    health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), enable_crcs=False))
+    assert health.verdict == "good"
+    assert "carry no CRC" in health.notes[0]
+
+
+# -- foreign bags ----------------------------------------------------------------------------------
+
+
+def write_foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
+    """Each tick one message a list of names, as mcap-ros2-support writes them."""
+    with path.open("wb") as stream:
+        writer = RosWriter(stream)
+        schema = writer.register_msgdef(JOINT_STATE, schema_text(JOINT_STATE))
+        for tick in range(400):
+            for k, group in enumerate(names):
+                t_ns = at(tick) + k * 200_000
+                stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+                position = [float(np.sin(tick / 20 + k))] * len(group)
+                message = {"header": {"stamp": stamp}, "name": group, "position": position}
+                writer.write_message(topic, schema, message, log_time=t_ns, publish_time=t_ns)
+        writer.finish()
+    return path
+
+
+def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
+    path = write_foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
+    health = check_session(path)
+    assert {each.label: each.timing.gaps for each in health.series} == {
+        "/joint_states (a)": 0,
+        "/joint_states (b)": 0,
+        "/joint_states (c)": 0,
+    }
+    assert [each.sequence.kind for each in health.channels] == ["none"]
+    assert health.reasons == ("/joint_commands is missing; JointStates are on /joint_states",)
+
+
+def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
+    health = check_session(write_foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
+    assert health.verdict == "degraded"
+    assert "/joint_states is missing; JointStates are on /arm/state" in health.reasons
+    with SessionWriter(tmp_path / "t.mcap", session_id="t", epoch_ns=EPOCH_NS) as writer:
+        writer.string("/gait/mode").write(EPOCH_NS, "walk")
+    assert check_session(tmp_path / "t.mcap").verdict == "bad"
+
+
+def test_a_joint_that_never_speaks_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES[:-1], unit="rad")
+        for tick in range(300):
+            commands.write(at(tick), gait(tick))
+            states.write(at(tick), gait(tick)[:-1] + 1e-3 * np.sin(tick))
+    assert check_session(path).reasons == ("/joint_states never carries joint25",)
+
+
+def test_what_is_no_log_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"no log at all")
+    assert undulog.run(["log", "check", str(tmp_path / "x.mcap")]) == 1
+    assert "not an MCAP file" in capsys.readouterr().err
+
+
+def test_struct_of_the_chunk_header_is_that_of_the_spec(clean: Path) -> None:
+    start, _ = chunk_spans(clean, "/joint_states")[0]
+    head = clean.read_bytes()[start + 9 : start + 9 + 32]
+    begin, end, _, crc, size = struct.unpack("<QQQII", head)
+    assert EPOCH_NS <= begin <= end <= at(TICKS)
+    assert crc
+    assert size == len("zstd")

@@ -1,0 +1,73 @@
+"""Logs that are dropped without being closed, while others are read."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.paths import ROOT
+from undulog.capture import SessionWriter
+from undulog.capture.log.mcap.mcap_payloads import McapPayloads
+
+READS = """
+import gc, sys, weakref
+from undulog.capture.log.mcap.mcap_payloads import McapPayloads
+from pathlib import Path
+
+class Ring:
+    pass
+
+path = Path(sys.argv[1])
+for allocations in range(1, 60):  # after as many, the collector works: at each place once
+    gc.collect()
+    gc.disable()
+    ring = Ring()
+    ring.log, ring.ring = McapPayloads(path), ring
+    dropped = weakref.ref(ring)
+    del ring
+    log = McapPayloads(path)
+    gc.set_threshold(allocations)
+    gc.enable()
+    log.forget()
+    log.close()
+    gc.collect()
+    assert dropped() is None
+print("read")
+"""
+
+
+def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path: Path) -> None:
+    path = tmp_path / "some.mcap"
+    with SessionWriter(path, session_id="some", epoch_ns=1_735_689_600_000_000_000) as writer:
+        states = writer.joint_state("/joint_states", ("a", "b"), unit="rad")
+        for tick in range(100):
+            states.write(1_735_689_600_000_000_000 + tick * 10_000_000, np.zeros(2))
+    done = subprocess.run(
+        [sys.executable, "-c", READS, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=ROOT,
+    )
+    assert done.stdout == "read\n", done.stderr
+
+
+def test_an_interrupt_stays_one_where_a_frame_still_holds_bytes_of_the_log(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"0123456789" * 100)
+
+    def read(log: McapPayloads) -> None:
+        held = memoryview(log.buffer)[10:20]
+        try:
+            raise KeyboardInterrupt
+        finally:
+            log.close()
+            assert bytes(held) == b"0123456789"
+
+    with pytest.raises(KeyboardInterrupt):
+        read(McapPayloads(path))

@@ -1,0 +1,205 @@
+"""The write-ahead log: what goes in comes out, and the life of its segments."""
+
+import random
+import struct
+import time
+import zlib
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.writer import Writer
+
+from support.wal_messages import CHANNEL, check_messages, filled, message
+from undulog.capture.common.errors import (
+    DataError,
+    LogError,
+    LogWriteError,
+    NotALogError,
+    OutputExistsError,
+)
+from undulog.capture.log.wal.wal import WriteAheadLog, wal_folder
+from undulog.capture.log.wal.wal_recover import recover
+
+# -- what goes in comes out ----------------------------------------------------------------------
+
+
+def test_messages_come_back_bit_for_bit_over_many_segments(tmp_path):
+    folder = filled(tmp_path / "x.mcap.wal", 200)
+    assert len(list(folder.glob("0*.seg"))) > 10
+    recovery = recover(folder)
+    assert check_messages(list(recovery)) == list(range(1, 201))
+    assert (recovery.found, recovery.before, recovery.missing) == (200, 0, 0)
+    assert recovery.warnings == []
+
+
+def test_a_record_has_the_documented_layout(tmp_path):
+    with WriteAheadLog(tmp_path / "w") as wal:
+        wal.append(7, 11, 13, 17, b"payload")
+    raw = (tmp_path / "w" / "000001.seg").read_bytes()
+    assert raw[:64] == raw[-64:]
+    magic, stream, salt, number, size, _ = struct.unpack_from("<8sIIQQ16s", raw)
+    assert (magic, stream, number, size) == (b"\x89UWAL1\r\n", 0, 1, len(raw))
+    crc, *fields = struct.unpack_from("<IIQBBHIQQ", raw, 64)
+    assert fields == [7, 1, 5, 0xA5, 7, 17, 11, 13]
+    assert raw[104:111] == b"payload"
+    assert crc == zlib.crc32(raw[68:111], salt)
+    assert not any(raw[111:-64])
+
+
+def test_definitions_outlive_the_segments_that_are_released(tmp_path):
+    records = [
+        Header("ros2", "undulog"),
+        Schema(id=1, data=b"float64 data", encoding="ros2msg", name="std_msgs/msg/Float64"),
+        CHANNEL,
+        Metadata("undulog", {"session_id": "s", "ü": "ö"}),
+        Attachment(1, 2, "robot.toml", "application/toml", random.Random(1).randbytes(700_000)),
+    ]
+    with WriteAheadLog(tmp_path / "w", segment_size=4096) as wal:
+        for record in records:
+            wal.define(record)
+        for position in range(1, 101):
+            wal.append(*message(position))
+        wal.release(90)
+    recovery = recover(tmp_path / "w")
+    assert list(recovery.definitions) == records
+    positions = check_messages(list(recovery))
+    assert set(positions) >= set(range(91, 101))
+    assert recovery.before == positions[0] - 1 > 50
+
+
+def test_an_mcap_made_from_a_recovery_is_the_one_the_writer_would_have_made(tmp_path):
+    schema = Schema(id=1, data=b"string data", encoding="ros2msg", name="std_msgs/msg/String")
+    with WriteAheadLog(tmp_path / "w") as wal:
+        wal.define(schema)
+        wal.define(CHANNEL)
+        for position in range(1, 50):
+            wal.append(1, *message(position)[1:])
+    recovery = recover(tmp_path / "w")
+    with (tmp_path / "again.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        for record in recovery.definitions:
+            if isinstance(record, Schema):
+                writer.register_schema(record.name, record.encoding, record.data)
+            elif isinstance(record, Channel):
+                writer.register_channel(
+                    record.topic, record.message_encoding, record.schema_id, record.metadata
+                )
+        for item in recovery:
+            writer.add_message(
+                item.channel_id, item.log_time_ns, item.payload, item.publish_time_ns, item.sequence
+            )
+        writer.finish()
+    with (tmp_path / "again.mcap").open("rb") as file:
+        read = list(make_reader(file).iter_messages(log_time_order=False))
+    assert [m.data for _, _, m in read] == [message(p)[4] for p in range(1, 50)]
+    assert {(s.name, c.topic, c.metadata["unit"]) for s, c, _ in read} == {
+        ("std_msgs/msg/String", "/t", "rad")
+    }
+
+
+def test_a_message_longer_than_a_segment_has_one_of_its_own(tmp_path):
+    long = random.Random(3).randbytes(100_000)
+    with WriteAheadLog(tmp_path / "w", segment_size=4096) as wal:
+        wal.define(CHANNEL)
+        for payload in (b"a", long, b"", long, b"b"):
+            wal.append(1, 0, 0, 0, payload)
+    recovery = recover(tmp_path / "w")
+    assert [item.payload for item in recovery] == [b"a", long, b"", long, b"b"]
+    assert recovery.warnings == []
+
+
+@pytest.mark.parametrize(
+    "values",
+    [(1 << 16, 0, 0, 0), (-1, 0, 0, 0), (1, -1, 0, 0), (1, 0, 1 << 64, 0), (1, 0, 0, 1 << 32)],
+)
+def test_a_number_out_of_range_is_refused_and_leaves_no_trace(tmp_path, values):
+    with WriteAheadLog(tmp_path / "w") as wal:
+        wal.define(CHANNEL)
+        wal.append(1, 0, 0, 0, b"before")
+        with pytest.raises(DataError, match="out of range"):
+            wal.append(*values, b"x" * 1000)
+        assert wal.append(1, 0, 0, 0, b"after") == 2
+    recovery = recover(tmp_path / "w")
+    assert [item.payload for item in recovery] == [b"before", b"after"]
+    assert recovery.warnings == []
+
+
+def test_bytes_of_another_log_in_a_payload_are_not_taken_for_messages(tmp_path):
+    inner = filled(tmp_path / "inner", 3)
+    raw = (inner / "000001.seg").read_bytes()
+    with WriteAheadLog(tmp_path / "w") as wal:
+        wal.define(CHANNEL)
+        wal.append(1, 0, 0, 0, raw)
+        wal.append(1, 0, 0, 0, b"last")
+    segment = tmp_path / "w" / "000001.seg"
+    damaged = bytearray(segment.read_bytes())
+    damaged[64] ^= 1  # the outer record is broken: what it wraps is searched
+    segment.write_bytes(damaged)
+    recovery = recover(tmp_path / "w")
+    assert [(item.position, item.payload) for item in recovery] == [(2, b"last")]
+    assert recovery.before == 1
+
+
+# -- life and end of a log -----------------------------------------------------------------------
+
+
+def test_segments_go_when_released_and_the_folder_when_all_is(tmp_path):
+    folder = wal_folder(tmp_path / "x.mcap")
+    assert folder.name == "x.mcap.wal"
+    wal = WriteAheadLog(folder, segment_size=4096)
+    for position in range(1, 201):
+        wal.append(*message(position))
+    before = len(list(folder.glob("0*.seg")))
+    wal.release(150)
+    deadline = time.monotonic() + 10
+    while len(list(folder.glob("0*.seg"))) > before / 2:
+        assert time.monotonic() < deadline, "released segments are still there"
+        time.sleep(0.01)
+    assert check_messages(list(recover(folder)))[-1] == 200  # a log in use can be looked at
+    wal.release(200)
+    wal.close()
+    wal.close()
+    assert not folder.exists()
+    with pytest.raises(LogWriteError, match="closed"):
+        wal.append(1, 0, 0, 0, b"")
+    with pytest.raises(LogWriteError, match="closed"):
+        wal.define(CHANNEL)
+
+
+def test_a_log_that_was_not_released_is_kept_and_not_written_over(tmp_path):
+    filled(tmp_path / "w", 5)
+    with pytest.raises(OutputExistsError):
+        WriteAheadLog(tmp_path / "w")
+    assert len(list(recover(tmp_path / "w"))) == 5
+    (tmp_path / "w" / "note.txt").write_text("not ours")
+    with WriteAheadLog(tmp_path / "w", force=True) as wal:
+        wal.release(0)
+    assert [path.name for path in (tmp_path / "w").iterdir()] == ["note.txt"]
+
+
+def test_what_was_not_accepted_cannot_be_released(tmp_path):
+    with WriteAheadLog(tmp_path / "w") as wal:
+        with pytest.raises(DataError, match="go up to 0"):
+            wal.release(1)
+        wal.release(0)
+
+
+@pytest.mark.parametrize("options", [{"segment_size": 100}, {"sync_interval_s": 0.0}])
+def test_senseless_options_are_refused(tmp_path, options):
+    with pytest.raises(DataError, match="at least 4096"):
+        WriteAheadLog(tmp_path / "w", **options)
+    assert not (tmp_path / "w").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+    with pytest.raises(LogWriteError, match=r"no/w: can't be created: No such file"):
+        WriteAheadLog(tmp_path / "no" / "w")
+
+
+def test_what_is_no_log_is_told(tmp_path):
+    with pytest.raises(LogError, match="No such file"):
+        recover(tmp_path / "none")
+    with pytest.raises(NotALogError, match="no segment"):
+        recover(tmp_path)

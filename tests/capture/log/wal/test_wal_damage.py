@@ -1,0 +1,279 @@
+"""The write-ahead log against kills and damaged bytes."""
+
+import itertools
+import os
+import random
+import re
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+from support.wal_messages import CHANNEL, MESSAGE, check_messages, filled, message
+from undulog.capture.common.errors import LogError
+from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.wal_format import SegmentHeader
+from undulog.capture.log.wal.wal_recover import recover
+
+# -- the kill --------------------------------------------------------------------------------------
+
+KILLED = (
+    MESSAGE
+    + """
+import os, sys
+from mcap.records import Channel
+from undulog.capture.log.wal.wal import WriteAheadLog
+
+wal = WriteAheadLog(sys.argv[1], segment_size=int(sys.argv[2]), sync_interval_s=0.05)
+for channel in (1, 2, 3):
+    wal.define(Channel(channel, f"/{channel}", "cdr", {}, 0))
+while True:
+    position = wal.append(*message(wal.position + 1))
+    os.write(1, position.to_bytes(8, "little"))
+    if position % 500 == 0 and sys.argv[3] == "release":
+        wal.release(position - 200)
+"""
+)
+
+
+def kill_at(folder, seconds, segment_size, release):
+    """Run the child, kill it that long after its first message; the last position accepted."""
+    command = [sys.executable, "-c", KILLED, str(folder), str(segment_size), release]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
+        pipe = child.stdout.fileno()
+        told = os.read(pipe, 1 << 16)
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            if select.select([pipe], [], [], left)[0]:
+                told += os.read(pipe, 1 << 16)
+        child.kill()
+        while rest := os.read(pipe, 1 << 16):
+            told += rest
+    assert child.returncode == -9
+    assert told, "the child did not start"
+    whole = len(told) // 8 * 8
+    return int.from_bytes(told[whole - 8 : whole], "little")
+
+
+@pytest.mark.parametrize(
+    ("run", "segment_size", "release"),
+    [(0, 1 << 22, "keep"), (1, 1 << 14, "keep"), (2, 1 << 14, "release"), (3, 4096, "release")],
+)
+def test_a_kill_loses_no_accepted_message(tmp_path, run, segment_size, release):
+    seconds = random.Random(run).uniform(0.05, 0.4)
+    accepted = kill_at(tmp_path / "w", seconds, segment_size, release)
+    recovery = recover(tmp_path / "w")
+    positions = check_messages(list(recovery))
+    assert recovery.missing == 0
+    # The child may have been killed between accepting and telling.
+    assert positions[-1] in (accepted, accepted + 1)
+    assert recovery.before == 0 if release == "keep" else recovery.before <= accepted - 200
+    assert len(recovery.definitions) == 3
+
+
+@pytest.mark.slow
+def test_thirty_kills_lose_no_accepted_message(tmp_path):
+    rng = random.Random(11)
+    for run in range(30):
+        folder = tmp_path / str(run)
+        size = rng.choice([4096, 1 << 14, 1 << 20])
+        release = rng.choice(["keep", "release"])
+        accepted = kill_at(folder, rng.uniform(0.0, 0.5), size, release)
+        recovery = recover(folder)
+        positions = check_messages(list(recovery))
+        assert recovery.missing == 0
+        assert positions[-1] in (accepted, accepted + 1)
+        assert recovery.before == 0 if release == "keep" else recovery.before <= accepted - 200
+        shutil.rmtree(folder)
+
+
+# -- damage ----------------------------------------------------------------------------------------
+
+
+def record_places(raw):
+    """Where the records of an undamaged segment are."""
+    at, places = 64, []
+    while (head := struct.unpack_from("<IIQ", raw, at))[2]:
+        places.append(at)
+        at = (at + 40 + head[1] + 7) & -8
+    return places
+
+
+def test_a_torn_last_record_is_left_out(tmp_path):
+    folder = filled(tmp_path / "w", 10, segment_size=1 << 16)
+    segment = folder / "000001.seg"
+    whole = segment.read_bytes()
+    last = record_places(whole)[-1]
+    for written in range(1, 40 + len(message(10)[4]), 7):
+        segment.write_bytes(whole[: last + written].ljust(len(whole) - 64, b"\0") + whole[-64:])
+        recovery = recover(folder)
+        assert check_messages(list(recovery)) == list(range(1, 10)), written
+        assert recovery.missing == 0
+
+
+def test_damage_in_between_costs_only_what_it_hit(tmp_path):
+    folder = filled(tmp_path / "w", 60, segment_size=1 << 16)
+    segment = folder / "000001.seg"
+    raw = bytearray(segment.read_bytes())
+    places = record_places(raw)
+    raw[places[9] + 4] ^= 0xFF  # a length: where the next record is must be searched
+    raw[places[29] : places[32]] = bytes(places[32] - places[29])  # a block never written
+    raw[places[49] + 20] ^= 0x01  # a sequence number
+    segment.write_bytes(raw)
+    recovery = recover(folder)
+    assert check_messages(list(recovery)) == [
+        p for p in range(1, 61) if p not in (10, 30, 31, 32, 50)
+    ]
+    assert (recovery.found, recovery.missing) == (55, 5)
+    damage, missing = recovery.warnings
+    assert re.fullmatch(
+        rf"000001.seg: \d+ bytes are no whole records, the first at byte {places[9]}", damage
+    )
+    assert missing == "5 messages are missing between those found"
+
+
+def test_a_missing_segment_is_counted(tmp_path):
+    folder = filled(tmp_path / "w", 100)
+    gone = [item.position for item in recover(folder)]
+    (folder / "000003.seg").unlink()
+    recovery = recover(folder)
+    positions = check_messages(list(recovery))
+    assert recovery.missing == len(gone) - len(positions) > 0
+    assert recovery.warnings == [f"{recovery.missing} messages are missing between those found"]
+
+
+def test_a_broken_header_is_read_at_the_other_end(tmp_path):
+    folder = filled(tmp_path / "w", 10, segment_size=1 << 16)
+    segment = folder / "000001.seg"
+    raw = bytearray(segment.read_bytes())
+    raw[:64] = bytes(64)
+    segment.write_bytes(raw)
+    assert check_messages(list(recover(folder))) == list(range(1, 11))
+    raw[-64:] = bytes(64)
+    segment.write_bytes(raw)
+    recovery = recover(folder)
+    assert list(recovery) == []
+    assert recovery.warnings == ["000001.seg has no readable header; left out"]
+
+
+def test_strangers_among_the_segments_are_left_out(tmp_path):
+    folder = filled(tmp_path / "w", 100)
+    other = filled(tmp_path / "other", 100)
+    shutil.copy(other / "000002.seg", folder / "000099.seg")
+    shutil.copy(other / "000003.seg", folder / "000003.seg")
+    (folder / "000100.seg").mkdir()
+    recovery = recover(folder)
+    check_messages(list(recovery))
+    assert recovery.missing > 0
+    assert recovery.warnings[:3] == [
+        "000003.seg is of another log; left out",
+        "000099.seg is a renamed segment; left out",
+        "000100.seg can't be read: Is a directory; left out",
+    ]
+
+
+def test_messages_without_their_channel_are_given_out_and_told(tmp_path):
+    with WriteAheadLog(tmp_path / "w") as wal:
+        wal.define(CHANNEL)
+        wal.append(4, 0, 0, 0, b"stranger")
+    recovery = recover(tmp_path / "w")
+    assert [item.payload for item in recovery] == [b"stranger"]
+    assert recovery.warnings == ["messages of channels that are not defined: 4"]
+
+
+@pytest.fixture
+def quick_folder(tmp_path):
+    """A folder in memory where the machine has one: thousands of files come and go in it."""
+    memory = Path("/dev/shm")
+    place = memory if os.access(memory, os.W_OK) else tmp_path
+    with tempfile.TemporaryDirectory(dir=place) as folder:
+        yield Path(folder)
+
+
+def damage(rng, folder):
+    """Damage the files of a log in some of several ways; the names of those it hit."""
+    files = sorted(folder.glob("*.seg"))
+    last = max(folder.glob("0*.seg"))
+    hit = set()
+    for _ in range(rng.randint(1, 3)):
+        path = rng.choice(files)
+        if not path.exists():
+            continue
+        hit.add(path.name)
+        raw = bytearray(path.read_bytes())
+        at = rng.randrange(len(raw) + 1)
+        length = rng.choice([1, 2, 8, 64, 512])
+        kind = rng.randrange(6)
+        if kind == 0:  # bytes
+            for _ in range(rng.randint(1, 20)):
+                if raw:
+                    raw[rng.randrange(len(raw))] = rng.randrange(256)
+        elif kind == 1:  # a stretch of noise, zeros or ones
+            noise = rng.choice([rng.randbytes(length), bytes(length), b"\xff" * length])
+            raw[at : at + length] = noise[: len(raw) - at]
+        elif kind == 2:
+            del raw[at:]
+        elif kind == 3:  # bytes lost or doubled: all behind them moves
+            raw[at : at + length] = rng.choice([b"", 2 * raw[at : at + length]])
+        elif kind == 4:  # one block in the place of another
+            start = rng.randrange(len(raw) + 1)
+            raw[at : at + length] = raw[start : start + length]
+        elif path != last:  # that the last one is gone, nothing could tell
+            path.unlink()
+            continue
+        path.write_bytes(raw)
+    return hit
+
+
+def test_whatever_bytes_there_are_only_true_messages_come_out(tmp_path, quick_folder):
+    source = filled(tmp_path / "source", 40)
+    originals = {path.name: path.read_bytes() for path in source.iterdir()}
+    rng = random.Random(7)
+    outcomes = {"all": 0, "some": 0, "untold": 0, "none": 0}
+    folder = quick_folder
+    hit = set(originals)
+    for _ in range(3000):
+        for name in hit:
+            (folder / name).write_bytes(originals[name])
+        hit = damage(rng, folder)
+        try:
+            recovery = recover(folder)
+            found = list(recovery)
+        except LogError:
+            outcomes["none"] += 1
+            continue
+        positions = check_messages(found)
+        assert recovery.found == len(found)
+        if found:
+            gaps = sum(b - a - 1 for a, b in itertools.pairwise(positions))
+            assert (recovery.before, recovery.missing) == (positions[0] - 1, gaps)
+        whole = positions == list(range(1, 41))
+        told = recovery.before or recovery.missing or recovery.warnings
+        outcomes["all" if whole else "some" if told else "untold"] += 1
+    assert outcomes["all"] > 100
+    assert outcomes["some"] > 1000
+    assert outcomes["untold"] == 0
+
+
+def test_no_memory_is_given_to_a_length_before_it_is_vouched_for(tmp_path):
+    folder = tmp_path / "w"
+    folder.mkdir()
+    size = 300 << 20  # sparse: no disk is used
+    header = SegmentHeader(stream=0, salt=5, number=1, size=size, log_id=bytes(16)).pack()
+    for claimed in (200 << 20, 0xFFFF_FFFF):
+        record = struct.pack("<IIQBBHIQQ", 1, claimed, 1, 5, 0xA5, 1, 0, 0, 0)
+        with (folder / "000001.seg").open("wb") as file:
+            file.write(header + record)
+            file.truncate(size)
+        tracemalloc.start()
+        assert list(recover(folder)) == []
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 16 << 20

@@ -1,0 +1,79 @@
+"""The pages of a write-ahead log: who takes their faults, and what if somebody cuts them off."""
+
+import os
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from support.paths import ROOT
+from support.patience import wait_for
+from support.wal_messages import message
+from undulog.capture import Session
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.sources.sender import FrameSender
+
+PAGE = resource.getpagesize()
+
+
+def test_the_appending_thread_takes_no_page_faults(tmp_path):
+    payload = bytes(1000)
+    with WriteAheadLog(tmp_path / "w", sync_interval_s=0.05) as wal:
+        wal.append(1, 0, 0, 0, payload)
+        wait_for(lambda: wal.synced, "the first sync")
+        time.sleep(0.2)  # the pages ahead are there by now
+        before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+        for _ in range(200):  # 50 pages before each sync, 250 in all
+            for _ in range(5):
+                wal.append(1, 0, 0, 0, payload)
+            time.sleep(0.005)
+        faults = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+        wal.release(wal.position)
+    assert faults < 1000 * 1040 / PAGE / 4  # one a page and one a sync without help
+
+
+def test_a_page_that_is_written_no_more_is_synced_in_the_end(tmp_path):
+    with WriteAheadLog(tmp_path / "w", sync_interval_s=0.02) as wal:
+        for position in range(1, 1001):
+            wal.append(*message(position))
+        wait_for(lambda: wal.synced == 1000, "the last page")
+
+
+@pytest.mark.parametrize("size", [0, 2 * PAGE])
+def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
+    output, path = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    command = [sys.executable, "-m", "undulog", "record", f"bus=unix:{path}", "-o", str(output)]
+    command += ["--floor", "0", "--socket", str(tmp_path / "control.sock"), "--quiet"]
+    recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    frame, accepted = empty_frames(1), 1
+    try:
+        with FrameSender(path) as sender:
+            wait_for(lambda: sender.send(frame), "the recorder")
+            before = sender.refused
+            while recorder.poll() is None and sender.refused < before + 10:
+                frame["t_device_ns"] = number = accepted
+                accepted += sender.send(frame)
+                if number == 500:
+                    time.sleep(0.5)  # long enough to have taken them
+                    os.truncate(tmp_path / "run.mcap.wal" / "000001.seg", size)
+                time.sleep(0.001)
+        _, said = recorder.communicate(timeout=60)
+    finally:
+        if recorder.poll() is None:
+            recorder.kill()
+            recorder.wait()
+    assert recorder.returncode == 1, said
+    assert "000001.seg: was cut short by another program" in said
+    assert "Traceback" not in said
+    with output.open("rb") as stream:
+        assert make_reader(stream).get_summary() is not None  # a whole file
+    with Session.open(output) as session:
+        frames = session.frames("/can/bus")
+        np.testing.assert_array_equal(frames["t_device_ns"], np.arange(len(frames)))
+        assert 501 <= len(frames) <= accepted
+        assert not session.warnings

@@ -1,0 +1,288 @@
+"""The control socket against real clients: slow, silent, mad and many."""
+
+import contextlib
+import os
+import resource
+import signal
+import socket
+import threading
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from support.control_clients import (
+    PATIENCE_S,
+    connected,
+    drain,
+    echo,
+    end,
+    polled,
+    polls,
+    replies,
+    start_recorder,
+)
+from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder import control
+from undulog.capture.recorder.control import BUFFER, MAX_CLIENTS, ControlServer
+from undulog.capture.recorder.control_client import ControlClient
+
+
+@pytest.fixture
+def server(tmp_path):
+    """A server that the test polls."""
+    server = ControlServer(tmp_path / "c.sock", echo)
+    yield server
+    server.close()
+
+
+# -- requests and replies ------------------------------------------------------------------------
+
+
+def test_each_request_gets_its_reply_in_order_on_one_connection(server):
+    with connected(server) as client:
+        client.sendall(b"".join(b'{"do": "n", "k": %d}\n' % k for k in range(500)))
+        assert [reply["got"]["k"] for reply in drain(server, client, 500)] == list(range(500))
+    assert server.requests == 500
+
+
+def test_a_socket_can_be_claimed_before_it_is_served(tmp_path):
+    server = ControlServer(tmp_path / "c.sock")
+    with pytest.raises(ControlError, match="another recorder listens there"):
+        ControlServer(server.path)
+    with polled(server), ControlClient(server.path) as client:
+        with pytest.raises(ControlError, match="not begun yet"):
+            client.ask({"do": "x"})
+        server.serve(echo)
+        assert client.ask({"do": "x"}) == {"got": {"do": "x"}}
+    server.close()
+
+
+def test_a_request_may_come_in_pieces(server):
+    with connected(server) as client:
+        for byte in b'{"do": "x"}\n':
+            client.sendall(bytes([byte]))
+            server.poll()
+        assert drain(server, client, 1) == [{"ok": True, "got": {"do": "x"}}]
+
+
+def test_a_client_that_ends_its_side_still_hears_the_reply_even_without_a_newline(server):
+    with connected(server) as client:
+        client.sendall(b'{"do": "a"}\n{"do": "b"}')
+        client.shutdown(socket.SHUT_WR)
+        assert [reply["got"]["do"] for reply in drain(server, client, 2)] == ["a", "b"]
+        polls(server, lambda: server.clients == 0)
+        assert client.recv(10) == b""
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (b"status", "not JSON"),
+        (b"[1]", "a request is a JSON object"),
+        (b'"status"', "a request is a JSON object"),
+        (b'{"do": NaN}', "not JSON: NaN"),
+        (b"\xff\xfe\xfd", "not JSON"),
+        (b"[" * 60_000, "not JSON"),
+        (b"9" * 60_000, "not JSON"),
+        (b'{"do": "refuse"}', "not now"),
+        (b'{"do": "big", "size": 70000}', "the reply has"),
+    ],
+)
+def test_a_bad_request_gets_an_error_and_the_connection_lives(server, line, why):
+    with connected(server) as client:
+        client.sendall(line + b"\n" + b'{"do": "x"}\n')
+        bad, good = drain(server, client, 2)
+        assert not bad["ok"]
+        assert why in bad["error"]
+        assert good["ok"]
+
+
+def test_a_mistake_of_ours_is_told_and_ends_nothing(server):
+    with connected(server) as client:
+        client.sendall(b'{"do": "mistake"}\n{"do": "mistake", "nan": true}\n{"do": "x"}\n')
+        first, second, third = drain(server, client, 3)
+        assert "KeyError" in first["error"]
+        assert "ValueError" in second["error"]
+        assert third["ok"]
+    told = server.take_faults()
+    assert len(told) == 2
+    assert all("mistake" in text for text in told)
+    assert server.take_faults() == ()
+
+
+@given(st.binary(max_size=400))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_whatever_comes_each_line_gets_one_line(server, data):
+    wanted = sum(bool(line.strip()) for line in data.split(b"\n"))
+    with connected(server) as client:
+        polls(server, lambda: server.clients == 1)
+        client.sendall(data)
+        client.shutdown(socket.SHUT_WR)
+        got = b""
+        polls(server, lambda: server.clients == 0)
+        while piece := client.recv(65536):
+            got += piece
+    assert got.count(b"\n") == wanted
+    assert all("ok" in reply for reply in (replies(got) if got else []))
+
+
+# -- nobody holds the recorder up ----------------------------------------------------------------
+
+
+def test_a_client_that_never_reads_costs_bounded_memory_and_no_one_else_s_time(server):
+    with connected(server) as mad, connected(server) as good:
+        mad.setblocking(False)
+        request = b'{"do": "big", "size": 9000}\n' * 100
+        good.sendall(b'{"do": "x"}\n')
+        heard, polled_times, worst = b"", 0, 0
+        good.setblocking(False)
+        while polled_times < 2000:
+            with contextlib.suppress(BlockingIOError):
+                mad.send(request)
+            server.poll()
+            polled_times += 1
+            for client in server._clients.values():
+                worst = max(worst, len(client.outgoing), len(client.incoming))
+            with contextlib.suppress(BlockingIOError):
+                heard += good.recv(4096)
+        assert replies(heard) == [{"ok": True, "got": {"do": "x"}}]
+        assert worst <= 2 * BUFFER + 16 * 1024
+        good.sendall(b'{"do": "y"}\n')
+        assert drain(server, good, 1)[0]["got"] == {"do": "y"}
+        # Once it reads, it gets whole replies.
+        mad.settimeout(PATIENCE_S)
+        with polled(server):
+            data = b""
+            while data.count(b"\n") < 20:
+                data += mad.recv(65536)
+        whole = data[: data.rindex(b"\n") + 1]
+        assert all(len(reply["text"]) == 9000 for reply in replies(whole))
+
+
+def test_a_request_without_end_is_refused_and_the_client_let_go(server):
+    with connected(server) as client:
+        client.setblocking(False)
+        data = b""
+        for _ in range(1000):
+            with contextlib.suppress(BlockingIOError, BrokenPipeError):
+                client.send(b"x" * 8192)
+            server.poll()
+            if server.clients == 0 and data:
+                break
+            with contextlib.suppress(BlockingIOError):
+                data += client.recv(4096)
+        (reply,) = replies(data)
+        assert "longer than 65536 bytes" in reply["error"]
+        assert server.clients == 0
+
+
+def test_silent_clients_make_room_for_the_next_the_longest_silent_first(server):
+    silent = [connected(server) for _ in range(MAX_CLIENTS)]
+    polls(server, lambda: server.clients == MAX_CLIENTS)
+    for client in silent[1:]:
+        client.sendall(b'{"do": "x"}\n')
+        drain(server, client, 1)
+    with connected(server) as late:
+        late.sendall(b'{"do": "stop"}\n')
+        assert drain(server, late, 1)[0]["ok"]
+        assert server.clients == MAX_CLIENTS
+        (told,) = replies(silent[0].recv(4096))
+        assert not told["ok"]
+        assert silent[0].recv(10) == b""
+    for client in silent:
+        client.close()
+    polls(server, lambda: server.clients == 0)
+
+
+def test_a_flood_is_taken_in_portions(server, monkeypatch):
+    """With no budget left, one request a client and poll."""
+    monkeypatch.setattr(control, "BUDGET_NS", -1)
+    with connected(server) as client:
+        client.sendall(b'{"do": "x"}\n' * 50)
+        counts = []
+        polls(server, lambda: counts.append(server.requests) or server.requests == 50)
+        assert all(b - a <= 1 for a, b in pairwise(counts))
+        assert len(drain(server, client, 50)) == 50
+
+
+def test_clients_that_vanish_leave_nothing_behind(server):
+    for k in range(200):
+        client = connected(server)
+        client.sendall(b'{"do": "big", "size": 60000}\n' * (1 + k % 3))
+        if k % 2:
+            server.poll()
+        client.close()
+    for _ in range(10):
+        server.poll()
+    polls(server, lambda: server.clients == 0)
+    assert len(server._selector.get_map()) == 1
+
+
+def test_without_descriptors_the_recorder_goes_on(server):
+    """Clients are not served then, and that's all."""
+    with connected(server) as client:
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        used = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+        resource.setrlimit(resource.RLIMIT_NOFILE, (used, hard))
+        try:
+            spare = []
+            with contextlib.suppress(OSError):
+                while True:
+                    spare.append(os.dup(0))
+            for _ in range(10):
+                server.poll()
+        finally:
+            for handle in spare:
+                os.close(handle)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        client.sendall(b'{"do": "x"}\n')
+        assert drain(server, client, 1)[0]["ok"]
+
+
+# -- stop and wait -------------------------------------------------------------------------------
+
+
+def test_the_reply_to_a_later_answer_comes_with_the_close(server):
+    with polled(server):
+        client = connected(server)
+        client.sendall(b'{"do": "later"}\n{"do": "x"}\n')
+        deadline = time.monotonic() + PATIENCE_S
+        while not server.requests and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(0.05)
+    assert server.requests == 1, "what comes after waits"
+    server.close({"verdict": "good"})
+    server.close({"verdict": "twice"})
+    with client:
+        assert replies(client.recv(4096)) == [{"ok": True, "verdict": "good"}]
+
+
+def test_a_client_is_told_when_the_recorder_dies_before_it_answers(tmp_path):
+    path = tmp_path / "c.sock"
+    process = start_recorder(path)
+    try:
+        assert process.stdout.readline() == "ready\n"
+        with ControlClient(path) as client:
+            client.ask({"do": "x"})
+            process.send_signal(signal.SIGSTOP)
+            killer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
+            killer.start()
+            with pytest.raises(ControlError, match="the recorder went"):
+                client.ask({"do": "x"})
+            killer.join()
+    finally:
+        end(process)
+
+
+def test_a_recorder_that_hangs_is_told(tmp_path):
+    server = ControlServer(tmp_path / "c.sock", echo)
+    with (
+        ControlClient(server.path, patience_s=0.1) as client,
+        pytest.raises(ControlError, match=r"no answer in 0\.1 s"),
+    ):
+        client.ask({"do": "x"})
+    server.close()

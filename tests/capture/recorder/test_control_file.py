@@ -1,0 +1,192 @@
+"""The control socket's file: whose it is, who may take it over, and where it is found."""
+
+import contextlib
+import os
+import shutil
+import socket
+import stat
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from support.control_clients import (
+    PATIENCE_S,
+    connected,
+    drain,
+    echo,
+    end,
+    polled,
+    polls,
+    start_recorder,
+)
+from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder.control import TEND_POLLS, ControlServer
+from undulog.capture.recorder.control_client import ControlClient
+from undulog.capture.recorder.control_socket import default_sockets, find_sockets, socket_folder
+
+# -- the file ------------------------------------------------------------------------------------
+
+
+def test_only_its_user_can_reach_it_from_the_first_moment(tmp_path):
+    path = tmp_path / "c.sock"
+    seen, ended = set(), threading.Event()
+
+    def watch():
+        while not ended.is_set():
+            with contextlib.suppress(FileNotFoundError):
+                seen.add(stat.S_IMODE(os.lstat(path).st_mode))
+
+    before = os.umask(0)
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        for _ in range(300):
+            ControlServer(path, echo).close()
+            assert not path.exists()
+        held = ControlServer(path, echo)
+        deadline = time.monotonic() + PATIENCE_S
+        while not seen and time.monotonic() < deadline:
+            time.sleep(0.001)
+        held.close()
+    finally:
+        ended.set()
+        thread.join()
+        assert os.umask(before) == 0, "the umask is back as it was"
+    assert seen == {0o600}
+
+
+def test_a_second_recorder_is_refused_while_the_first_lives_and_succeeds_it_after_a_kill(tmp_path):
+    path = tmp_path / "c.sock"
+    first = start_recorder(path)
+    try:
+        assert first.stdout.readline() == "ready\n"
+        with pytest.raises(ControlError, match="another recorder listens there"):
+            ControlServer(path, echo)
+        with ControlClient(path) as client:
+            assert client.ask({"do": "x"}) == {}
+    finally:
+        end(first)
+    assert path.is_socket(), "a killed recorder leaves its socket"
+    with pytest.raises(ControlError, match="no recorder listens there"):
+        ControlClient(path)
+    ControlServer(path, echo).close()
+
+
+@pytest.mark.slow
+def test_of_many_recorders_that_find_a_stale_socket_one_gets_it(tmp_path):
+    path = tmp_path / "c.sock"
+    for _ in range(3):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stale:
+            stale.bind(str(path))
+        go = "print('up', flush=True); sys.stdin.readline()"
+        racers = [start_recorder(path, go) for _ in range(6)]
+        try:
+            for racer in racers:
+                assert racer.stdout.readline() == "up\n"
+            for racer in racers:
+                racer.stdin.write("go\n")
+                racer.stdin.flush()
+            said = [racer.stdout.readline() for racer in racers]
+            assert said.count("ready\n") == 1
+            assert sum("another recorder listens" in line for line in said) == 5
+            with ControlClient(path) as client:
+                assert client.ask({"do": "x"}) == {}
+        finally:
+            for racer in racers:
+                end(racer)
+        path.unlink()
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_what_is_no_socket_is_left_alone(tmp_path, kind):
+    path = tmp_path / "c.sock"
+    (tmp_path / "precious").write_text("data")
+    if kind == "file":
+        path.write_text("data")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(tmp_path / "precious")
+    with pytest.raises(ControlError, match="no socket"):
+        ControlServer(path, echo)
+    assert os.path.lexists(path)
+    assert (tmp_path / "precious").read_text() == "data"
+
+
+def test_an_impossible_path_is_told(tmp_path):
+    with pytest.raises(ControlError, match="at most 107 bytes"):
+        ControlServer(tmp_path / ("x" * 120), echo)
+    with pytest.raises(ControlError, match="No such file"):
+        ControlServer(tmp_path / "none" / "c.sock", echo)
+
+
+def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
+    path = tmp_path / "c.sock"
+    first = ControlServer(path, echo)
+    path.unlink()
+    second = ControlServer(path, echo)
+    first.close()
+    with polled(second), ControlClient(path) as client:
+        client.ask({"do": "x"})
+    second.close()
+
+
+def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_in(tmp_path):
+    session = tmp_path / "user"
+    session.mkdir()
+    path, _ = default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(session)})
+    server = ControlServer(path, echo)
+    with connected(server) as client:
+        client.sendall(b'{"do": "x"}\n')
+        drain(server, client, 1)
+        shutil.rmtree(session)
+        for _ in range(3 * TEND_POLLS):
+            server.poll()
+        session.mkdir()
+        polls(server, path.is_socket)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        with connected(server) as back:
+            back.sendall(b'{"do": "y"}\n')
+            assert drain(server, back, 1)[0]["got"] == {"do": "y"}
+        client.sendall(b'{"do": "z"}\n')
+        assert drain(server, client, 1)[0]["got"] == {"do": "z"}
+    server.close()
+    assert not path.exists()
+
+
+def test_the_usual_place_and_finding_what_runs(tmp_path):
+    environ = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    path, _ = default_sockets(Path("somewhere/run.mcap"), environ)
+    assert path == tmp_path / "undulog" / "run.sock"
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    stale = path.with_name("stale.sock")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
+        dead.bind(str(stale))
+    (path.parent / "file.sock").write_text("")
+    (path.parent / "service").mkdir()
+    one = ControlServer(path, echo)
+    two = ControlServer(path.parent / "service" / "a.sock", echo)
+    found = [p for p in find_sockets(environ) if tmp_path in p.parents]
+    assert found == sorted([path, path.parent / "service" / "a.sock"])
+    one.close()
+    two.close()
+    assert [p for p in find_sockets(environ) if tmp_path in p.parents] == []
+
+
+def test_a_service_has_its_own_folder_and_no_session_uses_the_temporary_one(tmp_path, monkeypatch):
+    service = {"RUNTIME_DIRECTORY": f"{tmp_path}/a:{tmp_path}/b", "XDG_RUNTIME_DIR": "/x"}
+    assert socket_folder(service) == tmp_path / "a"
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    for environ in ({}, {"XDG_RUNTIME_DIR": str(tmp_path / "gone")}):
+        assert socket_folder(environ) == tmp_path / f"undulog-{os.getuid()}"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
+def test_a_folder_of_another_user_is_not_trusted(tmp_path):
+    (tmp_path / "undulog").mkdir()
+    os.chown(tmp_path / "undulog", 65534, 65534)
+    with pytest.raises(ControlError, match="not a folder of this user"):
+        default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(tmp_path)})

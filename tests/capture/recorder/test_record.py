@@ -1,0 +1,434 @@
+"""``undulog record`` as its users run it: a process, real sockets, real signals, a full disk."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.paths import ROOT
+from support.patience import wait_for
+from undulog.capture import Session, load_robot
+from undulog.capture.common.interruption import StopRequest
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import DIR_TX, empty_frames
+from undulog.capture.recorder.live_health import LiveHealth
+from undulog.capture.recorder.record import Recording
+from undulog.capture.recorder.settings import resolve
+
+UNDULOG = [sys.executable, "-m", "undulog"]
+FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
+
+
+def command(output, *arguments):
+    control = output.with_name("control.sock")
+    return [*UNDULOG, "record", *arguments, "-o", str(output), "--socket", str(control)]
+
+
+@contextmanager
+def recording(output, *arguments, env=None, floor="0"):
+    """A recorder in another process; it is running when the block begins."""
+    process = subprocess.Popen(
+        [*command(output, *arguments), "--floor", floor, "--json"],
+        cwd=ROOT,
+        env=env,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        control = output.with_name("control.sock")
+        wait_for(lambda: control.exists() or process.poll() is not None, "the recorder")
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def ask(output, **request):
+    """One request over the control socket, by hand."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.settimeout(30)
+        client.connect(str(output.with_name("control.sock")))
+        client.sendall(json.dumps(request).encode() + b"\n")
+        data = b""
+        while not data.endswith(b"\n"):
+            got = client.recv(65536)
+            assert got, "the recorder hung up"
+            data += got
+    return json.loads(data)
+
+
+def ended(process):
+    out, err = process.communicate(timeout=60)
+    return json.loads(out) if out else None, err
+
+
+def events(path):
+    with Session.open(path) as session:
+        return [(message.name, message.msg) for _, message in session.messages("/rosout")]
+
+
+def polling(cycles, period_ns=10_000_000):
+    """Frames of a polling cycle of the shipped robot: each servo's command, then its answer."""
+    robot = load_robot("snake25")
+    frames = empty_frames(50 * cycles)
+    number = np.arange(len(frames))
+    joint = number // 2 % len(robot.joints)
+    is_command = number % 2 == 0
+    frames["t_device_ns"] = 10**9 + number * (period_ns // 50)
+    frames["id_flags"] = np.where(is_command, 257, 513) + joint
+    frames["dlc"] = np.where(is_command, 2, 8)
+    frames["dir"] = np.where(is_command, DIR_TX, 0)
+    hundredths = np.rint(2000 * np.sin(0.05 * number)).astype("<i2")
+    frames["data"][:, :2] = hundredths[:, None].view(np.uint8)
+    return frames, hundredths
+
+
+def send(path, frames, per_packet=50, pause_s=0.01, stamp=False):
+    wait_for(path.exists, "the source's socket")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
+        sender.connect(str(path))
+        for start in range(0, len(frames), per_packet):
+            packet = frames[start : start + per_packet]
+            if stamp:
+                packet["t_device_ns"] = time.monotonic_ns() - np.arange(len(packet))[::-1] * 100_000
+            sender.send(packet.tobytes())
+            time.sleep(pause_s)
+
+
+# -- sources ---------------------------------------------------------------------------------
+
+
+def test_frames_come_back_exactly_and_mean_what_the_map_says(tmp_path):
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    frames, hundredths = polling(40)
+    with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
+        send(bus, frames)
+        wait_for(
+            lambda: ask(output, do="status")["sources"][0]["frames"] == len(frames), "all frames"
+        )
+        assert ask(output, do="stop", wait=True)["ok"]
+        report, _ = ended(process)
+    assert process.returncode == 0
+    assert report["sources"]["can0"]["frames"] == len(frames)
+    with Session.open(output) as session:
+        kept = session.frames("/can/can0")
+        for field in ("t_device_ns", "id_flags", "dlc", "dir", "data"):
+            np.testing.assert_array_equal(kept[field], frames[field], err_msg=field)
+        assert (np.diff(kept["t_host_ns"].astype(np.int64)) >= 0).all()
+        states = session.joints("/joint_states")
+        commands = session.joints("/joint_commands")
+        for k, (measured, commanded) in enumerate(zip(states.values, commands.values, strict=True)):
+            mine = np.deg2rad(hundredths.reshape(-1, 25, 2)[:, k] / 100)
+            np.testing.assert_allclose(commanded, mine[:, 0], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(measured, mine[:, 1], rtol=0, atol=1e-12)
+        # All samples are on one clock: device times, shifted by one offset and a small drift.
+        device = frames["t_device_ns"].reshape(-1, 25, 2)
+        shift = np.array([states.t_ns[k] - device[:, k, 1].astype(np.int64) for k in range(25)])
+        assert np.ptp(shift) < 20_000_000
+        clock = session.metadata["undulog.clock"]
+        assert int(clock["can0.samples"]) == len(frames)
+        references = session.table("/clock/can0")
+        assert np.isin(references["time_ref.sec"] * 10**9 + references["time_ref.nanosec"],
+                       frames["t_device_ns"]).all()  # fmt: skip
+
+
+def test_the_verdict_at_the_end_is_that_of_a_check(tmp_path):
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    frames, _ = polling(300)
+    lost = np.ones(len(frames), dtype=bool)
+    lost[5000:7000] = False
+    with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
+        send(bus, frames[lost])
+        process.send_signal(signal.SIGTERM)
+        report, _ = ended(process)
+    health = check_session(output)
+    assert report["verdict"] == health.verdict == health.stored != "good"
+    assert tuple(report["reasons"]) == health.reasons == health.stored_reasons
+
+
+def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
+    output = tmp_path / "twin.mcap"
+    done = subprocess.run(
+        [*command(output, "twin:flat"), "--fast", "--duration", "4s", "--json", "--floor", "0"],
+        cwd=ROOT, check=True, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    report = json.loads(done.stdout)
+    assert report["robot"] == "snake25"
+    assert report["ended"] == "all sources have ended"
+    with Session.open(output) as session:
+        states = session.joints("/joint_states")
+        np.testing.assert_array_equal(np.diff(states.t_ns[0]), 10_000_000)
+        assert len(states.t_ns[0]) == report["sources"]["flat"]["frames"] == 401
+        assert {"scenario.toml", "robot.urdf", "robot.toml"} <= set(session.attachments)
+
+
+def test_a_source_that_can_never_work_leaves_no_file(tmp_path):
+    (tmp_path / "bus.sock").write_text("not a socket")
+    done = subprocess.run(
+        command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"),
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "is no socket" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["bus.sock"]
+
+
+def test_unknown_identifiers_are_told_and_kept(tmp_path):
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    frames, _ = polling(200)
+    frames["id_flags"][::50] = 0x7AB
+    with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
+        send(bus, frames)
+        process.send_signal(signal.SIGINT)
+        ended(process)
+    said = events(output)
+    assert ("can0", "identifiers that no database knows: 7AB") in said
+    assert ("can0", "200 frames of identifiers that no database knows: 7AB (200)") in said
+    with Session.open(output) as session:
+        assert (session.frames("/can/can0")["id_flags"] == 0x7AB).sum() == 200
+
+
+# -- the end ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_a_whole_file(number, tmp_path):
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    with recording(output, f"unix:{bus}") as process:
+        wait_for(bus.exists, "the source's socket")
+        process.send_signal(number)
+        report, err = ended(process)
+    assert (process.returncode, err) == (0, "")
+    assert report["ended"] == f"{number.name} was received"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap"]
+    assert check_session(output).file.indexed
+
+
+def test_a_mistake_in_what_looks_on_does_not_end_the_recording(tmp_path, monkeypatch):
+    def fails(self, now_ns):
+        raise ZeroDivisionError(f"at {now_ns}")
+
+    monkeypatch.setattr(LiveHealth, "step", fails)
+    bus = tmp_path / "bus.sock"
+    settings = resolve(
+        {
+            "sources": (f"can0=unix:{bus}",),
+            "output": tmp_path / "run.mcap",
+            "robot": "snake25",
+            "duration": 2.5,
+            "floor": 0,
+            "socket": tmp_path / "control.sock",
+        },
+        {},
+    )
+    frames, _ = polling(100)
+    sender = threading.Thread(target=send, args=(bus, frames))
+    sender.start()
+    report = Recording(settings, StopRequest()).run()
+    sender.join()
+    assert not report.ending.failed
+    with Session.open(tmp_path / "run.mcap") as session:
+        assert len(session.frames("/can/can0")) == len(frames)
+        assert len(session.joints("/joint_states").t_ns[0]) == 100
+        assert session.verdict == "degraded"
+    assert any("live health is given up" in text for _, text in events(tmp_path / "run.mcap"))
+
+
+def test_an_existing_file_is_not_replaced(tmp_path):
+    output = tmp_path / "run.mcap"
+    output.write_bytes(b"precious")
+    done = subprocess.run(
+        command(output, f"unix:{tmp_path / 'bus.sock'}"),
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "exists already" in done.stderr
+    assert output.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["cam:0"], "no kind of source 'cam'"),
+        (["unix:/tmp/a.sock", "unix:/tmp/b.sock", "--robot", "snake25"], "--bus NAME"),
+        (["unix:/tmp/a.sock", "--bus", "b"], "no such bus"),
+        (["twin:flat", "--robot", "snake13"], "brings the robot snake25"),
+        (["unix:/tmp/a.sock", "--fast"], "--fast"),
+        (["unix:/tmp/a.sock", "--split-size", "many"], "--split-size"),
+    ],
+)
+def test_wrong_usage_is_told_before_anything_is_made(arguments, said, tmp_path):
+    done = subprocess.run(
+        command(tmp_path / "run.mcap", *arguments),
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_space_to_begin_with(tmp_path):
+    done = subprocess.run(
+        [*command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"), "--floor", "900TB"],
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "less than the floor" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 64 MB."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(folder)],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    if mounted.returncode:
+        pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("floor", ["10MB", "0"], ids=["floor", "to the last byte"])
+def test_a_full_disk_ends_the_recording_in_good_order(floor, small_disk, tmp_path):
+    output, bus = small_disk / "run.mcap", tmp_path / "bus.sock"
+    rng = np.random.default_rng(0)
+    frames, _ = polling(400)
+    sent = []
+    with recording(output, f"can0=unix:{bus}", floor=floor) as process:
+        wait_for(bus.exists, "the source's socket")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
+            sender.connect(str(bus))
+            deadline = time.monotonic() + 120
+            while process.poll() is None and time.monotonic() < deadline:
+                frames["data"] = rng.integers(0, 256, frames["data"].shape)  # no compression
+                for start in range(0, len(frames), 250):
+                    try:
+                        sender.send(frames[start : start + 250].tobytes())
+                    except OSError:
+                        break
+                    sent.append(frames[start : start + 250].copy())
+        report, err = ended(process)
+    assert process.returncode == 1, err  # not -SIGBUS
+    assert "MB" in err or "space" in err
+    assert report["failed"]
+    with Session.open(output) as session:
+        kept = session.frames("/can/can0")
+        assert session.verdict is not None
+    assert check_session(output).file.indexed
+    sent = np.concatenate(sent)
+    for field in ("t_device_ns", "id_flags", "data"):
+        np.testing.assert_array_equal(kept[field], sent[field][: len(kept)], err_msg=field)
+    assert len(kept) > 100_000
+
+
+# -- time --------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_wall_clock_that_is_set_changes_no_order_and_no_duration(tmp_path):
+    if not FAKETIME.exists():
+        assert not os.environ.get("UNDULOG_REQUIRE_ALL_TESTS"), "faketime is not installed"
+        pytest.skip(f"{FAKETIME} is not installed")
+    wall = tmp_path / "wall"
+    wall.write_text("+0\n")
+    env = os.environ | {
+        "LD_PRELOAD": str(FAKETIME),
+        "FAKETIME_TIMESTAMP_FILE": str(wall),
+        "FAKETIME_NO_CACHE": "1",
+        "DONT_FAKE_MONOTONIC": "1",
+        "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        "FAKETIME_FORCE_MONOTONIC_FIX": "0",
+    }
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    frames, _ = polling(500)
+    with recording(output, f"can0=unix:{bus}", "--robot", "snake25", env=env) as process:
+        wait_for(bus.exists, "the source's socket")
+        began = time.monotonic()
+        send(bus, frames[:8000], stamp=True)
+        wall.write_text("+3600\n")
+        send(bus, frames[8000:16000], stamp=True)
+        wall.write_text("-3600\n")
+        send(bus, frames[16000:], stamp=True)
+        took_s = time.monotonic() - began
+        process.send_signal(signal.SIGINT)
+        ended(process)
+    with Session.open(output) as session:
+        kept = session.frames("/can/can0")
+        np.testing.assert_array_equal(kept["t_device_ns"], frames["t_device_ns"])
+        host = kept["t_host_ns"].astype(np.int64)
+        assert (np.diff(host) >= 0).all()
+        assert np.ptp(host) * 1e-9 == pytest.approx(took_s, abs=0.2)
+        assert session.duration_s == pytest.approx(took_s, abs=3.0)
+        for topic in ("/joint_states", "/joint_commands"):
+            t_ns = session.joints(topic).t_ns
+            assert all((np.diff(t) > 0).all() for t in t_ns)
+            assert np.ptp(t_ns[0]) * 1e-9 == pytest.approx(took_s, abs=0.2)
+        assert not [warning for warning in session.warnings if "back" in warning]
+
+
+# -- while it runs --------------------------------------------------------------------------------
+
+
+def test_an_operator_and_a_controller_speak_to_it(tmp_path):
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    with recording(output, f"unix:{bus}", "--operator", "Ada") as process:
+        assert ask(output, do="note", text="wet sand")["ok"]
+        assert ask(output, do="mark", text="slipped")["ok"]
+        values = {"horizontal.A": 0.4, "horizontal.omega": 3.0}
+        for k in range(3):
+            assert ask(output, do="gait", values=values | {"horizontal.A": 0.4 + k})["ok"]
+        assert ask(output, do="mode", text="walk")["ok"]
+        refused = ask(output, do="gait", values={"vertical.A": 1.0})
+        assert not refused["ok"]
+        assert "horizontal.A, horizontal.omega" in refused["error"]
+        assert not ask(output, do="dance")["ok"]
+        status = ask(output, do="status")
+        assert (status["output"], status["ok"]) == (str(output), True)
+        assert output.with_name("control.sock").stat().st_mode & 0o777 == 0o600
+        assert ask(output, do="stop", wait=True)["failed"] is False
+        ended(process)
+    said = [text for name, text in events(output) if name == "operator"]
+    assert said == ["wet sand", "mark: slipped"]
+    with Session.open(output) as session:
+        gait = session.joints("/gait")
+        assert gait.names == ("horizontal.A", "horizontal.omega")
+        assert gait.values[0].tolist() == [0.4, 1.4, 2.4]
+        assert [message.data for _, message in session.messages("/gait/mode")] == ["walk"]
+        assert session.metadata["undulog"]["operator"] == "Ada"
+
+
+def test_a_split_session_is_one_session(tmp_path):
+    output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    frames, _ = polling(300)
+    with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
+        send(bus, frames[:7500])
+        assert ask(output, do="split")["part"] == 2
+        send(bus, frames[7500:])
+        process.send_signal(signal.SIGINT)
+        report, _ = ended(process)
+    assert [Path(file).name for file in report["files"]] == ["run.mcap", "run_0002.mcap"]
+    for named in (output, tmp_path / "run_0002.mcap"):
+        with Session.open(named) as session:
+            kept = session.frames("/can/can0")
+            np.testing.assert_array_equal(kept["t_device_ns"], frames["t_device_ns"])
+            assert session.warnings == []
+    shutil.move(output, tmp_path / "elsewhere")
+    with Session.open(tmp_path / "run_0002.mcap") as session:
+        assert any("part" in warning for warning in session.warnings)

@@ -1,0 +1,339 @@
+"""``undulog record`` with faulty sources: impossible times, plug-ins that raise, simulated time.
+
+The senders here know what they sent; joint states are counted with mcap's own reader.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from support.paths import ROOT
+from support.patience import wait_for
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.log.messages.frames import DIR_TX, FrameArray, empty_frames
+from undulog.capture.log.write.channels import JointStateChannel
+from undulog.capture.recorder.bus_recorder import BusRecorder
+from undulog.capture.recorder.source_clock import SourceClock
+
+NS = 1_000_000_000
+CYCLES, JOINTS = 300, 25
+
+
+def polling() -> FrameArray:
+    """300 polling cycles of 10 ms: each servo's command, then its answer."""
+    assert len(load_robot("snake25").joints) == JOINTS
+    frames = empty_frames(2 * JOINTS * CYCLES)
+    number = np.arange(len(frames))
+    answers = number % 2 == 1
+    frames["t_device_ns"] = 1_700_000_000 * NS + number * 200_000
+    frames["id_flags"] = np.where(answers, 513, 257) + number // 2 % JOINTS
+    frames["dlc"] = np.where(answers, 8, 2)
+    frames["dir"] = np.where(answers, 0, DIR_TX)
+    return frames
+
+
+@contextmanager
+def recording(
+    folder: Path, *arguments: str, env: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """A recorder in another process; its output is ``run.mcap``."""
+    control = folder / "control.sock"
+    command = [sys.executable, "-m", "undulog", "record", *arguments]
+    command += ["-o", str(folder / "run.mcap"), "--socket", str(control), "--floor", "0", "--json"]
+    with subprocess.Popen(
+        command, cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def report_of(process: subprocess.Popen[str]) -> dict[str, Any]:
+    """The recorder's report."""
+    said, trouble = process.communicate(timeout=60)
+    assert "Traceback" not in trouble, trouble
+    assert said, trouble
+    return json.loads(said)
+
+
+def counts(path: Path) -> dict[str, int]:
+    """Messages of each topic, as mcap's own reader counts them."""
+    found: dict[str, int] = {}
+    with path.open("rb") as stream:
+        for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
+            found[channel.topic] = found.get(channel.topic, 0) + 1
+    return found
+
+
+def events(path: Path) -> list[tuple[str, str]]:
+    with Session.open(path) as session:
+        return [(message.name, message.msg) for _, message in session.messages("/rosout")]
+
+
+def send(path: Path, frames: FrameArray, pause_s: float = 0.004) -> None:
+    wait_for(path.exists, "the source's socket")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
+        sender.connect(str(path))
+        for start in range(0, len(frames), 2 * JOINTS):
+            sender.send(frames[start : start + 2 * JOINTS].tobytes())
+            time.sleep(pause_s)
+
+
+# -- impossible times ---------------------------------------------------------------------------
+
+ODD_NS = (1 << 63, (1 << 63) + 18 * 10**17 - 1, 1 << 62, (1 << 63) - 1, 2**64 - 1)
+
+
+@pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
+def test_an_impossible_device_time_ends_no_decoding(first: int, tmp_path: Path) -> None:
+    bus, frames = tmp_path / "bus.sock", polling()
+    odd = frames[first::200]
+    odd["t_device_ns"] = np.resize(np.array(ODD_NS, dtype=np.uint64), len(odd))
+    with recording(tmp_path, f"can0=unix:{bus}", "--robot", "snake25") as process:
+        send(bus, frames)
+        process.send_signal(signal.SIGTERM)
+        report = report_of(process)
+    assert counts(tmp_path / "run.mcap")["/joint_states"] == CYCLES
+    assert report["sources"]["can0"]["malformed"] == len(odd)
+    with Session.open(tmp_path / "run.mcap") as session:
+        kept = session.frames("/can/can0")
+        assert kept["t_device_ns"].tolist() == frames["t_device_ns"].tolist()  # raw, as they came
+        clock = session.metadata["undulog.clock"]
+        assert (clock["can0.resets"], clock["can0.out_of_range"]) == ("0", str(len(odd)))
+        for t_ns in session.joints("/joint_states").t_ns:
+            assert (np.diff(t_ns) > 0).all()
+    assert not [text for _, text in events(tmp_path / "run.mcap") if "failed" in text]
+
+
+TIMES = ("9300000000.0", "99999999999.0", "-1.5", "nan", "inf", "1e300", "9" * 300)
+"""What stands where socketcand writes a frame's time."""
+
+
+@pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
+def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path: Path) -> None:
+    frames = polling()[1::2]  # a server marks no directions: answers only
+    odd = range(first, len(frames), 200)
+    lines: list[bytes] = []
+    for k, frame in enumerate(frames):
+        t_ns = int(frame["t_device_ns"])
+        stamp = f"{t_ns // NS}.{t_ns % NS // 1000:06d}"
+        if k in odd:
+            stamp = TIMES[odd.index(k) % len(TIMES)]
+        lines.append(f"< frame {int(frame['id_flags']):03X} {stamp} {'00' * 8} >".encode())
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        client, _ = listener.accept()
+        with client:
+            client.sendall(b"< hi >")
+            for _ in range(2):
+                client.recv(1000)
+                client.sendall(b"< ok >")
+            for start in range(0, len(lines), JOINTS):
+                client.sendall(b"".join(lines[start : start + JOINTS]))
+                time.sleep(0.004)
+            client.recv(1)  # until the recorder leaves
+
+    server = threading.Thread(target=serve)
+    server.start()
+    address = f"can0=can:socketcand:can0?host=127.0.0.1&port={listener.getsockname()[1]}"
+    with listener, recording(tmp_path, address, "--robot", "snake25", "--duration", "4") as process:
+        report = report_of(process)
+    server.join()
+    assert counts(tmp_path / "run.mcap")["/joint_states"] == CYCLES
+    assert report["sources"]["can0"]["frames"] == len(frames)
+    assert report["sources"]["can0"]["malformed"] == len(odd)
+
+
+# -- decoding that fails --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", ["decode", "map", "write"])
+def test_a_failure_of_decoding_costs_the_frames_that_cause_it(
+    stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every 200th frame makes one stage raise, as a fault of the program would."""
+    decode, add, write = BusDecoder.decode, SourceClock.add, JointStateChannel.write
+    mapped: list[int] = []
+
+    def failing_decode(self: BusDecoder, frames: FrameArray) -> Any:
+        if (frames["t_device_ns"] % 200 == 1).any():
+            raise ZeroDivisionError("decode")
+        return decode(self, frames)
+
+    def failing_add(self: SourceClock, device: Any, host: Any) -> Any:
+        mapped.append(len(device))
+        if len(mapped) % 3 == 0:
+            raise ZeroDivisionError("map")
+        return add(self, device, host)
+
+    def failing_write(self: JointStateChannel, t_ns: int, *fields: Any, **options: Any) -> None:
+        mapped.append(1)
+        if len(mapped) % 11 == 0:
+            raise ZeroDivisionError("write")
+        write(self, t_ns, *fields, **options)
+
+    if stage == "decode":
+        monkeypatch.setattr(BusDecoder, "decode", failing_decode)
+    elif stage == "map":
+        monkeypatch.setattr(SourceClock, "add", failing_add)
+    else:
+        monkeypatch.setattr(JointStateChannel, "write", failing_write)
+    frames = polling()
+    odd = np.arange(len(frames)) % (20 * 2 * JOINTS) == 77  # in every 20th cycle
+    frames["t_device_ns"] += 200 - frames["t_device_ns"] % 200 + odd
+    robot, now_ns = load_robot("snake25"), [1_700_000_000 * NS]
+    path = tmp_path / "run.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=now_ns[0], robot=robot) as writer:
+        bus = BusRecorder("can0", writer, SourceClock(), robot, directions=True)
+        for cycle in np.split(frames, CYCLES):
+            now_ns[0] += 10_000_000
+            cycle["t_host_ns"] = now_ns[0]
+            bus.add(cycle)
+            bus.write_raw(lambda: now_ns[0])
+            bus.decode(lambda: now_ns[0], now_ns[0] + 1)
+        bus.finish(lambda: now_ns[0])
+        faults = bus.take_faults()
+    assert faults
+    assert all("decoding failed with ZeroDivisionError" in text for text in faults)
+    found = counts(path)
+    assert found["/can/can0"] > 0
+    with Session.open(path) as session:
+        assert len(session.frames("/can/can0")) == len(frames)
+        samples = sum(np.isfinite(v).sum() for v in session.joints("/joint_states").values)
+    if stage == "map":
+        assert samples == CYCLES * JOINTS
+    elif stage == "decode":
+        assert CYCLES * JOINTS - 2 * JOINTS * odd.sum() < samples < CYCLES * JOINTS
+    else:
+        assert samples > 0.8 * CYCLES * JOINTS
+
+
+def test_a_decoder_that_always_fails_ends_in_bounded_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries: list[int] = []
+
+    def fail(self: BusDecoder, frames: FrameArray) -> Any:
+        tries.append(len(frames))
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(BusDecoder, "decode", fail)
+    frames, robot = polling(), load_robot("snake25")
+    path = tmp_path / "run.mcap"
+    with SessionWriter(path, session_id="s", epoch_ns=NS, robot=robot) as writer:
+        bus = BusRecorder("can0", writer, SourceClock(), robot, directions=True)
+        bus.add(frames)
+        bus.finish(lambda: NS)
+        (fault,) = bus.take_faults()
+    assert f"{len(frames)} frames are kept raw only" in fault
+    assert len(tries) < 30 * -(-len(frames) // 256)
+    with Session.open(path) as session:
+        assert len(session.frames("/can/can0")) == len(frames)
+
+
+# -- simulated time and plug-ins ------------------------------------------------------------------
+
+
+def test_a_duration_ends_sources_of_simulated_time(tmp_path: Path) -> None:
+    bus = tmp_path / "bus.sock"
+    with recording(tmp_path, f"can0=unix:{bus}?clock=simulated", "--duration", "1.5") as process:
+        wait_for(bus.exists, "the source's socket")
+        report = report_of(process)
+    assert process.returncode == 0
+    assert report["ended"] == "1.5 s are over"
+    assert 1.5 <= report["duration_s"] < 10
+
+
+PLUG_IN = """
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.robot.model import ClockDomain
+from undulog.capture.sources.contract import Polled, SourceCounts
+
+class Source:
+    clock, robot, directions, facts = ClockDomain.HOST, None, False, {}
+    connected, finished = True, False
+    def __init__(self, address):
+        self.name, self.fails, self.counts = address.name, address.rest.split(","), SourceCounts()
+        self.fail("open")
+    def fail(self, where):
+        if where in self.fails:
+            raise ZeroDivisionError(f"in {where}")
+    def start(self, context):
+        self.now_ns = context.now_ns
+        self.fail("start")
+    def poll(self):
+        self.fail("poll")
+        if "rubbish" in self.fails:
+            return None
+        frames = empty_frames(1) if "dtype" not in self.fails else [1, 2]
+        if "dtype" not in self.fails:
+            frames["t_host_ns"] = frames["t_device_ns"] = self.now_ns()
+        return Polled((frames,))
+    def stop(self):
+        self.fail("stop")
+"""
+
+
+@pytest.fixture
+def plugged(tmp_path: Path) -> dict[str, str]:
+    """The environment of a command that finds a plug-in with the scheme ``faulty``."""
+    folder = tmp_path / "plug-in"
+    info = folder / "faulty-1.0.dist-info"
+    info.mkdir(parents=True)
+    (folder / "faulty_source.py").write_text(PLUG_IN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[undulog.sources]\nfaulty = faulty_source:Source\n")
+    path = os.pathsep.join([str(ROOT), str(folder)])
+    return {**os.environ, "PYTHONPATH": path}
+
+
+@pytest.mark.parametrize("where", ["open", "start,stop"])
+def test_a_plug_in_that_fails_to_start_is_an_error_with_its_name(
+    where: str, plugged: dict[str, str], tmp_path: Path
+) -> None:
+    good = f"can0=unix:{tmp_path / 'bus.sock'}"
+    with recording(tmp_path, good, f"bad=faulty:{where}", env=plugged) as process:
+        said, trouble = process.communicate(timeout=60)
+    assert (process.returncode, said) == (1, "")
+    assert "Traceback" not in trouble
+    assert trouble.startswith(("error: bad=faulty:open: ", "error: bad: "))
+    assert "ZeroDivisionError" in trouble
+    assert [path.name for path in tmp_path.iterdir()] == ["plug-in"]
+
+
+@pytest.mark.parametrize("where", ["poll,stop", "rubbish", "dtype"])
+def test_a_plug_in_that_fails_later_is_given_up_alone(
+    where: str, plugged: dict[str, str], tmp_path: Path
+) -> None:
+    bus, frames = tmp_path / "bus.sock", polling()[: 50 * 2 * JOINTS]
+    sources = [f"can0=unix:{bus}", f"bad=faulty:{where}"]
+    with recording(tmp_path, *sources, env=plugged) as process:
+        send(bus, frames)
+        process.send_signal(signal.SIGTERM)
+        report = report_of(process)
+    assert process.returncode == 1
+    assert "given up before, see /rosout: bad" in report["ended"]
+    assert report["sources"]["can0"]["frames"] == len(frames)
+    told = [text for name, text in events(tmp_path / "run.mcap") if name == "bad"]
+    if where != "stop":
+        assert any(text.startswith("this source is given up: it failed with") for text in told)
+    with Session.open(tmp_path / "run.mcap") as session:
+        assert len(session.frames("/can/can0")) == len(frames)

@@ -1,0 +1,74 @@
+"""The stored verdict and clock of a real recording, against what was done to its source."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from support.paths import ROOT
+from support.patience import wait_for
+from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.sources.records import HEAD
+
+NS = 1_000_000_000
+
+
+def send(path: Path, seconds: float, lost: int) -> int:
+    """Frames at about 1 kHz on a clock that runs 80 ppm fast; some numbers are never sent."""
+    sequence = sent = 0
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
+        sock.connect(str(path))
+        begun = time.monotonic_ns()
+        while (now := time.monotonic_ns()) - begun < seconds * NS:
+            frames = empty_frames(1)
+            frames["t_device_ns"] = 5 * NS + (now - begun) + (now - begun) // 12_500
+            frames["id_flags"], frames["dlc"] = 0x123, 8
+            if sent == 1000:
+                sequence += lost
+            sock.send(HEAD.pack(sequence, 0) + frames.tobytes())
+            sequence, sent = sequence + 1, sent + 1
+            time.sleep(0.001)
+    return sent
+
+
+@pytest.mark.slow
+def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) -> None:
+    output, source = tmp_path / "run.mcap", tmp_path / "snake.sock"
+    command = [sys.executable, "-m", "undulog", "record", f"bus=unix:{source}", "-o", str(output)]
+    command += ["--socket", str(tmp_path / "control.sock"), "--floor", "0", "--json"]
+    with subprocess.Popen(
+        command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as recorder:
+        try:
+            wait_for(lambda: source.exists() or recorder.poll() is not None, "the source")
+            sent = send(source, seconds=10.0, lost=12)
+            recorder.send_signal(signal.SIGINT)
+            said, trouble = recorder.communicate(timeout=60)
+        finally:
+            recorder.kill()
+    assert recorder.returncode == 0, trouble
+    report = json.loads(said)
+    health = check_session(output)
+    assert (health.stored, health.stored_reasons) == (health.verdict, health.reasons)
+    assert (report["verdict"], tuple(report["reasons"])) == (health.verdict, health.reasons)
+    (found,) = health.sources
+    assert (found.name, found.frames, found.dropped) == ("bus", sent, 12)
+    assert any(f"source bus lost 12 of {sent + 12} frames" in text for text in health.reasons)
+    with output.open("rb") as stream:
+        facts = {m.name: m.metadata for m in make_reader(stream).iter_metadata()}
+    clock = facts["undulog.clock"]
+    unsure = float(clock["bus.drift_uncertainty_ppm"])
+    assert float(clock["bus.drift_ppm"]) == pytest.approx(80.0, abs=10.0 + 4 * unsure)
+    assert int(clock["bus.samples"]) == sent
+    assert clock["bus.resets"] == "0"
+    assert np.abs(int(clock["bus.offset_ns"]) - (health.start_ns - 5 * NS)) < 60 * NS

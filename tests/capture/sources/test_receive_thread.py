@@ -1,0 +1,296 @@
+"""Sockets emptied beside the interpreter, the end of a recording, and the priority asked for.
+
+The senders are other processes; what ``send()`` returned to them is the truth.
+"""
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import bus_sender
+import numpy as np
+import pytest
+
+from support.paths import ROOT
+from support.patience import wait_for
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.common.priority import raised_priority
+from undulog.capture.log.messages.frames import empty_frames
+from undulog.capture.recorder.bus_recorder import BusRecorder
+from undulog.capture.recorder.source_clock import SourceClock
+from undulog.capture.sources.receive_thread import ReceiveThread
+
+# One frame a packet, never waiting; at each line of stdin so many, with 0.1 ms between.
+SENDER = """
+import socket, struct, sys, time
+peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+while peer.connect_ex(sys.argv[1]):
+    time.sleep(0.01)
+peer.setblocking(False)
+number = 0
+for line in sys.stdin:
+    refused, times = 0, []
+    for _ in range(int(line)):
+        try:
+            peer.send(struct.pack("<QQIBB2x8s", number, 0, 1, 8, 0, bytes(8)))
+            number += 1
+        except BlockingIOError:
+            refused += 1
+        except OSError:
+            break
+        times.append(time.time_ns())
+        time.sleep(0.0001)
+    print(number, refused, *times, flush=True)
+"""
+
+
+class Sender:
+    """A sender in another process."""
+
+    def __init__(self, path):
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", SENDER, str(path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def start(self, count):
+        self.process.stdin.write(f"{count}\n")
+        self.process.stdin.flush()
+
+    def result(self):
+        """Frames accepted since the start, refused of the last ones, when each was sent."""
+        accepted, refused, *times = map(int, self.process.stdout.readline().split())
+        return accepted, refused, times
+
+    def close(self):
+        self.process.kill()
+        self.process.communicate()
+
+
+def hold_the_interpreter(seconds):
+    """A C call that keeps the interpreter's lock."""
+    began, letters = time.monotonic(), 18
+    while (took := time.monotonic() - began) < seconds:
+        began = time.monotonic()
+        re.match(r"(a+)+$", "a" * letters + "b")
+        took = time.monotonic() - began
+        letters += took < seconds
+    assert took >= seconds
+
+
+def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
+    """An AF_UNIX socket of the default size holds 277 such packets."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(tmp_path / "s"))
+        listener.listen()
+        sender = Sender(tmp_path / "s")
+        try:
+            receiver = ReceiveThread(listener.accept()[0], 100)
+            sizes, stamps = [], []
+
+            def taken(count):
+                for batch in receiver.take(10_000):
+                    sizes.extend(batch.sizes)
+                    stamps.extend(batch.stamps_ns)
+                return len(sizes) >= count
+
+            sender.start(1500)  # from now on there is room for 1024 at a time
+            accepted, _, _ = sender.result()
+            wait_for(lambda: taken(accepted), "the first packets")
+            before = accepted
+            sender.start(500)
+            hold_the_interpreter(1.0)
+            accepted, refused, sent_ns = sender.result()
+            assert refused == 0
+            wait_for(lambda: taken(accepted), "all packets")
+            assert sizes == [32] * accepted
+            apart = np.array(stamps[before:]) - np.array(sent_ns)
+            assert np.percentile(apart, 90) <= 0  # the kernel's time, not ours
+            receiver.close()
+        finally:
+            sender.close()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
+    path, output = tmp_path / "bus.sock", tmp_path / "run.mcap"
+    recorder = start_recorder(output, f"bus=unix:{path}")
+    sender = Sender(path)
+    try:
+        wait_for(path.exists, "the recorder")
+        sender.start(1_000_000)
+        wait_for((output.parent / "run.mcap.wal").exists, "the log")
+        time.sleep(1.0 + seed / 7)
+        recorder.send_signal(signal.SIGINT)
+        out, err = recorder.communicate(timeout=60)
+        accepted, _, _ = sender.result()  # its send() failed: it knows that nobody records
+    finally:
+        stop(recorder)
+        sender.close()
+    assert recorder.returncode == 0, err
+    with Session.open(output) as session:
+        numbers = session.frames("/can/bus")["t_device_ns"]
+    np.testing.assert_array_equal(numbers, np.arange(accepted))
+    assert json.loads(out)["sources"]["bus"]["frames"] == accepted
+
+
+def test_a_stream_is_kept_up_to_the_end(tmp_path):
+    """socketcand can't refuse: what was sent before the signal is there, and nothing is missing."""
+    output = tmp_path / "run.mcap"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        recorder = start_recorder(output, f"bus=can:socketcand:can0?host=127.0.0.1&port={port}")
+        try:
+            client, _ = server.accept()
+            with client:
+                client.sendall(b"< hi >")
+                for _ in range(2):
+                    client.recv(4096)
+                    client.sendall(b"< ok >")
+                for number in range(4000):
+                    if number == 3000:
+                        recorder.send_signal(signal.SIGINT)
+                        signalled_ns = time.time_ns()
+                    try:
+                        client.sendall(b"< frame 1 %d.000000 11 >" % number)
+                    except OSError:
+                        break
+                    time.sleep(0.0002)
+                _, err = recorder.communicate(timeout=60)
+        finally:
+            stop(recorder)
+    assert recorder.returncode == 0, err
+    with Session.open(output) as session:
+        frames = session.frames("/can/bus")
+    seconds = frames["t_device_ns"] // 1_000_000_000
+    np.testing.assert_array_equal(seconds, np.arange(len(seconds)))
+    assert len(seconds) >= 3000
+    assert frames["t_host_ns"][2999] < signalled_ns + 1_000_000
+
+
+def test_decoding_stops_when_its_time_is_over(tmp_path):
+    """Also within what one slice of frames gives; nothing is lost or doubled by it."""
+    robot = load_robot("snake25")
+    frames = bus_sender.payloads(bus_sender.cycle_frames(), 0, 2000, 9000.0, 10**18)
+    frames["t_host_ns"] = frames["t_device_ns"]
+    for name, until_ns in (("whole", 1 << 62), ("bits", 5)):
+        path = tmp_path / f"{name}.mcap"
+        with SessionWriter(path, session_id=name, epoch_ns=10**18, robot=robot) as writer:
+            bus = BusRecorder("bus", writer, SourceClock(), robot, directions=True)
+            bus.add(frames.copy())
+            bus.write_raw(lambda: 10**18)
+            calls, most = 0, 0
+            while (bus.behind or bus.backlog) and calls < 100_000:
+                looks = iter(range(1, 1 << 40))  # a clock that goes on by 1 ns a look
+                bus.decode(lambda looks=looks: next(looks), until_ns)
+                most = max(most, next(looks))
+                calls += 1
+            bus.finish(lambda: 1)
+        assert name == "whole" or (most <= until_ns + 2 and calls > 100)
+    sessions = [Session.open(tmp_path / f"{name}.mcap") for name in ("whole", "bits")]
+    for topic in ("/joint_states", "/joint_commands", "/joint_sample_offset"):
+        first, second = (sorted(m.data for m in raw(each, topic)) for each in sessions)
+        assert first == second
+        assert len(first) > 10
+    for each in sessions:
+        each.close()
+
+
+def raw(session, topic):
+    from mcap.reader import make_reader
+
+    with session.path.open("rb") as stream:
+        yield from (message for _, _, message in make_reader(stream).iter_messages([topic]))
+
+
+def start_recorder(output, source, *before):
+    command = [*before, sys.executable, "-m", "undulog", "record", source, "-o", str(output)]
+    command += ["--floor", "0", "--quiet", "--json"]
+    return subprocess.Popen(
+        [*command, "--socket", str(output.with_name("control.sock"))],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def stop(process):
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+
+
+root_only = pytest.mark.skipif(
+    os.geteuid() != 0 or shutil.which("setpriv") is None, reason="needs root and setpriv"
+)
+
+
+def permitted(call):
+    """Whether the system lets a process of ours do this."""
+    code = f"import os; os.{call}"
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True)
+    return done.returncode == 0
+
+
+def test_priority_is_what_the_system_grants_and_is_given_back():
+    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+    before = policy, os.getpriority(os.PRIO_PROCESS, 0)
+    real_time = permitted("sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))")
+    nicer = permitted("setpriority(os.PRIO_PROCESS, 0, -10)")
+    alone = before[0] != os.SCHED_OTHER or before[1] > 0  # as whoever started it wants it
+    with raised_priority() as got:
+        assert got.refused == (not alone and not real_time and not nicer)
+        policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        assert policy == (os.SCHED_RR if real_time and not alone else before[0])
+        if nicer and not real_time and not alone:
+            assert os.getpriority(os.PRIO_PROCESS, 0) == min(before[1], -10)
+        child = "import os; print(os.sched_getscheduler(0))"
+        done = subprocess.run([sys.executable, "-c", child], check=True, capture_output=True)
+        assert int(done.stdout) == (before[0] if alone else os.SCHED_OTHER)
+    after = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+    assert (after, os.getpriority(os.PRIO_PROCESS, 0)) == before
+
+
+@root_only
+@pytest.mark.parametrize(
+    ("before", "text"),
+    [
+        (("setpriv", "--bounding-set=-sys_nice"), "refused: nice 0"),
+        (("nice", "-n", "5"), "as it was started: nice 5"),
+    ],
+)
+def test_the_recorder_reports_its_priority(before, text, tmp_path):
+    output, path = tmp_path / "run.mcap", tmp_path / "bus.sock"
+    recorder = start_recorder(output, f"bus=unix:{path}", *before)
+    try:
+        wait_for(path.exists, "the recorder")
+        time.sleep(0.5)
+        recorder.send_signal(signal.SIGINT)
+        out, _ = recorder.communicate(timeout=60)
+    finally:
+        stop(recorder)
+    assert json.loads(out)["recorder"]["priority"] == text
+    with Session.open(output) as session:
+        said = [message.msg for _, message in session.messages("/rosout")]
+    assert any("priority was refused" in line for line in said) == text.startswith("refused")
+
+
+def test_a_quiet_sender_has_no_frames():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        receiver = ReceiveThread(ours, 100)
+        assert receiver.take(10) == []
+        assert not receiver.ended
+        theirs.send(empty_frames(1).tobytes())
+        wait_for(lambda: receiver.take(10), "the packet")
+    wait_for(lambda: receiver.take(10) is not None and receiver.ended, "the end")
+    receiver.close()

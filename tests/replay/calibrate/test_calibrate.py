@@ -1,0 +1,328 @@
+"""The twin fitted to sessions of twins whose parameters are hidden, and to a real servo."""
+
+import math
+import signal
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import undulog as front
+from support.paths import TRACE
+from support.twin_fits import fitted, room_for
+from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture.common.interruption import StopRequest
+from undulog.replay.calibrate.determined import ridges
+from undulog.replay.calibrate.lack_of_fit import misfit
+from undulog.replay.calibrate.noise import memory, score_covariance
+from undulog.replay.calibrate.parameters import Unknown
+from undulog.replay.calibrate.solve import solve
+from undulog.replay.commands import fit as cli
+from undulog.sim.scenario.scenario_file import load_scenario
+
+AIR = """description = "One joint in the air."
+robot = "arcsnake-joint"
+duration_s = 9.0
+[gait.horizontal]
+amplitude = 0.1
+frequency_hz = 0.5
+lag = 0.0
+[world]
+gravity = [0.0, 0.0, 0.0]
+surface = "none"
+"""
+
+
+def assert_true_or_open(found, truth):
+    """Within 3 % or undetermined, and in the interval."""
+    for key, value in truth.items():
+        one = found[key]
+        low, high = one["ci95"]
+        assert low <= value <= high, one
+        assert not one["determined"] or one["value"] == pytest.approx(value, rel=0.03), one
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    hidden = "[servo]\nstall_torque = 0.33\ncoulomb_friction = 0.025\n"
+    return room_for(tmp_path_factory.mktemp("small"), 3, 4.5, hidden, noise=0.001)
+
+
+TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03")
+
+
+def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
+    output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
+    report, found = fitted(small, capsys, *TWO, "-o", str(output), "--scenario", str(world))
+    truth = {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025}
+    assert_true_or_open(found, truth)
+    assert found["stall_torque", None]["determined"]
+    assert report["converged"]
+    assert report["rms_rad"]["after"] == pytest.approx(0.001, rel=0.05)  # the encoders' noise
+    assert report["rms_rad"]["before"] > report["rms_rad"]["after"]
+    assert report["residual_memory_samples"] < 2.0
+    servo = load_robot(output).joints[1].servo
+    assert servo.stall_torque == found["stall_torque", None]["value"]
+    assert servo.gear_stiffness == 12.0  # what wasn't fitted stays
+    assert "[defaults.servo]  # of the data sheet\n" in output.read_text()
+    again = load_scenario(str(world))
+    assert again.robot.joints[0].servo == servo
+    assert again.duration_s == pytest.approx(4.5)
+
+
+def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
+    late_s = 0.012
+    with Session.open(small / "run.mcap") as session:
+        commands, states = (session.joints(t) for t in ("/joint_commands", "/joint_states"))
+        robot = session.robot
+    with SessionWriter(
+        tmp_path / "late.mcap", session_id="late", epoch_ns=int(commands.t_ns[0][0]), robot=robot
+    ) as writer:
+        for topic, signals, shift in (
+            ("/joint_commands", commands, 0),
+            ("/joint_states", states, round(late_s * 1e9)),
+        ):
+            channel = writer.joint_state(topic, signals.names, unit="rad")
+            rows = np.array(signals.values).T
+            for t_ns, row in zip(signals.t_ns[0].tolist(), rows, strict=True):
+                channel.write(t_ns + shift, row)
+    for name in ("robot.toml", "nominal.toml"):
+        (tmp_path / name).write_text((small / name).read_text())
+    words = (*TWO, "--delay", "--settle", "1.5", "-o", str(tmp_path / "fitted.toml"))
+    _, found = fitted(tmp_path, capsys, *words, source="late.mcap")
+    low, high = found["delay", None]["ci95"]
+    assert low <= late_s <= high
+    assert high - low < 0.004
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("-o a.json", "end its name in .toml"),
+        ("-o a.toml --scenario a.toml", "that is the robot's file"),
+        ("-o a.toml --only stal_torque", "expected one of stall_torque"),
+        ("-o a.toml --module joint9", "joint01, joint02, joint03"),
+        ("-o a.toml --module joint01 --modules", "give one of them"),
+        ("-o a.toml --on can:x", "expected twin or twin:SCENARIO"),
+        ("-o a.toml --spread 3", "--spread 3"),
+        ("-o a.toml --within 0", "--within 0"),
+    ],
+)
+def test_wrong_usage_says_what_would_be_right(small, tmp_path, capsys, words, told):
+    words = words.replace("a.", f"{tmp_path}/a.").split()
+    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == 2
+    assert told in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten(small, tmp_path, capsys):
+    (tmp_path / "a.toml").write_text("mine")
+    words = ["sim", "fit", str(small / "run.mcap"), "-o", str(tmp_path / "a.toml")]
+    assert front.run(words) == 2
+    assert "--force" in capsys.readouterr().err
+    assert (tmp_path / "a.toml").read_text() == "mine"
+
+
+def test_a_session_without_settled_samples_is_refused(small, tmp_path, capsys):
+    words = ["-o", str(tmp_path / "a.toml"), "--settle", "60"]
+    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == 1
+    assert "is --settle too long?" in capsys.readouterr().err
+
+
+def test_an_interrupted_fit_leaves_nothing(small, tmp_path, capsys, monkeypatch):
+    @contextmanager
+    def interrupted():
+        request = StopRequest()
+        request.signal = signal.SIGINT
+        yield request
+
+    monkeypatch.setattr(cli, "interruptible", interrupted)
+    words = ["sim", "fit", str(small / "run.mcap"), "-o", str(tmp_path / "a.toml")]
+    assert front.run(words) == 1
+    assert "nothing is written" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_weak_module_is_found_among_hidden_parameters(tmp_path, capsys):
+    hidden = """[servo]
+stall_torque = 0.345
+proportional_gain = 6.8
+coulomb_friction = 0.024
+[servo_of.joint04]
+stall_torque = 0.276
+[world.ground]
+mu_tangential = 0.06
+mu_normal = 0.42
+"""
+    room = room_for(tmp_path, 5, 8.0, hidden)
+    world = tmp_path / "fitted-world.toml"
+    words = ["--modules", "--within", "0.03", "--scenario", str(world)]
+    report, found = fitted(room, capsys, *words, "-o", str(tmp_path / "fitted.toml"))
+    assert report["search"]["named"]
+    assert report["search"]["module"] == "joint04"
+    truth = {
+        ("stall_torque", None): 0.345,
+        ("proportional_gain", None): 6.8,
+        ("coulomb_friction", None): 0.024,
+        ("viscous_friction", None): 0.005,
+        ("gear_stiffness", None): 12.0,
+        ("gear_damping", None): 0.008,
+        ("mu_tangential", None): 0.06,
+        ("mu_normal", None): 0.42,
+        ("stall_torque", "joint04"): 0.8,
+    }
+    assert_true_or_open(found, truth)
+    # Short of full voltage a servo's viscous friction acts as its back EMF does.
+    ridge = next(one["factors"] for one in report["ridges"] if "stall torque" in one["factors"])
+    assert "viscous friction" in ridge
+    assert {"viscous friction", "gear damping"} <= set(report["undetermined"])
+    again = load_scenario(str(world))
+    weak, sound = again.robot.joints[3].servo, again.robot.joints[0].servo
+    factor = found["stall_torque", "joint04"]["value"]
+    assert weak.stall_torque == pytest.approx(factor * sound.stall_torque)
+    assert again.world.ground.mu_normal == found["mu_normal", None]["value"]
+
+
+@pytest.mark.slow
+def test_full_voltage_parts_stall_torque_gain_and_friction(tmp_path, capsys):
+    """What the slow wave above leaves open, as it says itself."""
+    hidden = "[servo]\nstall_torque = 0.345\nproportional_gain = 6.8\nviscous_friction = 0.006\n"
+    room = room_for(tmp_path, 5, 8.0, hidden, gait=(0.5, 2.5))
+    words = ["--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
+    report, found = fitted(room, capsys, *words)
+    names = ("stall_torque", "proportional_gain", "viscous_friction")
+    truth = dict(zip(names, (0.345, 6.8, 0.006), strict=True))
+    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
+    assert found["stall_torque", None]["determined"]
+    assert not any("stall torque" in one["factors"] for one in report["ridges"])
+
+
+@pytest.mark.slow
+def test_with_the_rest_known_servo_and_ground_are_within_three_percent(tmp_path, capsys):
+    hidden = """[servo]
+stall_torque = 0.27
+proportional_gain = 9.0
+coulomb_friction = 0.035
+[world.ground]
+mu_tangential = 0.045
+mu_normal = 0.56
+"""
+    room = room_for(tmp_path, 5, 14.0, hidden, seed=0)
+    names = ("stall_torque", "proportional_gain", "coulomb_friction", "mu_tangential", "mu_normal")
+    words = [word for name in names for word in ("--only", name)]
+    report, found = fitted(
+        room, capsys, *words, "--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")
+    )
+    assert not report["search"]["named"]  # no module differs
+    truth = dict(zip(names, (0.27, 9.0, 0.035, 0.045, 0.56), strict=True))
+    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
+    assert found["stall_torque", None]["determined"]
+    assert found["proportional_gain", None]["determined"]
+
+
+@pytest.mark.slow
+def test_a_real_ramp_tells_a_lag_and_no_servo(tmp_path, capsys):
+    """A motor at constant speed, in the air: one lag for six parameters."""
+    if not TRACE.is_file():
+        pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")
+    session = tmp_path / "arc.mcap"
+    words = ["import", str(TRACE), "--robot", "arcsnake-joint", "-o", str(session)]
+    assert front.run(words) == 0
+    (tmp_path / "nominal.toml").write_text(AIR)
+    report, found = fitted(
+        tmp_path, capsys, "--settle", "1", "-o", str(tmp_path / "f.toml"), source="arc.mcap"
+    )
+    assert not any(one["determined"] for one in found.values())
+    assert report["rms_rad"]["after"] < report["rms_rad"]["before"]
+    assert report["rms_rad"]["after"] < 0.005  # of a way of 17 rad
+    assert report["residual_memory_samples"] > 3.0  # the twin isn't this servo
+    fitted_robot = load_robot(tmp_path / "f.toml")  # its DBC files lie beside it
+    assert fitted_robot.bus is not None
+
+
+def test_the_memory_of_noise_is_that_of_its_closed_form():
+    random = np.random.default_rng(3)
+    assert memory([random.standard_normal(20000) for _ in range(3)]) == pytest.approx(1.0, abs=0.1)
+    rho = 0.8
+    noise = random.standard_normal((3, 40000))
+    for k in range(1, noise.shape[1]):
+        noise[:, k] += rho * noise[:, k - 1]
+    assert memory(list(noise)) == pytest.approx((1 + rho) / (1 - rho), rel=0.1)
+
+
+def colored(random, rho, shape):
+    """AR(1) noise of variance one, shape (..., n)."""
+    white = random.standard_normal((*shape[:-1], shape[-1] + 500))
+    return math.sqrt(1 - rho**2) * lfilter([1.0], [1.0, -rho], white)[..., 500:]
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
+    """J = cos(w t): the sum of n samples varies by n/2 times the spectrum at w."""
+    n, w = 40000, 2 * np.pi * 0.01
+    noise = colored(np.random.default_rng(4), rho, (n,))
+    column = np.cos(w * np.arange(n))[:, None]
+    got = score_covariance([column], [noise], np.ones(1), np.ones(1))
+    spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
+    assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
+
+
+@pytest.mark.parametrize(("n", "rho"), [(300, 0.0), (300, 0.8), (1000, 0.9)])
+def test_intervals_of_a_linear_model_cover(n, rho):
+    """Three joints, four parameters whose columns are two harmonics of three or ten cycles."""
+    random = np.random.default_rng(5)
+    t, joints, count, runs = np.arange(n) * 0.01, np.arange(3.0), 4, 600
+    prior, inside = np.full(count, 4.0), 0
+    for _ in range(runs):
+        waves = [2 * np.pi * k * t[:, None] - k * joints for k in (1, 3)]
+        base = np.stack([f(wave) for wave in waves for f in (np.cos, np.sin)], axis=-1)
+        mixed = random.standard_normal((4, count)) * np.array([1.0, 1.0, 0.1, 0.1])[:, None]
+        columns = list(np.moveaxis(0.02 * base @ mixed, 1, 0))
+        columns = [column - column.mean(axis=0) for column in columns]
+        truth = 0.5 * random.standard_normal(count)
+        noise = 0.005 * colored(random, rho, (3, n))
+        measured = [c @ truth + e - e.mean() for c, e in zip(columns, noise, strict=True)]
+        solution = solve_linear(columns, measured, prior)
+        half = 1.96 * np.sqrt(np.diag(solution[1]))
+        inside += int((np.abs(solution[0] - truth) <= half).sum())
+    assert inside / (runs * count) == pytest.approx(0.95, abs=0.02)
+
+
+def solve_linear(columns, measured, prior):
+    """The fit's own iteration, of a model whose derivatives never change."""
+
+    class Model:
+        def __init__(self):
+            self.measured = SimpleNamespace(angles=tuple(measured))
+
+        def at(self, _wanted, x):
+            return tuple(column @ x for column in columns)
+
+    wanted = [Unknown(f"p{k}", "1", 1.0, p**-0.5) for k, p in enumerate(prior.tolist())]
+    found = solve(Model(), wanted)
+    assert found.converged
+    return found.x, found.covariance
+
+
+def test_a_ridge_is_the_direction_that_keeps_what_is_told():
+    """Only the product of two parameters is known."""
+    pair = [Unknown(name, "1", 2.0, 0.5) for name in ("stall_torque", "proportional_gain")]
+    precise = 1e6 * np.ones((2, 2)) + np.eye(2) / 0.25
+    (ridge,) = ridges(pair, np.linalg.inv(precise))
+    up, down = ridge.factors.values()
+    assert up * down == pytest.approx(1.0)
+    assert math.log(max(up, down)) == pytest.approx(0.5 / math.sqrt(2))
+    assert ridge.left == pytest.approx(1.0)
+    assert ridges(pair, np.linalg.inv(1e6 * np.eye(2))) == ()
+
+
+def test_gain_and_lateness_of_a_sine():
+    t = np.arange(0.0, 4.0, 0.01)
+    twin = 0.3 * np.sin(2 * np.pi * t)
+    found = misfit(t, 1.05 * 0.3 * np.sin(2 * np.pi * (t - 0.004)), twin)
+    assert found.gain == pytest.approx(0.05, abs=1e-3)
+    assert found.late_s == pytest.approx(0.004, rel=1e-2)
+    assert misfit(t, twin, 0.0 * t).gain is None

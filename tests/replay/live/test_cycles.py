@@ -1,0 +1,192 @@
+"""Cycles computed while a session comes in are those of its analysis."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from support.live_stage import EPOCH_NS, WAIT_S, Recorder, Relay
+from undulog.analysis.session.analyse import analyse_session
+from undulog.capture import Session, SessionWriter
+from undulog.capture.recorder.live_wire import LiveMessage
+from undulog.capture.robot.model import Plane
+from undulog.replay.live.cycles import CycleMeter
+from undulog.replay.live.decode import LiveLog
+
+FREQUENCY_HZ = 0.8
+GAIN = 0.95
+TORQUE, SPEED = 0.2, 0.5
+
+
+@pytest.fixture(scope="module")
+def walk(snake25, tmp_path_factory):
+    """Nine seconds: known gain and lag of the yaw joints, each sampled in its turn, with noise.
+
+    The torque goes with the velocity, so that each cycle's mean power is half the product of their
+    amplitudes. From 4 s on the gait is half as large: a run of its own.
+    """
+    path = tmp_path_factory.mktemp("walk") / "walk.mcap"
+    yaw = snake25.joint_indices(Plane.HORIZONTAL)
+    k = np.arange(len(yaw))
+    lag = 0.1 + 0.02 * k
+    offset = np.linspace(0.0, 6e-3, 25)
+    rng = np.random.default_rng(5)
+    parts = ["horizontal.A", "horizontal.omega", "horizontal.lag", "horizontal.phase"]
+    omega = 2 * np.pi * FREQUENCY_HZ
+    with SessionWriter(path, session_id="walk", epoch_ns=EPOCH_NS, robot=snake25) as w:
+        names = snake25.joint_names
+        offsets = w.joint_state("/joint_sample_offset", names, unit="s")
+        commands = w.joint_state("/joint_commands", names, unit="rad")
+        states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
+        gait = w.joint_state("/gait", parts, unit="rad, omega in rad/s")
+        for i in range(900):
+            t, t_ns = i / 100.0, EPOCH_NS + i * 10_000_000
+            size = 0.4 if t < 4.0 else 0.2
+            own = omega * (t + offset[yaw]) - k * np.pi / 6
+            command, position, velocity, effort = np.zeros((4, 25))
+            command[yaw] = size * np.sin(omega * t - k * np.pi / 6)
+            position[yaw] = GAIN * size * np.sin(own - lag) + rng.normal(0, 1e-4, len(yaw))
+            velocity[yaw] = SPEED * np.cos(own)
+            effort[yaw] = TORQUE * np.cos(own)
+            offsets.write(t_ns, offset)
+            commands.write(t_ns, command)
+            states.write(t_ns, position, velocity, effort)
+            phase = np.angle(np.exp(1j * omega * t))  # within a turn, as some controllers log it
+            gait.write(t_ns, np.array([size, omega, np.pi / 6, phase]))
+    return path
+
+
+def measured_in_batches(path, length_ns):
+    """All cycles of a file that comes in pieces."""
+    log, found, meter = LiveLog(), [], None
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        for record in (
+            *reader.iter_metadata(),
+            *summary.schemas.values(),
+            *summary.channels.values(),
+            *reader.iter_attachments(),
+        ):
+            log.define(record)
+        batch, end_ns = [], 0
+        for _, _, m in reader.iter_messages():
+            meter = meter or CycleMeter(m.log_time)
+            if m.log_time >= end_ns:
+                found += meter.add(log.decode(batch), log.robot)
+                batch, end_ns = [], m.log_time + length_ns
+            one = LiveMessage(m.channel_id, m.sequence, m.log_time, m.publish_time, 0, m.data)
+            batch.append(one)
+    return [*found, *meter.add(log.decode(batch), log.robot)]
+
+
+@pytest.mark.parametrize("length_ns", [30_000_000, 700_000_000, 20_000_000_000])
+def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
+    with Session.open(walk) as session:
+        joints = {one.name: one for one in analyse_session(session).over_time.joints}
+        start_ns = session.start_ns
+    found = measured_in_batches(walk, length_ns)
+    told = {}
+    for cycle in found:
+        for name, gain, lag in zip(cycle.names, cycle.gain, cycle.lag_rad, strict=True):
+            if np.isfinite(gain):
+                told[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
+    expected = {
+        (name, round(start_s * 1e3)): (gain, lag)
+        for name, one in joints.items()
+        for start_s, gain, lag in zip(one.start_s, one.gain, one.lag_rad, strict=True)
+        if gain is not None
+    }
+    assert len(expected) == 13 * 4  # two whole cycles and their surroundings in either run
+    assert told.keys() == expected.keys()
+    np.testing.assert_allclose(
+        [told[key] for key in expected], [*expected.values()], rtol=0, atol=1e-9
+    )
+
+
+def test_gain_lag_and_power_are_those_that_were_written(walk, snake25):
+    found = measured_in_batches(walk, 50_000_000)
+    yaw = snake25.joint_indices(Plane.HORIZONTAL)
+    for cycle in found:
+        assert cycle.names == snake25.joint_names
+        np.testing.assert_allclose(cycle.gain[yaw], GAIN, atol=2e-3)
+        np.testing.assert_allclose(cycle.lag_rad[yaw], 0.1 + 0.02 * np.arange(13), atol=2e-3)
+        np.testing.assert_allclose(cycle.power_w[yaw], TORQUE * SPEED / 2, rtol=0.01)
+        assert np.isnan(np.delete(cycle.gain, yaw)).all()  # held still
+        period_s = (cycle.stop_ns - cycle.start_ns) * 1e-9
+        assert period_s == pytest.approx(1 / FREQUENCY_HZ, abs=1e-6)
+
+
+def test_without_a_logged_phase_there_are_no_cycles(write, tmp_path):
+    assert measured_in_batches(write(tmp_path / "a.mcap", gait=False), 50_000_000) == []
+
+
+def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_path, read_back):
+    socket_path = tmp_path / "live.sock"
+    relay = Relay(socket_path, tmp_path / "live.rrd")
+    try:
+        recorder = Recorder(walk, socket_path)
+        recorder.connect()
+        recorder.send()
+        recorder.feed.close()
+        report = relay.finish()
+    finally:
+        relay.process.kill()
+        relay.process.communicate()
+    assert report["dropped"] == report["unread"] == 0
+    drawn = read_back(tmp_path / "live.rrd")
+    expected = measured_in_batches(walk, 50_000_000)
+    starts = [cycle.start_ns - EPOCH_NS for cycle in expected]
+    for key, of in (
+        ("gain_minus_one_percent", lambda cycle: 100 * (cycle.gain - 1)),
+        ("lag_degrees", lambda cycle: np.degrees(cycle.lag_rad)),
+        ("power_milliwatt", lambda cycle: 1e3 * cycle.power_w),
+    ):
+        steps = f"/cycles/{key}"
+        assert drawn.times(steps).tolist() == starts
+        shown = np.array(drawn.column(steps, "Scalars:scalars"), dtype=float)
+        np.testing.assert_allclose(shown, [of(cycle) for cycle in expected], atol=1e-4)
+        for i in (0, 24):
+            bar = f"/segments/{key}/estimate/{snake25.joint_names[i]}"
+            assert drawn.times(bar).tolist() == starts
+            heights = [row[0]["buffer"] for row in drawn.column(bar, "BarChart:values")]
+            np.testing.assert_allclose(
+                np.ravel(heights).astype(float), [of(cycle)[i] for cycle in expected], atol=1e-4
+            )
+
+
+@pytest.mark.slow
+def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back):
+    """A recorder of the twin in real time, and a relay: two processes."""
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    environment.pop("RUNTIME_DIRECTORY", None)
+    session_file, sockets = tmp_path / "run.mcap", tmp_path / "undulog"
+    sockets.mkdir(mode=0o700)
+    relay = Relay(sockets / "run.live", tmp_path / "live.rrd")
+    words = ["record", "twin:weak-servo-pi3", "-o", str(session_file), "--duration", "9s"]
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "undulog", *words, "--quiet"], env=environment
+    )
+    try:
+        report = relay.finish()
+        assert recorder.wait(WAIT_S) == 0
+    finally:
+        for process in (recorder, relay.process):
+            process.kill()
+            process.wait()
+    assert report["dropped"] == report["unread"] == 0
+    drawn = read_back(tmp_path / "live.rrd")
+    with Session.open(session_file) as session:
+        joints = {one.name: one for one in analyse_session(session).over_time.joints}
+    names = drawn.static("/cycles/lag_degrees", "SeriesLines:names")
+    rows = drawn.column("/cycles/lag_degrees", "Scalars:scalars")
+    assert len(rows) >= 2
+    # The feed found its relay a moment after the gait began, so the cycles are not the same ones;
+    # once the gait has settled they are alike.
+    told = {name: lag for name, lag in zip(names, rows[-1], strict=True) if np.isfinite(lag)}
+    assert len(told) == 13
+    for name, lag in told.items():
+        assert lag == pytest.approx(np.degrees(joints[name].lag_rad[-1]), abs=0.05)

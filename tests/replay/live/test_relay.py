@@ -1,0 +1,233 @@
+"""The relay of the live view against frozen, killed, late and noisy processes."""
+
+import os
+import signal
+import socket
+
+import numpy as np
+import pytest
+
+from support.live_stage import EPOCH_NS, WAIT_S, Recorder, freeze, until
+from undulog.capture import SessionWriter
+from undulog.capture.common.errors import UsageError
+from undulog.capture.recorder import live_feed
+from undulog.capture.recorder.live_spawn import spawn_relay
+from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
+from undulog.replay.live.inbox import Inbox
+
+
+def rows(recorded, entity, component):
+    """Time to values, in order."""
+    found = zip(recorded.times(entity).tolist(), recorded.column(entity, component), strict=True)
+    return dict(sorted((t, v) for t, v in found if v is not None))
+
+
+def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):
+    recorder = stage.recorder()
+    recorder.send(0.0, 1.5, wait=False)
+    relay = stage.relay()
+    recorder.connect()
+    recorder.send(1.5)
+    recorder.feed.close()
+    report = relay.finish()
+    assert report["dropped"] == 0
+    drawn = read_back(relay.output)
+    found = rows(drawn, "/joints/measured", "Angle:degrees")
+    assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
+    expected = np.degrees(truth.position[150:])
+    np.testing.assert_allclose(list(found.values()), expected, atol=2e-6)
+    # The mode was said before, and still holds.
+    assert rows(drawn, "/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
+
+
+def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back):
+    recorder, relay = stage.recorder(), stage.relay()
+    recorder.connect()
+    freeze(relay.process.pid)
+    recorder.send(wait=False)  # all three seconds wait
+    os.kill(relay.process.pid, signal.SIGCONT)
+    until(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
+    recorder.feed.close()
+    assert relay.finish()["dropped"] == 0
+    drawn = read_back(relay.output)
+    for entity, component in (
+        ("/joints/measured", "Angle:degrees"),
+        ("/joints/error", "Angle:degrees"),
+        ("/power/mechanical", "Scalars:scalars"),
+    ):
+        found = rows(drawn, entity, component)
+        assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
+
+
+def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch):
+    monkeypatch.setattr(live_feed, "_DATAGRAM", 4096)
+    recorder, relay = stage.recorder(), stage.relay()
+    recorder.connect()
+    recorder.send(0.0, 0.5)
+    freeze(relay.process.pid)
+    recorder.feed._max_messages = 50
+    ticks = recorder.send(0.5, 2.5, wait=False)
+    assert ticks == 100
+    assert recorder.feed.counts.dropped > 0
+    os.kill(relay.process.pid, signal.SIGCONT)
+    recorder.send(2.5)
+    recorder.feed.close()
+    report = relay.finish()
+    assert report["dropped"] == recorder.feed.counts.dropped
+    assert report["shown"] == recorder.feed.counts.sent
+    found = list(rows(read_back(relay.output), "/joints/measured", "Angle:degrees"))
+    assert found[:50] == [10_000_000 * i for i in range(50)]
+    assert found[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
+
+
+def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
+    monkeypatch.setattr(live_feed, "RETRY_NS", 10_000_000)
+    recorder, first = stage.recorder(), stage.relay("first.rrd")
+    recorder.connect()
+    recorder.send(0.0, 0.5)
+    first.process.kill()
+    first.process.wait()
+    assert recorder.send(0.5, 1.5, wait=False) > 40
+    until(lambda: not recorder.feed.connected, each=recorder.feed.pump)
+    second = stage.relay("second.rrd")  # over the socket that the first has left
+    recorder.connect()
+    recorder.send(1.5)
+    recorder.feed.close()
+    second.finish()
+    found = list(rows(read_back(second.output), "/joints/measured", "Angle:degrees"))
+    assert found == [1_500_000_000 + 10_000_000 * i for i in range(150)]
+
+
+def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
+    stage, snake25, truth, tmp_path, read_back
+):
+    path = tmp_path / "turns.mcap"
+    offset = np.linspace(0.0, 8e-3, 25)
+    with SessionWriter(path, session_id="turns", epoch_ns=EPOCH_NS, robot=snake25) as w:
+        offsets = w.joint_state("/joint_sample_offset", snake25.joint_names, unit="s")
+        states = w.joint_state("/joint_states", snake25.joint_names, unit="rad")
+        for i, t_ns in enumerate(truth.t_ns.tolist()):
+            offsets.write(t_ns, offset)
+            states.write(t_ns, truth.position[i])
+    recorder, relay = stage.recorder(path), stage.relay()
+    recorder.connect()
+    recorder.send()
+    recorder.feed.close()
+    relay.finish()
+    drawn = read_back(relay.output)
+    for j in (0, 12, 24):
+        found = rows(drawn, f"/joints/measured/{snake25.joint_names[j]}", "Angle:degrees")
+        expected = truth.t_ns - EPOCH_NS + round(offset[j] * 1e9)
+        assert np.abs(np.array(list(found)) - expected).max() <= 1
+        shown = np.ravel(list(found.values()))
+        np.testing.assert_allclose(shown, np.degrees(truth.position[:, j]), atol=2e-6)
+    centres = rows(drawn, "/world/snake/measured", "Capsules3D:translations")
+    assert len(centres) > 100  # at the origin, without odometry
+
+
+def test_noise_on_the_socket_is_counted_and_borne(stage):
+    recorder, relay = stage.recorder(), stage.relay()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.connect(str(stage.path))
+        link.send(b"")
+        link.send(b"not ours")
+        link.send(pack_datagram(DatagramHead(Kind.MESSAGES, 1, 1, 0), [b"\x05\0\0\0cut"]))
+    recorder.connect()
+    recorder.send()
+    recorder.feed.close()
+    report = relay.finish()
+    assert report["unread"] == 3
+    assert report["sessions"] == ["made-for-tests"]
+
+
+def test_interrupted_relay_leaves_a_whole_file_and_no_socket(stage, read_back):
+    recorder, relay = stage.recorder(), stage.relay()
+    recorder.connect()
+    recorder.send(0.0, 1.0)
+    until(lambda: recorder.feed.counts.sent > 0, each=recorder.feed.pump)
+    relay.process.send_signal(signal.SIGINT)
+    report = relay.finish()
+    assert report["shown"] == recorder.feed.counts.sent
+    assert "/joints/measured" in read_back(relay.output).entities
+    assert not stage.path.exists()
+
+
+def test_without_a_recording_nothing_is_written(stage):
+    relay = stage.relay()
+    relay.process.terminate()
+    _, err = relay.process.communicate(timeout=WAIT_S)
+    assert relay.process.returncode == 1
+    assert "no recording was heard" in err
+    assert not relay.output.exists()
+
+
+def test_socket_is_the_owners_alone_and_only_one_reads_it(tmp_path):
+    path = tmp_path / "s"
+    with Inbox(path):
+        assert path.stat().st_mode & 0o777 == 0o600
+        with pytest.raises(UsageError, match="another live view reads there"):
+            Inbox(path)
+    assert not path.exists()
+    path.write_text("mine")
+    with pytest.raises(UsageError, match="is no socket"):
+        Inbox(path)
+    assert path.read_text() == "mine"
+
+
+def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, session_file):
+    path = tmp_path / "s"
+    with Inbox(path, max_bytes=100_000) as inbox:
+        recorder = Recorder(session_file, path)
+        recorder.connect()
+        recorder.send()
+        recorder.feed.close()
+        kinds = []
+
+        def end_has_come():
+            kinds[:] = [one.head.kind for one in inbox._queue]
+            return Kind.END in kinds
+
+        until(end_has_come)
+        taken = inbox.take()
+        shown = sum(one.head.messages for one in taken)
+        assert shown + inbox.dropped == recorder.feed.counts.sent
+        assert inbox.dropped > 0
+        assert taken[0].head.kind is Kind.DEFINITIONS
+        assert sum(len(one.data) for one in taken) <= 150_000
+
+
+def test_spawned_relay_is_in_a_session_of_its_own_and_ends_when_told(stage, tmp_path):
+    output = tmp_path / "spawned.rrd"
+    relay = spawn_relay(stage.path, ["--save", str(output)])
+    try:
+        assert os.getsid(relay.pid) == relay.pid
+        until(stage.path.is_socket)
+        until(lambda: os.getpriority(os.PRIO_PROCESS, relay.pid) >= 10)
+        recorder = stage.recorder()
+        recorder.connect()
+        recorder.send(0.0, 0.5)
+        assert relay.poll() is None
+    finally:
+        relay.close()
+        relay.close()
+    assert relay.poll() == 0
+    assert output.stat().st_size > 10_000
+
+
+def test_spawned_relay_says_why_it_ended(tmp_path):
+    relay = spawn_relay(tmp_path / "there is no such folder" / "s", ["--connect", "x"])
+    try:
+        until(lambda: relay.poll() is not None)
+        assert relay.poll() == 2
+        assert "the socket can't be made" in relay.complaint()
+    finally:
+        relay.close()
+
+
+def test_frozen_relay_that_was_spawned_can_be_ended(stage, monkeypatch):
+    monkeypatch.setattr("undulog.capture.recorder.live_spawn._GRACE_S", 0.2)
+    relay = spawn_relay(stage.path, ["--connect", "rerun+http://127.0.0.1:9/proxy"])
+    until(lambda: stage.path.is_socket() or relay.poll() is not None)
+    freeze(relay.pid)
+    relay.close()
+    assert relay.poll() == -signal.SIGKILL

@@ -1,0 +1,162 @@
+"""The web viewer in a real Chromium draws what the native one does, with another renderer.
+
+Chromium draws by WebGL on SwiftShader, the native viewer by Vulkan on the machine's driver: two
+rasterisers that know nothing of each other.
+"""
+
+import base64
+import io
+import os
+import subprocess
+import sys
+import time
+import urllib.request
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import undulog
+from support import golden_pictures
+
+pytestmark = pytest.mark.slow
+
+WIDTH, HEIGHT = 1440, 900
+SECONDS = 3.0
+# Parts of the window as (top, bottom, left, right) [pixels]. Left out: the title bars, which
+# differ, the lane of modes, whose colours the viewer makes up, and words, which wrap otherwise.
+PARTS = {
+    "body": (92, 588, 0, 752),
+    "angles": (92, 352, 757, WIDTH),
+    "power": (382, 582, 757, WIDTH),
+    "response": (612, 868, 757, WIDTH),
+}
+REACH = 3
+"""How far the two place a line differently where it is steep [pixels]."""
+PLAY = (27, 886)
+"""Its button [pixels], blue while it plays."""
+
+
+@pytest.fixture(scope="module")
+def native(show, rgb, tmp_path_factory):
+    """The native viewer's picture."""
+    path = tmp_path_factory.mktemp("native") / "session.rrd"
+    assert undulog.run(["view", str(golden_pictures.SESSION), "--save", str(path)]) == 0
+    return rgb(show(path, SECONDS).picture())
+
+
+@pytest.fixture
+def address(tmp_path):
+    """Where ``undulog view --web`` serves the session, until the test is over."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "undulog", "view", golden_pictures.SESSION, "--web"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
+    try:
+        line = process.stdout.readline().strip()
+        while not line.startswith("http"):
+            assert process.poll() is None
+            line = process.stdout.readline().strip()
+        for _ in range(100):
+            try:
+                urllib.request.urlopen(line.partition("?")[0], timeout=5).close()
+                break
+            except OSError:
+                assert process.poll() is None
+                time.sleep(0.1)
+        yield line
+    finally:
+        process.terminate()
+        process.wait(timeout=60)
+        process.stdout.close()
+
+
+def part(picture, name):
+    top, bottom, left, right = PARTS[name]
+    return picture[top:bottom, left:right]
+
+
+def glows(picture):
+    """How many pixels are vermilion, which only the body's power is here."""
+    red, green, blue = (part(picture, "body")[..., channel] for channel in range(3))
+    return int(((red > 1.6 * blue) & (red > 1.4 * green) & (red > 90)).sum())
+
+
+class Page:
+    """Rerun's page in a browser."""
+
+    def __init__(self, browser, address):
+        self._browser = browser
+        browser.open(f"{address}&renderer=webgl", width=WIDTH, height=HEIGHT, dark=True)
+
+    def picture(self):
+        shot = self._browser.call("Page.captureScreenshot", format="png")["data"]
+        with Image.open(io.BytesIO(base64.b64decode(shot))) as image:
+            return np.asarray(image.convert("RGB")).astype(int)
+
+    def rest(self, patience_s=60.0):
+        """A picture that is the same as the two before."""
+        deadline = time.monotonic() + patience_s
+        equal, last = 0, self.picture()
+        while equal < 2:
+            assert time.monotonic() < deadline, "the page's picture doesn't come to rest"
+            time.sleep(1.0)
+            picture = self.picture()
+            equal, last = equal + 1 if (picture == last).all() else 0, picture
+        return last
+
+    def wait(self, until, patience_s=120.0):
+        deadline = time.monotonic() + patience_s
+        while not until(self.picture()):
+            assert time.monotonic() < deadline, "the page doesn't show the session"
+            time.sleep(0.5)
+
+    def click(self, x, y):
+        for kind in ("mousePressed", "mouseReleased"):
+            self._browser.call(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+            )
+
+    def press(self, key, code, *, shift=False, control=False):
+        for kind in ("rawKeyDown", "keyUp"):
+            self._browser.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                code=key,
+                windowsVirtualKeyCode=code,
+                modifiers=2 * control + 8 * shift,
+            )
+        self.rest()  # it may draw one frame a second, and takes keys of one frame together
+
+
+def plays(picture):
+    """Whether the page plays, by the colour of its button."""
+    red, _, blue = picture[PLAY[1] - 8, PLAY[0] - 8]
+    return blue > red + 60
+
+
+def complete(picture):
+    """Whether body and plots are there, and it plays as it does once all is loaded."""
+    bars = np.ptp(part(picture, "response"), axis=-1) > 60
+    return glows(picture) > 300 and bars.sum() > 1000 and plays(picture)
+
+
+def test_chromium_draws_what_the_native_viewer_draws(webgl_browser, address, native, tmp_path):
+    page = Page(webgl_browser, address)
+    page.wait(complete)
+    page.click(*PLAY)
+    page.wait(lambda picture: not plays(picture))
+    page.rest()
+    page.press("ArrowLeft", 37, control=True, shift=True)  # to the start
+    for _ in range(round(SECONDS)):
+        page.press("ArrowRight", 39, shift=True)  # a second on
+    picture = page.rest()
+    Image.fromarray(picture.astype(np.uint8)).save(tmp_path / "web.png")
+    worst = {
+        name: golden_pictures.worst_tile(part(picture, name), part(native, name), REACH)
+        for name in PARTS
+    }
+    assert max(worst.values()) <= golden_pictures.DIFFERING, f"{worst} in {tmp_path / 'web.png'}"

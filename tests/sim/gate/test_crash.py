@@ -1,0 +1,188 @@
+"""An armed drive that is killed, or whose disk is full: what was commanded is in its session.
+
+Robot, controller and listener are three processes; what was on the bus is what the listener wrote.
+"""
+
+import json
+import random
+import re
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from support import gate_stage
+from support.gate_stage import JOINTS, Written, staged
+from undulog.capture import Session
+from undulog.capture.log.health.session_check import check_session
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Robot file and scenario."""
+    return gate_stage.robot_files(tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="module")
+def session(small, tmp_path_factory):
+    """A minute of commands."""
+    return gate_stage.write_commands(
+        tmp_path_factory.mktemp("session") / "wave.mcap", small[0], 60.0
+    )
+
+
+# -- kill -9 --------------------------------------------------------------------------------------
+
+
+def check_kept(written, lines):
+    """All that was on the bus is there, but for the tick in which the process died."""
+    on_bus = [(one["id"], one["data"]) for one in lines if (one["name"] or "").endswith("_command")]
+    assert written.sent == on_bus[: len(written.sent)]
+    assert len(on_bus) - len(written.sent) in {0, len(JOINTS)}
+    for name, (_, angle) in gate_stage.commands_of(lines).items():
+        given = np.array([row[name] for _, row in written.commands])
+        assert len(angle) - len(given) in {0, 1}
+        assert np.abs(given - angle[: len(given)]).max() <= gate_stage.STEP / 2 * (1 + 1e-6)
+    said = [text for _, _, text in written.said]
+    assert said[0] == "drives wave.mcap (commands) on " + said[0].rpartition(" on ")[2]
+    assert "gate: reading the pose" in said
+    assert any(text.startswith("gate: approach, ") for text in said)
+    assert "gate: run" in said
+
+
+def check_kill(folder, scenario, session, seed):
+    """Kill an armed drive at a random moment, and look at what is left of its session."""
+    folder.mkdir(exist_ok=True)
+    path, repaired = folder / "a.mcap", folder / "repaired.mcap"
+    with staged(folder, scenario) as on_stage, on_stage.replay(session, path) as controller:
+        on_stage.wait_for_commands(controller, 80)
+        time.sleep(random.Random(seed).uniform(0.0, 1.5))
+        controller.kill()
+        controller.communicate(timeout=20)
+        on_stage.settle()
+        lines = on_stage.lines
+        again = gate_stage.undulog(*on_stage.words(session, path)[len(gate_stage.UNDULOG) :])
+    assert again.returncode == 2
+    assert "exists already" in again.stderr
+    with Session.open(path) as left:
+        commands = left.joints("/joint_commands")
+        ticks = len(commands.t_ns[0])
+        assert any("undulog log recover" in warning for warning in left.warnings)
+    done = gate_stage.undulog("log", "recover", path, "-o", repaired, "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["missing"] == 0
+    assert report["from_wal"] > 0
+    written = Written(repaired)
+    check_kept(written, lines)
+    assert ticks == len(written.commands)
+    for name, values in zip(commands.names, commands.values, strict=True):
+        assert values.tolist() == [row[name] for _, row in written.commands]
+    gate_stage.check_limits(lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_a_drive_that_is_killed_has_all_that_was_commanded(seed, small, session, tmp_path):
+    check_kill(tmp_path, small[1], session, seed)
+
+
+# -- a full disk ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def disk(tmp_path, request):
+    """A file system of so many MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={request.param}m", "tmpfs", str(folder)],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    if mounted.returncode:
+        pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def fill(folder):
+    """Take the rest of a disk, as somebody else would who leaves the processors to others."""
+    with (folder / "hog").open("wb", buffering=0) as hog:
+        size = 1 << 20
+        while size:
+            try:
+                hog.write(bytes(size))
+                time.sleep(0.01)
+            except OSError:
+                size //= 2
+
+
+def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
+    """The robot came to its safe end, and that is in a whole session; what was said and written."""
+    _, err = controller.communicate(timeout=120)
+    assert controller.returncode == 1, err
+    assert err.startswith(f"error: the disk at {disk} is full or fails: {path}")
+    assert "; the joints were brought straight within " in err
+    assert not (path.parent / f"{path.name}.wal").exists()
+    found = check_session(path).file
+    assert (found.indexed, found.damage) == (True, ())
+    written = Written(path)
+    gate_stage.check_ramp_down(written, "fault: the disk at ", ramp_rate=ramp_rate)
+    health = written.metadata["undulog.health"]
+    assert health["verdict"] == "bad"
+    assert json.loads(health["reasons"])[0].startswith(f"the disk at {disk} is full")
+    return err, written
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("disk", [64], indirect=True)
+def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, tmp_path, disk):
+    path = disk / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
+        on_stage.wait_for_commands(controller)
+        fill(disk)
+        err, _ = check_told(controller, path, disk)
+        on_stage.settle()
+        lines = on_stage.lines
+    assert "No space left on device" in err
+    gate_stage.check_limits(lines)
+    gate_stage.check_session(path, lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("disk", [50], indirect=True)
+def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk):
+    path = disk / "a.mcap"
+    serve = (*gate_stage.UNDULOG, "sim", "serve", "flat", "--socketcand", "0")
+    with gate_stage.process(*serve, "--lockstep", "--fast", "--json") as robot:
+        port = json.loads(robot.stdout.readline())["port"]
+        words = (*gate_stage.UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={port}")
+        words += ("--arm", "-o", path, "--duration", "600")
+        with gate_stage.process(*words) as controller:
+            err, written = check_told(controller, path, disk, ramp_rate=0.5)
+    assert len(written.commands) > 1000
+    missing = re.search(
+        r"needs 16777216 bytes and the disk has (\d+) free: (\d+) bytes are mi", err
+    )
+    assert int(missing[1]) + int(missing[2]) == 1 << 24
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("disk", [44], indirect=True)
+def test_on_a_disk_without_room_nothing_is_sent(small, session, tmp_path, disk):
+    path = disk / "a.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
+        _, err = controller.communicate(timeout=60)
+        on_stage.settle()
+        assert on_stage.lines
+        assert not on_stage.command_lines
+    assert controller.returncode == 1
+    missing = re.search(
+        r"needs 50331648 bytes and the disk has (\d+) free: (\d+) bytes are mi", err
+    )
+    assert err.startswith(f"error: {path}: needs")
+    assert int(missing[1]) + int(missing[2]) == 48 << 20
+    assert list(disk.iterdir()) == []

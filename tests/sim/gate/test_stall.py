@@ -1,0 +1,254 @@
+"""The gate under a far end that stops, delays, or delivers in bursts, judged at the far end.
+
+Robot, router and drive are processes of their own (``far_end.py``); the far end's own arrival
+times tell what reached the robot, and how fast. The clock of the robot is set again and again, and
+so is that of the drive.
+"""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from support import far_end
+from support.far_end import beyond_rate, largest_burst
+from undulog.capture import Session, SessionWriter
+from undulog.capture.robot.description import load_robot
+
+FAR_END = far_end.__file__
+MAX_RATE, PERIOD_S = 4.0, 0.01
+STEP = MAX_RATE * PERIOD_S
+ROUNDING = 2 * math.radians(0.01)  # of two commands on the bus
+SAFETY = """
+[safety]
+max_rate = 4.0
+ramp_rate = 1.0
+max_tracking_error = 0.5
+max_current = 5.0
+max_temperature = 60.0
+reply_timeout_s = 0.25
+max_late_s = 0.5
+"""
+# The wall clock is set by a day to and fro while it drives.
+DRIVE = """
+import sys, time
+own, own_ns = time.time, time.time_ns
+time.time = lambda: own() + 86400 * (int(own() / 0.9) % 2)
+time.time_ns = lambda: own_ns() + 86400 * 10**9 * (int(own() / 0.9) % 2)
+import undulog
+sys.exit(undulog.run(sys.argv[1:]))
+"""
+
+
+@contextmanager
+def far_end(*words):
+    """One process, and its port."""
+    command = [sys.executable, str(FAR_END), *map(str, words)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
+        try:
+            yield one, int(one.stdout.readline())
+        finally:
+            one.kill()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Commands at 3.25 rad/s, for the snake and for a servo that answers requests."""
+    folder = tmp_path_factory.mktemp("stall")
+    polled, unasked = load_robot("arcsnake-joint"), load_robot("snake25")
+    wide = unasked.toml.replace("-0.5235987755982988", "-3.0").replace("0.5235987755982988", "3.0")
+    tomls = {"polled": polled.toml + SAFETY, "unasked": wide}
+    for name, text in (*polled.databases, *unasked.databases):
+        (folder / name).write_text(text)
+    for kind, toml in tomls.items():
+        (folder / f"{kind}.toml").write_text(toml)
+        robot = load_robot(folder / f"{kind}.toml")
+        path = folder / f"{kind}.mcap"
+        with SessionWriter(path, session_id=kind, epoch_ns=10**18, robot=robot) as writer:
+            channel = writer.joint_state("/joint_commands", robot.joint_names, unit="rad")
+            for tick in range(3000):
+                angle = 2.6 * (1 - abs((tick + 80) % 320 - 160) / 80)  # a triangle
+                channel.write(10**18 + tick * 10_000_000, np.full(len(robot.joints), angle))
+    return folder
+
+
+class Drive:
+    """A drive under way, and what came of it."""
+
+    def __init__(self, robot, router, running, session):
+        self.robot, self.router, self.running = robot, router, running
+        self.path = session
+
+    def stop_far_end(self, seconds):
+        os.kill(self.robot.pid, signal.SIGSTOP)
+        time.sleep(seconds)
+        os.kill(self.robot.pid, signal.SIGCONT)
+
+    def route(self, line):
+        self.router.stdin.write(f"{line}\n")
+        self.router.stdin.flush()
+
+    def end(self):
+        """Wait for it: the exit code, the report, the session, and what arrived."""
+        out, self.errors = self.running.communicate(timeout=60)
+        self.code, self.report = self.running.returncode, json.loads(out)
+        self.route("hold none")
+        time.sleep(0.3)
+        self.robot.stdin.close()
+        found = json.loads(self.robot.stdout.readline())
+        self.arrivals, self.pause_s = found["arrivals"], found["pause_s"]
+        self.burst = largest_burst(self.arrivals)
+        self.beyond = beyond_rate(self.arrivals, MAX_RATE, PERIOD_S)
+        with Session.open(self.path) as session:
+            self.phases = [message.data for _, message in session.messages("/gate/phase")]
+            self.verdict, self.facts = session.verdict, session.metadata["undulog.gate.feedback"]
+        print(f"burst {self.burst:.4f} beyond {self.beyond:.4f}", self.facts, self.phases)
+        print(
+            f"pause {self.pause_s:.3f}",
+            self.errors,
+            self.report["changed"],
+            self.report["overruns"],
+        )
+
+    def check_bound(self):
+        """What arrived within 5 ms is within the bound that the session gives."""
+        steps = int(self.facts["most_steps"])
+        assert steps == (1 if self.facts["confirmed_by"] == "replies" else self.hold_after + 1)
+        assert self.burst <= steps * STEP + ROUNDING
+        if steps == 1:
+            assert self.beyond <= ROUNDING
+
+    @property
+    def hold_after(self):
+        return int(self.facts["hold_after_ticks"])
+
+    def check_held(self):
+        """It held, and was brought to rest."""
+        assert self.code == 1
+        assert self.report["fault"]["kind"] == "silent"
+        assert "the bus was silent: no joint was received for " in self.errors
+        assert self.phases[:4] == ["reading the pose", "run", "hold", "ending"]
+        assert self.phases[-1] == "ending"
+        assert self.verdict == "bad"
+        assert self.report["held_s"] > 0
+        assert abs(self.arrivals[-1][2]) < ROUNDING
+
+
+@contextmanager
+def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=3.0, route=()):
+    path, which = tmp_path / "a.mcap", "unasked" if kind == "unasked" else "polled"
+    with (
+        far_end("robot", kind, period_s, latency_s) as (robot, port),
+        far_end("router", port) as (router, front),
+    ):
+        drive = Drive(robot, router, None, path)
+        for line in route:
+            drive.route(line)
+        on = f"can:socketcand:can0?host=127.0.0.1&port={front}&plain=yes"
+        words = ["drive", str(folder / f"{which}.mcap"), "--on", on, "--arm", "--json"]
+        words += ["-o", str(path), "--duration", str(duration_s)]
+        with subprocess.Popen(
+            [sys.executable, "-c", DRIVE, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
+        ) as running:
+            try:
+                drive.running = running
+                assert robot.stdout.readline() == "first\n", running.communicate(timeout=60)
+                time.sleep(1.2)
+                yield drive
+            finally:
+                running.kill()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["polled", "unasked"])
+@pytest.mark.parametrize("stall_s", [0.2, 1.0, 5.0])
+def test_a_far_end_that_stops_is_held_and_then_brought_to_rest(folder, tmp_path, kind, stall_s):
+    with driving(folder, tmp_path, kind, duration_s=4.0 + stall_s) as drive:
+        drive.stop_far_end(stall_s)
+        drive.end()
+    drive.check_bound()
+    drive.check_held()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["polled", "unasked"])
+def test_short_stalls_change_no_joint_beyond_the_bound(folder, tmp_path, kind):
+    with driving(folder, tmp_path, kind, duration_s=5.0) as drive:
+        for stall_s in (0.02, 0.03, 0.02, 0.025, 0.02):
+            drive.stop_far_end(stall_s)
+            time.sleep(0.3)
+        drive.end()
+    drive.check_bound()
+
+
+WAYS = {
+    "up": ["hold up", 0.4, "hold none"],
+    "down": ["hold down", 0.4, "hold none"],
+    "up, down": ["hold up", 0.025, "hold both", 0.1, "hold down", 0.1, "hold none"],
+    "bursts": ["bursts 0.025", 1.0, "bursts 0"],
+    "wide bursts": ["bursts 0.1", 1.0, "bursts 0"],
+    "late": ["late 0.015", 0.5, "late 0.1", 0.5, "late 0"],
+    "late bursts": ["late 0.02", "bursts 0.025", 1.0, "bursts 0"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", list(WAYS))
+def test_a_router_on_the_way_makes_no_step_larger(folder, tmp_path, way):
+    with driving(folder, tmp_path, "polled", duration_s=4.0) as drive:
+        for each in WAYS[way]:
+            if isinstance(each, str):
+                drive.route(each)
+            else:
+                time.sleep(each)
+        drive.end()
+    drive.check_bound()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["polled", "unasked"])
+def test_a_half_open_connection_ends_without_a_ramp(folder, tmp_path, kind):
+    with driving(folder, tmp_path, kind, duration_s=20.0) as drive:
+        drive.route("hold both")
+        drive.end()
+    drive.check_bound()
+    assert drive.code == 1
+    assert drive.report["fault"]["kind"] == "silent"
+    assert drive.report["held_s"] == pytest.approx(10.0, abs=1.0)
+    assert drive.report["ended"].startswith("nothing more was sent")
+    assert drive.phases == ["reading the pose", "run", "hold", "done"]
+
+
+HEALTHY = {
+    "20 Hz": ("unasked", {"period_s": 0.05}),
+    "20 Hz, asked": ("slow", {"period_s": 0.05}),
+    "16 ms": ("unasked", {"route": ["late 0.016"]}),
+    "16 ms, asked": ("polled", {"latency_s": 0.016}),
+    "bursts": ("polled", {"route": ["bursts 0.025"]}),
+    "lossy": ("lossy", {}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", list(HEALTHY))
+def test_a_bus_that_is_slow_late_or_lossy_is_never_held(folder, tmp_path, which):
+    kind, more = HEALTHY[which]
+    with driving(folder, tmp_path, kind, duration_s=4.0, **more) as drive:
+        drive.end()
+    if kind != "unasked":
+        drive.check_bound()
+    if drive.pause_s > 0.8 * float(drive.facts["hold_after_s"]):
+        pytest.skip(f"this computer let the robot report nothing for {drive.pause_s:.2f} s")
+    assert (drive.code, drive.report["outcome"], drive.report["held_s"]) == (0, "complete", 0.0)
+    assert drive.phases == ["reading the pose", "run"]

@@ -1,0 +1,1 @@
+"""What tests share: builders of sessions, robots and buses, processes, a browser."""

@@ -1,0 +1,74 @@
+"""What the tests of `undulog log check` share: a clean session, and faults planted in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import Writer as McapWriter
+
+from undulog.capture import SessionWriter, load_robot
+from undulog.capture.log.health.session_check import SessionHealth
+from undulog.capture.log.health.tallies import Timing
+from undulog.capture.log.messages.cdr import encode
+from undulog.capture.log.messages.schemas import message_type, schema_text
+
+EPOCH_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+ROBOT = load_robot("snake25")
+NAMES = ROBOT.joint_names
+TICKS = 2000
+JOINT_STATE = "sensor_msgs/msg/JointState"
+Edit = Callable[[int, np.ndarray, np.ndarray], int | None]
+"""Tick, command and measured angles (edited in place) to stamp; None leaves the state out."""
+
+
+def gait(tick: int) -> np.ndarray:
+    return 0.4 * np.sin(np.pi * tick / 100 - 0.5 * np.arange(len(NAMES)))
+
+
+def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> Path:
+    """20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
+    noise = np.random.default_rng(3).normal(0.0, 1e-3, (TICKS, len(NAMES)))
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
+        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+        states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
+        for tick in range(TICKS):
+            command, angles = gait(tick), gait(tick - 5) + noise[tick]
+            log_ns = EPOCH_NS + tick * STEP_NS
+            t_ns: int | None = log_ns
+            if edit is not None:
+                t_ns = edit(tick, command, angles)
+            commands.write(log_ns, command)
+            if t_ns is not None:
+                states.write(t_ns, angles, command, log_time_ns=log_ns)
+        if verdict is not None:
+            writer.set_verdict(verdict, ["so said the recorder"])
+    return path
+
+
+def at(tick: int) -> int:
+    return EPOCH_NS + tick * STEP_NS
+
+
+def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
+    (found,) = [each.timing for each in health.series if each.topic == topic]
+    return found
+
+
+def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
+    """JointState messages of three joints with sequence numbers of our choice."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, **options)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
+        for topic in ("/joint_commands", "/joint_states"):
+            channel = writer.register_channel(topic, "cdr", schema)
+            for k, sequence in enumerate(sequences):
+                stamp = {"sec": at(k) // 10**9, "nanosec": at(k) % 10**9}
+                values = {"header": {"stamp": stamp}, "name": list("abc"), "position": gait(k)[:3]}
+                message = encode(message_type(JOINT_STATE), values)
+                writer.add_message(channel, at(k), message, at(k), sequence)
+        writer.finish()
+    return path

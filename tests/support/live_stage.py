@@ -1,0 +1,101 @@
+"""What the tests of the live view share: recorders that send sessions, and relays."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+
+from undulog.capture.recorder.live_feed import LiveFeed
+
+EPOCH_NS = 1_735_689_600_000_000_000
+STEP_NS = 20_000_000
+WAIT_S = 90
+
+
+def until(condition, *, each=lambda: None):
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        each()
+        time.sleep(0.005)
+
+
+def freeze(pid):
+    """Stop a process, and wait until all its threads stand."""
+    os.kill(pid, signal.SIGSTOP)
+    threads = Path(f"/proc/{pid}/task")
+
+    def stands():
+        states = [
+            (one / "stat").read_text().rpartition(")")[2].split()[0] for one in threads.iterdir()
+        ]
+        return set(states) == {"T"}
+
+    until(stands)
+
+
+class Recorder:
+    """Sends a session's messages, as a recorder would, but as fast as the relay takes them."""
+
+    def __init__(self, session, socket_path):
+        with session.open("rb") as stream:
+            reader = make_reader(stream)
+            summary = reader.get_summary()
+            self.definitions = [
+                *reader.iter_metadata(),
+                *summary.schemas.values(),
+                *summary.channels.values(),
+                *reader.iter_attachments(),
+            ]
+            self.messages = [
+                (m.channel_id, m.log_time, m.publish_time, m.sequence, m.data)
+                for _, _, m in reader.iter_messages()
+            ]
+        self.feed = LiveFeed(socket_path)
+        for one in self.definitions:
+            self.feed.define(one)
+
+    def connect(self):
+        until(lambda: self.feed.connected, each=self.feed.pump)
+
+    def send(self, start_s=0.0, stop_s=np.inf, *, wait=True):
+        """Messages of a stretch of time; returns how many ticks there were."""
+        ticks, at_ns = 0, EPOCH_NS
+        for message in self.messages:
+            if not start_s <= (message[1] - EPOCH_NS) * 1e-9 < stop_s:
+                continue
+            if message[1] >= at_ns + STEP_NS:
+                at_ns = message[1]
+                self.feed.pump()
+                ticks += 1
+                if wait:
+                    until(lambda: self.feed.queued == 0, each=self.feed.pump)
+            self.feed.offer(*message)
+        if wait:
+            until(lambda: self.feed.queued == 0, each=self.feed.pump)
+        return ticks
+
+
+class Relay:
+    """The verb in a process of its own."""
+
+    def __init__(self, socket_path, output, *more):
+        self.output = output
+        command = [sys.executable, "-m", "undulog", "view", "--live", socket_path]
+        if output is not None:
+            command += ["--save", output, "--json", "--force"]
+        self.process = subprocess.Popen(
+            [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        until(lambda: socket_path.is_socket() or self.process.poll() is not None)
+
+    def finish(self):
+        out, err = self.process.communicate(timeout=WAIT_S)
+        assert self.process.returncode == 0, err
+        return json.loads(out)
