@@ -1,13 +1,13 @@
 """Every script of the manual runs: each has --quick, few draws and short runs, for this test."""
 
 import os
-import subprocess
 import sys
 
 import pytest
 
 import undulog
 from support.paths import ROOT
+from support.processes import run
 
 DOCS = ROOT / "docs"
 RUN_ELSEWHERE = {"conf.py", "notebook_page.py"}
@@ -28,9 +28,7 @@ def printed(*words):
     """What a script prints; it has to end well, with warnings as errors."""
     threads = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-W", "error", *map(str, words)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env=os.environ | threads
-    )
+    done = run(*command, env=os.environ | threads)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from rosbags.highlevel import AnyReader
 
+from support import processes
 from support.paths import ROOT
 
 RERUN = Path(sys.executable).parent / "rerun"
@@ -32,9 +32,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*command: object) -> str:
-    done = subprocess.run(
-        [str(word) for word in command], capture_output=True, text=True, check=False
-    )
+    done = processes.run(*[str(word) for word in command])
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 import undulog
+from support import processes
 from support.paths import ROOT
+from support.processes import python, run
 
 
 @pytest.mark.parametrize("verb", sorted(undulog.VERBS))
@@ -26,7 +28,7 @@ def test_help_lists_all_verbs_without_importing_any() -> None:
         "heavy = {'pandas', 'scipy', 'pybullet', 'rerun', 'matplotlib', 'can'} & set(sys.modules);"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = python(code)
     assert done.returncode == 0, done.stderr
     for word in ("import", "log", "sim", "analyse", "report", "view", "info"):
         assert word in done.stdout
@@ -47,7 +49,7 @@ def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module: str) -
         "heavy = {'pybullet', 'rerun', 'matplotlib'} & set(sys.modules);"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = python(code)
     assert done.returncode == 0, done.stderr
 
 
@@ -78,7 +80,7 @@ def test_a_missing_extra_says_which_one_to_install() -> None:
         "import sys; sys.modules['pybullet'] = None; import undulog;"
         "sys.exit(undulog.run(['sim', 'run', 'flat', '-o', 'never.mcap']))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = python(code)
     assert done.returncode == 2, done.stderr
     assert "pip install 'undulog[sim]'" in done.stderr
 
@@ -92,7 +94,7 @@ def test_info_names_versions(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_closed_pipe_is_no_traceback() -> None:
     command = f"{sys.executable} -m undulog info --json | true"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    done = run("bash", "-c", command)
     assert "Traceback" not in done.stderr
 
 
@@ -107,10 +109,7 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path: Path) -> N
         " is_extended_id=False, data=[k], channel=0))\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-    done = subprocess.run(
-        [sys.executable, "-m", "undulog", "import", trace, "-o", session, "-r", "arcsnake-joint"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = processes.undulog("import", trace, "-o", session, "-r", "arcsnake-joint", cwd=ROOT)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "5 CAN frames" in done.stdout
 

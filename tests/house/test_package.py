@@ -8,7 +8,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tarfile
 import zipfile
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from support import processes
 from support.paths import ROOT
 
 FOLDERS = ("analysis", "capture", "replay", "sim")
@@ -24,7 +24,7 @@ BUILD = [sys.executable, "-m", "hatchling", "build"]
 
 def tracked(*patterns: str) -> list[Path]:
     command = ["git", "ls-files", "--", *patterns]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = processes.run(*command, cwd=ROOT)
     if done.returncode:
         pytest.skip("not a git checkout: the list of tracked files is unknown")
     return [ROOT / name for name in done.stdout.splitlines()]
@@ -32,9 +32,7 @@ def tracked(*patterns: str) -> list[Path]:
 
 def run(*words: str | Path, cwd: Path = ROOT, fails: bool = False, **environment: str) -> str:
     keep = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        words, cwd=cwd, env=keep | environment, capture_output=True, text=True, check=False
-    )
+    done = processes.run(*words, cwd=cwd, env=keep | environment)
     assert (done.returncode != 0) == fails, done.stderr
     return done.stderr if fails else done.stdout
 

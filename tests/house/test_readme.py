@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from support import processes
 from support.paths import ROOT
 
 README = (ROOT / "README.md").read_text()
@@ -38,9 +38,7 @@ def test_the_readme_shows_a_picture_before_anything_else() -> None:
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("make ")])
 def test_make_targets_exist_and_are_run_by_the_integration(command: str) -> None:
-    done = subprocess.run(
-        [*shlex.split(command), "-n"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = processes.run(*shlex.split(command), "-n", cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert command in (ROOT / ".ci" / "run").read_text()
 
@@ -61,8 +59,6 @@ def test_the_verbs_in_order_then_the_snippets(tmp_path: Path) -> None:
 
 
 def run(command: list[str], folder: Path) -> str:
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ)
-    )
+    done = processes.run(*command, cwd=folder, env=dict(os.environ))
     assert done.returncode == 0, f"{command}: {done.stderr}"
     return done.stdout

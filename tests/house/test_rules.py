@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import pytest
 
 from support.paths import ROOT
+from support.processes import run
 
 
 def _tracked() -> list[str]:
-    done = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = run("git", "ls-files", cwd=ROOT)
     if done.returncode:
         pytest.skip("not a git checkout: the list of tracked files is unknown")
     return done.stdout.splitlines()

@@ -7,7 +7,6 @@ listener wrote, with python-can and cantools; sessions are read by the ``mcap`` 
 import json
 import math
 import signal
-import subprocess
 import sys
 import time
 from contextlib import contextmanager
@@ -18,9 +17,9 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from support.processes import UNDULOG, process, wait_for
 from undulog.capture import SessionWriter, load_robot
 
-UNDULOG = (sys.executable, "-m", "undulog")
 LISTENER = Path(__file__).with_name("bus_listener.py")
 RATE_HZ = 100
 MARK = 0x7F0  # an identifier that nobody else uses
@@ -28,7 +27,6 @@ STEP = math.radians(0.01)  # of a command on the bus
 JOINTS = ("joint01", "joint02", "joint03", "joint04")
 LIMIT, MAX_RATE, RAMP_RATE = math.radians(30.0), 4.0, 1.0
 EPOCH_NS = 1_735_689_600_000_000_000
-WAIT_S = 90
 FRAME = np.dtype(
     [
         *(("t_device_ns", "<u8"), ("t_host_ns", "<u8"), ("id_flags", "<u4")),
@@ -134,46 +132,6 @@ def write_commands(path, robot, duration_s, *, names=JOINTS, commands=wave):
     return path
 
 
-def undulog(*words, **options):
-    """Run a command to its end."""
-    return subprocess.run(
-        [*UNDULOG, *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        **options,
-    )
-
-
-def until(condition, what, *, alive=()):
-    """Wait for a condition; the processes that must live meanwhile are told of if they don't."""
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        for one in alive:
-            assert one.poll() is None, (what, one.communicate())
-        assert time.monotonic() < deadline, what
-        time.sleep(0.01)
-
-
-@contextmanager
-def process(*words, **options):
-    """A process that is ended with the block."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
-    running = subprocess.Popen([str(word) for word in words], **pipes)
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.send_signal(signal.SIGCONT)  # a stopped one would not end
-            running.terminate()
-        try:
-            running.communicate(timeout=20)
-        except subprocess.TimeoutExpired:
-            running.kill()
-            running.communicate(timeout=20)
-
-
 class Stage:
     """A virtual robot and a listener on its bus.
 
@@ -211,7 +169,7 @@ class Stage:
 
     def wait_for_commands(self, controller, count=150):
         """Until so many ticks were commanded."""
-        until(
+        wait_for(
             lambda: len(self.command_lines) >= count * len(JOINTS),
             "no commands on the bus",
             alive=[controller],
@@ -231,7 +189,9 @@ class Stage:
             place = {"host": "127.0.0.1", "port": self.port, "channel": self.bus}
             with can.Bus(interface="socketcand", **place) as bus:
                 bus.send(can.Message(arbitration_id=MARK, is_extended_id=False))
-                until(lambda: any(one["id"] == MARK for one in self.lines), "the mark is not heard")
+                wait_for(
+                    lambda: any(one["id"] == MARK for one in self.lines), "the mark is not heard"
+                )
         self._listener.send_signal(signal.SIGTERM)
         _, complained = self._listener.communicate(timeout=20)
         assert self._listener.returncode == 0, complained

@@ -1,43 +1,17 @@
 """What the tests of the live view share: recorders that send sessions, and relays."""
 
 import json
-import os
-import signal
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 from mcap.reader import make_reader
 
+from support.processes import start, wait_for
 from undulog.capture.recorder.live_feed import LiveFeed
 
 EPOCH_NS = 1_735_689_600_000_000_000
 STEP_NS = 20_000_000
 WAIT_S = 90
-
-
-def until(condition, *, each=lambda: None):
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        each()
-        time.sleep(0.005)
-
-
-def freeze(pid):
-    """Stop a process, and wait until all its threads stand."""
-    os.kill(pid, signal.SIGSTOP)
-    threads = Path(f"/proc/{pid}/task")
-
-    def stands():
-        states = [
-            (one / "stat").read_text().rpartition(")")[2].split()[0] for one in threads.iterdir()
-        ]
-        return set(states) == {"T"}
-
-    until(stands)
 
 
 class Recorder:
@@ -62,7 +36,7 @@ class Recorder:
             self.feed.define(one)
 
     def connect(self):
-        until(lambda: self.feed.connected, each=self.feed.pump)
+        wait_for(lambda: self.feed.connected, each=self.feed.pump)
 
     def send(self, start_s=0.0, stop_s=np.inf, *, wait=True):
         """Messages of a stretch of time; returns how many ticks there were."""
@@ -75,10 +49,10 @@ class Recorder:
                 self.feed.pump()
                 ticks += 1
                 if wait:
-                    until(lambda: self.feed.queued == 0, each=self.feed.pump)
+                    wait_for(lambda: self.feed.queued == 0, each=self.feed.pump)
             self.feed.offer(*message)
         if wait:
-            until(lambda: self.feed.queued == 0, each=self.feed.pump)
+            wait_for(lambda: self.feed.queued == 0, each=self.feed.pump)
         return ticks
 
 
@@ -90,10 +64,8 @@ class Relay:
         command = [sys.executable, "-m", "undulog", "view", "--live", socket_path]
         if output is not None:
             command += ["--save", output, "--json", "--force"]
-        self.process = subprocess.Popen(
-            [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        until(lambda: socket_path.is_socket() or self.process.poll() is not None)
+        self.process = start(*command, *more)
+        wait_for(lambda: socket_path.is_socket() or self.process.poll() is not None)
 
     def finish(self):
         out, err = self.process.communicate(timeout=WAIT_S)

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support import processes
 from support.paths import ROOT
-from support.patience import wait_for
+from support.processes import run, wait_for
 from undulog.capture import Session, load_robot
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.log.health.session_check import check_session
@@ -37,13 +38,8 @@ def command(output, *arguments):
 @contextmanager
 def recording(output, *arguments, env=None, floor="0"):
     """A recorder in another process; it is running when the block begins."""
-    process = subprocess.Popen(
-        [*command(output, *arguments), "--floor", floor, "--json"],
-        cwd=ROOT,
-        env=env,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+    process = processes.start(
+        *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
     )
     try:
         control = output.with_name("control.sock")
@@ -140,8 +136,10 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(tmp_path):
         clock = session.metadata["undulog.clock"]
         assert int(clock["can0.samples"]) == len(frames)
         references = session.table("/clock/can0")
-        assert np.isin(references["time_ref.sec"] * 10**9 + references["time_ref.nanosec"],
-                       frames["t_device_ns"]).all()  # fmt: skip
+        assert np.isin(
+            references["time_ref.sec"] * 10**9 + references["time_ref.nanosec"],
+            frames["t_device_ns"],
+        ).all()
 
 
 def test_the_verdict_at_the_end_is_that_of_a_check(tmp_path):
@@ -162,8 +160,12 @@ def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     output = tmp_path / "twin.mcap"
     done = subprocess.run(
         [*command(output, "twin:flat"), "--fast", "--duration", "4s", "--json", "--floor", "0"],
-        cwd=ROOT, check=True, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     report = json.loads(done.stdout)
     assert report["robot"] == "snake25"
     assert report["ended"] == "all sources have ended"
@@ -176,10 +178,7 @@ def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
 
 def test_a_source_that_can_never_work_leaves_no_file(tmp_path):
     (tmp_path / "bus.sock").write_text("not a socket")
-    done = subprocess.run(
-        command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"),
-        cwd=ROOT, check=False, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+    done = run(*command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"), cwd=ROOT)
     assert done.returncode == 1
     assert "is no socket" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["bus.sock"]
@@ -249,10 +248,7 @@ def test_a_mistake_in_what_looks_on_does_not_end_the_recording(tmp_path, monkeyp
 def test_an_existing_file_is_not_replaced(tmp_path):
     output = tmp_path / "run.mcap"
     output.write_bytes(b"precious")
-    done = subprocess.run(
-        command(output, f"unix:{tmp_path / 'bus.sock'}"),
-        cwd=ROOT, check=False, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run(*command(output, f"unix:{tmp_path / 'bus.sock'}"), cwd=ROOT)
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert output.read_bytes() == b"precious"
@@ -270,20 +266,19 @@ def test_an_existing_file_is_not_replaced(tmp_path):
     ],
 )
 def test_wrong_usage_is_told_before_anything_is_made(arguments, said, tmp_path):
-    done = subprocess.run(
-        command(tmp_path / "run.mcap", *arguments),
-        cwd=ROOT, check=False, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run(*command(tmp_path / "run.mcap", *arguments), cwd=ROOT)
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
 def test_no_space_to_begin_with(tmp_path):
-    done = subprocess.run(
-        [*command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"), "--floor", "900TB"],
-        cwd=ROOT, check=False, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run(
+        *command(tmp_path / "run.mcap", f"unix:{tmp_path / 'bus.sock'}"),
+        "--floor",
+        "900TB",
+        cwd=ROOT,
+    )
     assert done.returncode == 1
     assert "less than the floor" in done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -294,10 +289,7 @@ def small_disk(tmp_path):
     """A file system of 64 MB."""
     folder = tmp_path / "small"
     folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(folder)],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
+    mounted = run("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", folder)
     if mounted.returncode:
         pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
     yield folder

@@ -13,6 +13,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import undulog
+from support import processes
+from support.processes import UNDULOG, run
 from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.control_socket import find_sockets
 
@@ -38,9 +40,7 @@ def recorder(place):
     def start(name, *options):
         command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/{name}.frames"]
         command += ["-o", str(place / f"{name}.mcap"), "--quiet", *options]
-        started.append(
-            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        )
+        started.append(processes.start(*command))
         path = place / "r" / "undulog" / f"{name}.sock"
         deadline = time.monotonic() + PATIENCE_S
         while path not in find_sockets(os.environ):
@@ -134,12 +134,7 @@ def test_of_several_recorders_one_must_be_named(recorder, place, capsys):
 def test_a_recorder_that_is_killed_while_we_wait_is_told(recorder, capsys):
     process = recorder("run")
     process.send_signal(signal.SIGSTOP)
-    waiting = subprocess.Popen(
-        [sys.executable, "-m", "undulog", "record", "stop", "--wait"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    waiting = processes.start(*UNDULOG, "record", "stop", "--wait")
     with contextlib.suppress(subprocess.TimeoutExpired):
         waiting.wait(1.0)
     assert waiting.poll() is None, "it waits, however long the recorder hangs"
@@ -154,13 +149,7 @@ def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorde
     (place / "b").mkdir()
     socket = place / "r" / "undulog" / "run.sock"
     command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/b.frames"]
-    done = subprocess.run(
-        [*command, "-o", str(place / "b" / "run.mcap"), "--socket", str(socket)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
+    done = run(*command, "-o", place / "b" / "run.mcap", "--socket", socket)
     assert done.returncode == 1
     assert "another recorder listens there; end it, or name another with --socket" in done.stderr
     assert list((place / "b").iterdir()) == []

@@ -22,8 +22,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from support import processes
 from support.paths import ROOT
-from support.patience import wait_for
+from support.processes import wait_for
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.log.messages.frames import DIR_TX, FrameArray, empty_frames
@@ -56,9 +57,7 @@ def recording(
     control = folder / "control.sock"
     command = [sys.executable, "-m", "undulog", "record", *arguments]
     command += ["-o", str(folder / "run.mcap"), "--socket", str(control), "--floor", "0", "--json"]
-    with subprocess.Popen(
-        command, cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    with processes.start(*command, cwd=ROOT, env=env) as process:
         try:
             yield process
         finally:

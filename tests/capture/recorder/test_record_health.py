@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import socket
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from support.paths import ROOT
-from support.patience import wait_for
+from support.processes import start, wait_for
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.sources.records import HEAD
@@ -46,9 +45,7 @@ def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) 
     output, source = tmp_path / "run.mcap", tmp_path / "snake.sock"
     command = [sys.executable, "-m", "undulog", "record", f"bus=unix:{source}", "-o", str(output)]
     command += ["--socket", str(tmp_path / "control.sock"), "--floor", "0", "--json"]
-    with subprocess.Popen(
-        command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as recorder:
+    with start(*command, cwd=ROOT) as recorder:
         try:
             wait_for(lambda: source.exists() or recorder.poll() is not None, "the source")
             sent = send(source, seconds=10.0, lost=12)

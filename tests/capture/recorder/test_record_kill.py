@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from support.paths import ROOT
-from support.patience import wait_for
+from support.processes import run, wait_for
 from undulog.capture import Session
 
 SENDER = ROOT / "bench" / "bus_sender.py"
@@ -135,10 +135,5 @@ def test_fifty_kills(options, tmp_path):
         folder = tmp_path / str(seed)
         folder.mkdir()
         for file in check_kill(folder, seed, *options):
-            done = subprocess.run(
-                [str(rerun), "mcap", "check", str(file)],
-                check=False,
-                capture_output=True,
-                text=True,
-            )
+            done = run(rerun, "mcap", "check", file)
             assert done.returncode == 0, (seed, done.stdout, done.stderr)

@@ -6,12 +6,12 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from support.processes import run, undulog
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
 
@@ -49,12 +49,7 @@ def settings_of(text):
 
 
 def test_systemd_finds_nothing_wrong(systemd_analyze, unit):
-    done = subprocess.run(
-        [systemd_analyze, "verify", "--man=no", str(unit)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run(systemd_analyze, "verify", "--man=no", unit)
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if unit.name in line]
     assert said == []
@@ -63,7 +58,7 @@ def test_systemd_finds_nothing_wrong(systemd_analyze, unit):
 def test_systemd_finds_it_well_hardened(systemd_analyze, unit):
     command = [systemd_analyze, "security", "--offline=true", "--no-pager"]
     command += [f"--threshold={EXPOSURE * 10:.0f}", str(unit)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run(*command)
     if "unrecognized option" in done.stderr:
         pytest.skip("this systemd-analyze can't judge a file")
     assert done.returncode == 0, done.stdout
@@ -78,7 +73,7 @@ def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
     unit.write_text(weak)
     command = [systemd_analyze, "security", "--offline=true", "--no-pager"]
     command += [f"--threshold={EXPOSURE * 10:.0f}", str(unit)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run(*command)
     assert done.returncode != 0
 
 
@@ -112,12 +107,7 @@ def test_odd_paths_mean_to_systemd_what_they_say(systemd_analyze, tmp_path, fold
     """systemd looks for the program, and names the path that it understood."""
     unit = tmp_path / UNIT_NAME.replace("@", "@snake")
     unit.write_text(unit_text(Path(folder) / "undulog"))
-    done = subprocess.run(
-        [systemd_analyze, "verify", "--man=no", str(unit)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run(systemd_analyze, "verify", "--man=no", unit)
     assert f"Command {folder}/undulog is not executable" in done.stderr
 
 
@@ -197,13 +187,7 @@ def service(unit, tmp_path):
 def control(runtime, *words):
     """Run a verb of the control socket as the operator would."""
     environ = {**os.environ, "RUNTIME_DIRECTORY": str(runtime)}
-    return subprocess.run(
-        [sys.executable, "-m", "undulog", "record", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environ,
-    )
+    return undulog("record", *words, env=environ)
 
 
 def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(service, tmp_path):

@@ -17,8 +17,9 @@ import bus_sender
 import numpy as np
 import pytest
 
+from support import processes
 from support.paths import ROOT
-from support.patience import wait_for
+from support.processes import wait_for
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.priority import raised_priority
 from undulog.capture.log.messages.frames import empty_frames
@@ -214,13 +215,7 @@ def raw(session, topic):
 def start_recorder(output, source, *before):
     command = [*before, sys.executable, "-m", "undulog", "record", source, "-o", str(output)]
     command += ["--floor", "0", "--quiet", "--json"]
-    return subprocess.Popen(
-        [*command, "--socket", str(output.with_name("control.sock"))],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return processes.start(*command, "--socket", output.with_name("control.sock"), cwd=ROOT)
 
 
 def stop(process):

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import undulog
+from support import processes
 from undulog.capture.common.errors import UsageError
 from undulog.replay.film.files import open_film
 from undulog.replay.film.film import Shot
@@ -233,13 +234,8 @@ def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, cap
 @pytest.mark.slow
 def test_without_a_vulkan_driver_the_packages_are_named(session_file, tmp_path):
     nowhere = {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"}
-    done = subprocess.run(
-        [sys.executable, "-m", "undulog", "view", session_file, "--clip", tmp_path / "a.mp4"],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env={**os.environ, **nowhere},
+    done = processes.undulog(
+        "view", session_file, "--clip", tmp_path / "a.mp4", env={**os.environ, **nowhere}
     )
     assert done.returncode == 1
     assert "mesa-vulkan-drivers" in done.stderr

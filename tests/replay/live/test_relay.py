@@ -7,7 +7,8 @@ import socket
 import numpy as np
 import pytest
 
-from support.live_stage import EPOCH_NS, WAIT_S, Recorder, freeze, until
+from support.live_stage import EPOCH_NS, WAIT_S, Recorder
+from support.processes import freeze, wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder import live_feed
@@ -46,7 +47,7 @@ def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back
     freeze(relay.process.pid)
     recorder.send(wait=False)  # all three seconds wait
     os.kill(relay.process.pid, signal.SIGCONT)
-    until(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
+    wait_for(lambda: recorder.feed.queued == 0, each=recorder.feed.pump)
     recorder.feed.close()
     assert relay.finish()["dropped"] == 0
     drawn = read_back(relay.output)
@@ -88,7 +89,7 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     first.process.kill()
     first.process.wait()
     assert recorder.send(0.5, 1.5, wait=False) > 40
-    until(lambda: not recorder.feed.connected, each=recorder.feed.pump)
+    wait_for(lambda: not recorder.feed.connected, each=recorder.feed.pump)
     second = stage.relay("second.rrd")  # over the socket that the first has left
     recorder.connect()
     recorder.send(1.5)
@@ -144,7 +145,7 @@ def test_interrupted_relay_leaves_a_whole_file_and_no_socket(stage, read_back):
     recorder, relay = stage.recorder(), stage.relay()
     recorder.connect()
     recorder.send(0.0, 1.0)
-    until(lambda: recorder.feed.counts.sent > 0, each=recorder.feed.pump)
+    wait_for(lambda: recorder.feed.counts.sent > 0, each=recorder.feed.pump)
     relay.process.send_signal(signal.SIGINT)
     report = relay.finish()
     assert report["shown"] == recorder.feed.counts.sent
@@ -187,7 +188,7 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
             kinds[:] = [one.head.kind for one in inbox._queue]
             return Kind.END in kinds
 
-        until(end_has_come)
+        wait_for(end_has_come)
         taken = inbox.take()
         shown = sum(one.head.messages for one in taken)
         assert shown + inbox.dropped == recorder.feed.counts.sent
@@ -201,8 +202,8 @@ def test_spawned_relay_is_in_a_session_of_its_own_and_ends_when_told(stage, tmp_
     relay = spawn_relay(stage.path, ["--save", str(output)])
     try:
         assert os.getsid(relay.pid) == relay.pid
-        until(stage.path.is_socket)
-        until(lambda: os.getpriority(os.PRIO_PROCESS, relay.pid) >= 10)
+        wait_for(stage.path.is_socket)
+        wait_for(lambda: os.getpriority(os.PRIO_PROCESS, relay.pid) >= 10)
         recorder = stage.recorder()
         recorder.connect()
         recorder.send(0.0, 0.5)
@@ -217,7 +218,7 @@ def test_spawned_relay_is_in_a_session_of_its_own_and_ends_when_told(stage, tmp_
 def test_spawned_relay_says_why_it_ended(tmp_path):
     relay = spawn_relay(tmp_path / "there is no such folder" / "s", ["--connect", "x"])
     try:
-        until(lambda: relay.poll() is not None)
+        wait_for(lambda: relay.poll() is not None)
         assert relay.poll() == 2
         assert "the socket can't be made" in relay.complaint()
     finally:
@@ -227,7 +228,7 @@ def test_spawned_relay_says_why_it_ended(tmp_path):
 def test_frozen_relay_that_was_spawned_can_be_ended(stage, monkeypatch):
     monkeypatch.setattr("undulog.capture.recorder.live_spawn._GRACE_S", 0.2)
     relay = spawn_relay(stage.path, ["--connect", "rerun+http://127.0.0.1:9/proxy"])
-    until(lambda: stage.path.is_socket() or relay.poll() is not None)
+    wait_for(lambda: stage.path.is_socket() or relay.poll() is not None)
     freeze(relay.pid)
     relay.close()
     assert relay.poll() == -signal.SIGKILL

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 import undulog
-from support.live_stage import WAIT_S, freeze
+from support.live_stage import WAIT_S
+from support.processes import freeze
 from undulog.replay.viewer.viewer import free_ports, viewer_binary
 
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 import pytest
 from rerun.experimental import ViewerClient
 
-from support.live_stage import freeze
+from support import processes
+from support.processes import freeze
 from undulog.replay.viewer.viewer import Viewer
 
 pytestmark = pytest.mark.slow
@@ -49,11 +49,13 @@ class Shown:
 
     def __init__(self, file, scratch, *options):
         self.scratch = scratch
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", HEADLESS, "view", file, *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+        self.process = processes.start(
+            sys.executable,
+            "-c",
+            HEADLESS,
+            "view",
+            file,
+            *options,
             env={**os.environ, "TMPDIR": str(scratch)},
         )
         address = self.process.stdout.readline().strip()

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import signal
-import subprocess
-import sys
 import time
 from collections import defaultdict
 
@@ -13,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 import undulog as front
+from support.processes import UNDULOG, start
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.write.writer import SessionWriter
@@ -197,15 +196,7 @@ def test_wrong_usage_says_what_would_be_right(words, told, capsys, tmp_path, mon
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     path = tmp_path / "stopped.mcap"
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "undulog", "drive", "flat", "--on", "twin"),
-            *("-o", str(path), "--duration", "3600"),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(*UNDULOG, "drive", "flat", "--on", "twin", "-o", path, "--duration", "3600")
     request.addfinalizer(process.kill)
     deadline = time.monotonic() + 60
     unfinished = tmp_path / "stopped.mcap.part"

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from support import processes
+from support.processes import start
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import DIR_TX
 
@@ -23,9 +25,7 @@ STEP = np.radians(0.01)
 
 @contextmanager
 def process(*words, env=None):
-    running = subprocess.Popen(
-        [*UNDULOG, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env
-    )
+    running = start(*UNDULOG, *words, env=env)
     try:
         yield running
     finally:
@@ -62,9 +62,7 @@ def recorded(on, path, env):
 
 
 def undulog(*words, env=None):
-    return subprocess.run(
-        [*UNDULOG, *words], capture_output=True, text=True, check=False, env=env, timeout=300
-    )
+    return processes.undulog(*words, env=env)
 
 
 @pytest.fixture

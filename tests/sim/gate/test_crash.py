@@ -14,6 +14,7 @@ import pytest
 
 from support import gate_stage
 from support.gate_stage import JOINTS, Written, staged
+from support.processes import UNDULOG, process, run, undulog
 from undulog.capture import Session
 from undulog.capture.log.health.session_check import check_session
 
@@ -62,14 +63,14 @@ def check_kill(folder, scenario, session, seed):
         controller.communicate(timeout=20)
         on_stage.settle()
         lines = on_stage.lines
-        again = gate_stage.undulog(*on_stage.words(session, path)[len(gate_stage.UNDULOG) :])
+        again = undulog(*on_stage.words(session, path)[len(UNDULOG) :])
     assert again.returncode == 2
     assert "exists already" in again.stderr
     with Session.open(path) as left:
         commands = left.joints("/joint_commands")
         ticks = len(commands.t_ns[0])
         assert any("undulog log recover" in warning for warning in left.warnings)
-    done = gate_stage.undulog("log", "recover", path, "-o", repaired, "--json")
+    done = undulog("log", "recover", path, "-o", repaired, "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["missing"] == 0
@@ -96,12 +97,7 @@ def disk(tmp_path, request):
     """A file system of so many MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={request.param}m", "tmpfs", str(folder)],
-        check=False,
-        capture_output=True,
-        text=True,
-    )
+    mounted = run("mount", "-t", "tmpfs", "-o", f"size={request.param}m", "tmpfs", folder)
     if mounted.returncode:
         pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
     yield folder
@@ -156,12 +152,12 @@ def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, 
 @pytest.mark.parametrize("disk", [50], indirect=True)
 def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk):
     path = disk / "a.mcap"
-    serve = (*gate_stage.UNDULOG, "sim", "serve", "flat", "--socketcand", "0")
-    with gate_stage.process(*serve, "--lockstep", "--fast", "--json") as robot:
+    serve = (*UNDULOG, "sim", "serve", "flat", "--socketcand", "0")
+    with process(*serve, "--lockstep", "--fast", "--json") as robot:
         port = json.loads(robot.stdout.readline())["port"]
-        words = (*gate_stage.UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={port}")
+        words = (*UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={port}")
         words += ("--arm", "-o", path, "--duration", "600")
-        with gate_stage.process(*words) as controller:
+        with process(*words) as controller:
             err, written = check_told(controller, path, disk, ramp_rate=0.5)
     assert len(written.commands) > 1000
     missing = re.search(

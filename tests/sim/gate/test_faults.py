@@ -18,6 +18,7 @@ import pytest
 
 from support import gate_stage
 from support.gate_stage import SAFETY, Written, staged
+from support.processes import process
 
 FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over by then
 LONG_S = 60.0
@@ -311,7 +312,7 @@ def test_a_console_that_goes_brings_the_joints_down(kind, small, session, tmp_pa
     with staged(tmp_path, small[1]) as on_stage:
         words = (sys.executable, "-c", IN_A_TERMINAL, kind, *on_stage.words(session, path))
         streams = {"stdin": slave, "stdout": slave, "stderr": slave, "start_new_session": True}
-        with gate_stage.process(*words, **streams) as controller:
+        with process(*words, **streams) as controller:
             os.close(slave)
             on_stage.wait_for_commands(controller, 60)
             shown = os.read(master, 1 << 16).decode()

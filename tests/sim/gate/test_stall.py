@@ -19,6 +19,7 @@ import pytest
 
 from support import far_end
 from support.far_end import beyond_rate, largest_burst
+from support.processes import start
 from undulog.capture import Session, SessionWriter
 from undulog.capture.robot.description import load_robot
 
@@ -154,12 +155,8 @@ def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=
         on = f"can:socketcand:can0?host=127.0.0.1&port={front}&plain=yes"
         words = ["drive", str(folder / f"{which}.mcap"), "--on", on, "--arm", "--json"]
         words += ["-o", str(path), "--duration", str(duration_s)]
-        with subprocess.Popen(
-            [sys.executable, "-c", DRIVE, *words],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
+        with start(
+            sys.executable, "-c", DRIVE, *words, env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
         ) as running:
             try:
                 drive.running = running

@@ -1,12 +1,11 @@
 """The compiled kernels against the NumPy laws, our own kinematics, and the engine link by link."""
 
 import dataclasses
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from support.processes import python
 from undulog.capture import Session
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Link
@@ -156,9 +155,7 @@ def test_a_missing_extra_is_named_and_auto_goes_without(tmp_path, package, words
         f"import sys; sys.modules[{package!r}] = None; import undulog\n"
         f"sys.exit(undulog.run(['sim', 'run', 'a.toml', '-o', 'a.mcap', *{words.split()!r}]))"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    said = python(code, cwd=tmp_path)
     if words.endswith("auto"):
         assert (said.returncode, said.stderr) == (0, "")
     else:

@@ -3,12 +3,11 @@
 import dataclasses
 import math
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from support.processes import undulog
 from undulog.capture import Session
 from undulog.capture.common.errors import ScenarioError
 from undulog.capture.robot.model import Plane
@@ -166,13 +165,14 @@ def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
 def test_two_processes_write_the_same_bytes(tmp_path):
     (tmp_path / "x.toml").write_text(SCENARIO)
     for name in ("a", "b"):
-        done = subprocess.run(
-            [*(sys.executable, "-m", "undulog", "sim", "run", "x.toml", "-o", f"{name}.mcap")],
+        done = undulog(
+            "sim",
+            "run",
+            "x.toml",
+            "-o",
+            f"{name}.mcap",
             cwd=tmp_path,
             env=os.environ | {"PYTHONHASHSEED": str(ord(name))},
-            capture_output=True,
-            text=True,
-            check=False,
         )
         assert done.returncode == 0, done.stderr
     first, second = ((tmp_path / f"{name}.mcap").read_bytes() for name in "ab")

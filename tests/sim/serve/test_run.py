@@ -19,6 +19,7 @@ import pytest
 
 import undulog as front
 from support.paths import ROOT
+from support.processes import undulog
 from undulog.capture import Session, load_robot
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.sources.address import parse_address
@@ -122,14 +123,19 @@ def recorder(source, output):
 
 
 def driven(scenario, port, control, *words):
-    done = subprocess.run(
-        [
-            *(*UNDULOG, "drive", str(scenario), "--on", f"can:socketcand:can0?port={port}"),
-            *("--arm", "--recorder", str(control), "--json", *words),
-            *("-o", str(control.with_suffix(".drive.mcap"))),
-        ],
-        check=False, capture_output=True, text=True, timeout=PATIENCE_S,
-    )  # fmt: skip
+    done = undulog(
+        "drive",
+        scenario,
+        "--on",
+        f"can:socketcand:can0?port={port}",
+        "--arm",
+        "--recorder",
+        control,
+        "--json",
+        *words,
+        "-o",
+        control.with_suffix(".drive.mcap"),
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -322,10 +328,7 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
         with process(*record, **options) as recording:
 
             def connected():
-                said = subprocess.run(
-                    [*UNDULOG, "record", "status", "--json"],
-                    capture_output=True, text=True, check=False, **options,
-                )  # fmt: skip
+                said = undulog("record", "status", "--json", **options)
                 found = json.loads(said.stdout or "{}").get("recordings", [])
                 return found and found[0]["sources"][0]["connected"]
 

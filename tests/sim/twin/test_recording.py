@@ -6,13 +6,14 @@ import math
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
 
+from support import processes
+from support.processes import start
 from undulog.capture import Session
 from undulog.capture.common.errors import OutputExistsError
 from undulog.capture.common.interruption import StopRequest
@@ -251,14 +252,7 @@ def test_noise_comes_from_the_seed_and_touches_only_reports(tmp_path, scenario, 
 
 
 def undulog(*words, cwd, **options):
-    return subprocess.run(
-        [*UNDULOG, *words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        **options,
-    )
+    return processes.undulog(*words, cwd=cwd, **options)
 
 
 def test_two_processes_write_the_same_bytes(tmp_path):
@@ -280,12 +274,7 @@ def test_two_processes_write_the_same_bytes(tmp_path):
 
 def long_run(path):
     """A run of an hour that has begun to write."""
-    process = subprocess.Popen(
-        [*UNDULOG, "sim", "run", "flat", "-o", str(path), "--duration", "3600"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(*UNDULOG, "sim", "run", "flat", "-o", path, "--duration", "3600")
     part = path.with_name(f"{path.name}.part")
     deadline = time.monotonic() + 60
     while not (part.exists() and part.stat().st_size > 0):
@@ -390,7 +379,7 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, capsys, name):
 def test_a_full_disk_leaves_nothing_and_no_traceback(disk_of):
     disk = disk_of("400k")
     words = ["sim", "run", "flat", "-o", str(disk / "run.mcap"), "--duration", "60"]
-    done = subprocess.run([*UNDULOG, *words], capture_output=True, text=True, check=False)
+    done = processes.undulog(*words)
     assert done.returncode == 1
     assert "run.mcap" in done.stderr
     assert "No space left" in done.stderr

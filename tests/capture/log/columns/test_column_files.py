@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.processes import run
 from undulog.capture import Session, SessionWriter
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -64,7 +65,7 @@ def test_columns_in_memory_stay(session_path, values):
 
 def test_without_room_on_the_disk_columns_lie_in_memory(session_path, values, tmp_path):
     command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(tmp_path)]
-    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    mounted = run(*command)
     if mounted.returncode != 0:
         pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
@@ -22,6 +21,7 @@ from support.edited_logs import (
     ticks,
     write_log,
 )
+from support.processes import python, start
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.log.edit.cut import cut_log
@@ -103,12 +103,7 @@ def test_sigterm_leaves_no_half_file_and_the_former_one_whole(tmp_path: Path):
     whole = write_log(tmp_path / "whole.mcap", ticks(5000))
     former = tmp_path / "cut.mcap"
     former.write_bytes(b"former")
-    process = subprocess.Popen(
-        [sys.executable, "-c", SLOW, "log", "cut", str(whole), "-o", str(former), "--force"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(sys.executable, "-c", SLOW, "log", "cut", whole, "-o", former, "--force")
     assert process.stdout is not None
     assert process.stdout.readline() == "writing\n"
     assert (tmp_path / "cut.mcap.part").exists()
@@ -129,9 +124,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path):
         "sys.exit(undulog.run(sys.argv[1:]))"
     )
     run = ["log", "cut", str(whole), "-o", str(tmp_path / "cut.mcap")]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *run], capture_output=True, text=True, check=False
-    )
+    done = python(code, *run)
     assert done.returncode == 1
     assert "cut.mcap: can't be written: File too large" in done.stderr
     assert list(tmp_path.iterdir()) == [whole]

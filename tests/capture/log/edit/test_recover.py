@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 
 import undulog
 from support import durable_child as recorder
+from support import processes
 from support.read_back import read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import (
@@ -381,13 +382,7 @@ def test_rerun_finds_nothing_wrong_with_a_recovered_file(tmp_path):
     path = unfinished(tmp_path / "run.mcap", 500)
     output = recovered_path(path)
     recover_log(path, output)
-    done = subprocess.run(
-        [str(rerun), "mcap", "check", str(output)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    done = processes.run(rerun, "mcap", "check", output)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

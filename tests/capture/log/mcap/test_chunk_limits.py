@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +12,7 @@ from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state, lz4_zeros, zeros
 from mcap.reader import make_reader
 
 import undulog
+from support.processes import python
 
 GIB = 1 << 30
 MIB = 1 << 20
@@ -72,13 +71,8 @@ def run(*commands: list[object], most: int = ROOM) -> list[str]:
         resource.setrlimit(resource.RLIMIT_AS, (3 * GIB, 3 * GIB))
 
     listed = json.dumps([[str(word) for word in command] for command in commands])
-    done = subprocess.run(
-        [sys.executable, "-c", script, listed],
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=limited,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    done = python(
+        script, listed, preexec_fn=limited, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     )
     assert not done.returncode, done.stderr
     used, found = json.loads(done.stdout)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from support.paths import ROOT
+from support.processes import python
 from undulog.capture import SessionWriter
 from undulog.capture.log.mcap.mcap_payloads import McapPayloads
 
@@ -46,14 +45,7 @@ def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path: Path) -> None:
         states = writer.joint_state("/joint_states", ("a", "b"), unit="rad")
         for tick in range(100):
             states.write(1_735_689_600_000_000_000 + tick * 10_000_000, np.zeros(2))
-    done = subprocess.run(
-        [sys.executable, "-c", READS, str(path)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        cwd=ROOT,
-    )
+    done = python(READS, path, cwd=ROOT)
     assert done.stdout == "read\n", done.stderr
 
 

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -14,7 +13,8 @@ from mcap.records import Channel, Metadata
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from support import durable_child as recorder
-from support.patience import wait_for
+from support import processes
+from support.processes import wait_for
 from support.read_back import read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
@@ -256,9 +256,7 @@ except LogWriteError as error:
 
 def fill(place, ballast, split_size=0, hog="never"):
     command = [sys.executable, "-c", FILL, CHILD, place, ballast, split_size, hog]
-    done = subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, check=False, timeout=120
-    )
+    done = processes.run(*command)
     assert done.returncode == 0, done.stderr
     told, end = done.stdout.splitlines()
     accepted, foreseen, error = told.split("|")

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from support.patience import wait_for
+from support.processes import wait_for
 from undulog.capture import Session
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.log.sinks.mcap_sink import McapSink

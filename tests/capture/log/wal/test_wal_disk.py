@@ -3,13 +3,12 @@
 import os
 import re
 import resource
-import subprocess
-import sys
 import threading
 import time
 
 import pytest
 
+from support.processes import python
 from support.wal_messages import MESSAGE, check_messages, message
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.log.wal.wal import WriteAheadLog
@@ -125,14 +124,7 @@ print(accepted)
 
 
 def run_child(script, *arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-c", script, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-        **options,
-    )
+    return python(script, *map(str, arguments), **options)
 
 
 @pytest.mark.parametrize("then", ["close", "release"])

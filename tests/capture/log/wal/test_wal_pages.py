@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from support.paths import ROOT
-from support.patience import wait_for
+from support.processes import wait_for
 from support.wal_messages import message
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import empty_frames

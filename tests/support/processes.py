@@ -1,0 +1,73 @@
+"""Commands and other processes run from tests, and patience with them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+UNDULOG = (sys.executable, "-m", "undulog")
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+
+
+def run(*words, **options):
+    """Run a process to its end; its exit code is for the caller to check."""
+    options = PIPES | {"timeout": 300} | options
+    return subprocess.run([str(word) for word in words], check=False, **options)
+
+
+def undulog(*words, **options):
+    return run(*UNDULOG, *words, **options)
+
+
+def python(code, *words, **options):
+    return run(sys.executable, "-c", code, *words, **options)
+
+
+def start(*words, **options):
+    """Start a process whose output goes to pipes."""
+    return subprocess.Popen([str(word) for word in words], **(PIPES | options))
+
+
+@contextmanager
+def process(*words, **options):
+    """A process that is ended with the block."""
+    running = start(*words, **options)
+    try:
+        yield running
+    finally:
+        if running.poll() is None:
+            running.send_signal(signal.SIGCONT)  # a stopped one would not end
+            running.terminate()
+        try:
+            running.communicate(timeout=20)
+        except subprocess.TimeoutExpired:
+            running.kill()
+            running.communicate(timeout=20)
+
+
+def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
+    """What a condition gives as soon as it holds; the processes ``alive`` must live meanwhile."""
+    deadline = time.monotonic() + seconds
+    while not (found := condition()):
+        for one in alive:
+            assert one.poll() is None, (what, one.communicate())
+        assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
+        each()
+        time.sleep(0.005)
+    return found
+
+
+def freeze(pid):
+    """Stop a process, and wait until all its threads stand."""
+    os.kill(pid, signal.SIGSTOP)
+    threads = Path(f"/proc/{pid}/task")
+
+    def states():
+        return {
+            (one / "stat").read_text().rpartition(")")[2].split()[0] for one in threads.iterdir()
+        }
+
+    wait_for(lambda: states() == {"T"}, "all threads to stand")
