@@ -109,7 +109,7 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path: Path) -> N
         " is_extended_id=False, data=[k], channel=0))\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-    done = processes.undulog("import", trace, "-o", session, "-r", "arcsnake-joint", cwd=ROOT)  # fmt: skip
+    done = processes.undulog("import", trace, "-o", session, "-r", "arcsnake-joint", cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "5 CAN frames" in done.stdout
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 
+from support.processes import wait_for
 from undulog.capture.common.errors import DataError
 from undulog.capture.recorder.control import LATER
 
@@ -57,10 +58,7 @@ def connected(server):
 
 def polls(server, until):
     """Poll until a condition holds."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not until():
-        assert time.monotonic() < deadline
-        server.poll()
+    wait_for(until, each=server.poll)
 
 
 def replies(data):

@@ -2,14 +2,13 @@
 
 import json
 import math
-import subprocess
-import sys
 import time
-from contextlib import closing, contextmanager
+from contextlib import closing
 
 import pytest
 
 import undulog
+from support.processes import UNDULOG, process
 from undulog.capture import Session, load_robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
@@ -22,7 +21,6 @@ from zoo.outputs import OUTPUTS, statements
 from zoo.planting import RESPONSE
 from zoo.truth import PAUSED, STOPPED, JointTruth, Truth
 
-UNDULOG = [sys.executable, "-m", "undulog"]
 PATIENCE_S = 300
 DURATION_S = 12.0
 FREQUENCY_HZ = 0.8
@@ -65,17 +63,6 @@ class SnakeOfTheBus:
     omega = 2 * math.pi * FREQUENCY_HZ
 
 
-@contextmanager
-def process(*words):
-    started = subprocess.Popen([*UNDULOG, *words], text=True, stdout=subprocess.PIPE)
-    try:
-        yield started
-    finally:
-        if started.poll() is None:
-            started.kill()
-        started.communicate()
-
-
 def logged_on_the_bus(folder, scenario, faults):
     """Serve and drive in lockstep, and log what is on the bus by the robot's own clock.
 
@@ -86,7 +73,7 @@ def logged_on_the_bus(folder, scenario, faults):
     words = [word for fault in faults for word in ("--fault", fault)]
     words += ["--socketcand", "0", "--lockstep", "--fast", "--json", "--duration", str(DURATION_S)]
     lines = []
-    with process("sim", "serve", str(scenario), *words) as served:
+    with process(*UNDULOG, "sim", "serve", scenario, *words) as served:
         port = json.loads(served.stdout.readline())["port"]
         gait = find_driven(str(scenario)).make(robot, None)
         encoder, blind = CommandEncoder(robot), Readings.nothing(robot)

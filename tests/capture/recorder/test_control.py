@@ -25,6 +25,7 @@ from support.control_clients import (
     replies,
     start_recorder,
 )
+from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder import control
 from undulog.capture.recorder.control import BUFFER, MAX_CLIENTS, ControlServer
@@ -250,9 +251,7 @@ def test_the_reply_to_a_later_answer_comes_with_the_close(server):
     with polled(server):
         client = connected(server)
         client.sendall(b'{"do": "later"}\n{"do": "x"}\n')
-        deadline = time.monotonic() + PATIENCE_S
-        while not server.requests and time.monotonic() < deadline:
-            time.sleep(0.001)
+        wait_for(lambda: server.requests)
         time.sleep(0.05)
     assert server.requests == 1, "what comes after waits"
     server.close({"verdict": "good"})

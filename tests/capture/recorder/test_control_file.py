@@ -6,13 +6,11 @@ import shutil
 import socket
 import stat
 import threading
-import time
 from pathlib import Path
 
 import pytest
 
 from support.control_clients import (
-    PATIENCE_S,
     connected,
     drain,
     echo,
@@ -21,6 +19,7 @@ from support.control_clients import (
     polls,
     start_recorder,
 )
+from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import TEND_POLLS, ControlServer
 from undulog.capture.recorder.control_client import ControlClient
@@ -46,9 +45,7 @@ def test_only_its_user_can_reach_it_from_the_first_moment(tmp_path):
             ControlServer(path, echo).close()
             assert not path.exists()
         held = ControlServer(path, echo)
-        deadline = time.monotonic() + PATIENCE_S
-        while not seen and time.monotonic() < deadline:
-            time.sleep(0.001)
+        wait_for(lambda: seen)
         held.close()
     finally:
         ended.set()

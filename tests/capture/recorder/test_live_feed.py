@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Attachment, Channel, Metadata, Schema
 
+from support.processes import wait_for
 from undulog.capture.common.errors import DataError
 from undulog.capture.recorder import live_feed
 from undulog.capture.recorder.live_feed import LiveFeed
@@ -96,11 +97,7 @@ def received(link):
 
 
 def pump_until(feed, condition):
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        feed.pump()
-        time.sleep(0.002)
+    wait_for(condition, each=feed.pump)
 
 
 def offer(feed, number, channel=1, payload=b"data", step_ns=STEP_NS):

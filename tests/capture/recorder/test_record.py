@@ -6,7 +6,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ import pytest
 
 from support import processes
 from support.paths import ROOT
-from support.processes import run, wait_for
+from support.processes import UNDULOG, run, wait_for
 from undulog.capture import Session, load_robot
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.log.health.session_check import check_session
@@ -26,7 +25,6 @@ from undulog.capture.recorder.live_health import LiveHealth
 from undulog.capture.recorder.record import Recording
 from undulog.capture.recorder.settings import resolve
 
-UNDULOG = [sys.executable, "-m", "undulog"]
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
 
 
@@ -284,22 +282,10 @@ def test_no_space_to_begin_with(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 64 MB."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    mounted = run("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", folder)
-    if mounted.returncode:
-        pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("floor", ["10MB", "0"], ids=["floor", "to the last byte"])
-def test_a_full_disk_ends_the_recording_in_good_order(floor, small_disk, tmp_path):
-    output, bus = small_disk / "run.mcap", tmp_path / "bus.sock"
+def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path):
+    output, bus = disk_of / "run.mcap", tmp_path / "bus.sock"
     rng = np.random.default_rng(0)
     frames, _ = polling(400)
     sent = []

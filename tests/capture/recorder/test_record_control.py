@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 import undulog
 from support import processes
-from support.processes import UNDULOG, run
+from support.processes import UNDULOG, run, wait_for
 from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.control_socket import find_sockets
 
@@ -42,11 +42,7 @@ def recorder(place):
         command += ["-o", str(place / f"{name}.mcap"), "--quiet", *options]
         started.append(processes.start(*command))
         path = place / "r" / "undulog" / f"{name}.sock"
-        deadline = time.monotonic() + PATIENCE_S
-        while path not in find_sockets(os.environ):
-            assert time.monotonic() < deadline
-            assert started[-1].poll() is None, started[-1].communicate()
-            time.sleep(0.02)
+        wait_for(lambda: path in find_sockets(os.environ), alive=[started[-1]])
         return started[-1]
 
     yield start

@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from support.processes import wait_for
 from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import FRAME_DTYPE
 from undulog.capture.robot.model import ClockDomain
@@ -145,9 +146,6 @@ def test_a_connection_that_opens_after_the_end_is_closed(sockets, context) -> No
     assert source.poll().frames == ()
     source.stop()
     go.set()
-    deadline = time.monotonic() + 60
-    while ours.fileno() != -1:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: ours.fileno() == -1)
     assert not source.connected
     assert source.poll().frames == ()

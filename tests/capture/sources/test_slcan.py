@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from can.util import len2dlc
 
+from support.processes import wait_for
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import (
     EXTENDED_FLAG,
@@ -189,10 +190,7 @@ def test_a_recorder_that_is_held_up_loses_nothing(plug, tmp_path, listen, traffi
     adapter = plug()
     heard = listen(source_at(tmp_path))
     adapter.send(lines(truth))
-    deadline = time.monotonic() + 60
-    while adapter.queue:  # nobody polls
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: not adapter.queue)  # nobody polls
     found = heard.until_frames(len(truth))
     assert same(found, truth)
     assert len(np.unique(found["t_host_ns"])) > 5  # each stamped when it was read

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.processes import wait_for
 from undulog.capture.common.errors import DataError, SourceError, UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import ClockDomain
@@ -244,11 +245,8 @@ def test_our_sender_waits_for_a_recorder_and_for_the_next_one(tmp_path, context,
     for _ in range(2):
         source = source_at(path)
         source.start(context)
-        deadline = time.monotonic() + 60
-        while sender.send(truth) == 0:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        count = 0
+        wait_for(lambda: sender.send(truth) != 0)
+        deadline, count = time.monotonic() + 60, 0
         while count < 10:
             assert time.monotonic() < deadline
             count += sum(map(len, source.poll().frames))
@@ -274,10 +272,10 @@ def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(
     for _ in range(3 * MOST_SENDERS):
         idle.append(peer())
         heard.poll()
-    deadline = time.monotonic() + 10
-    while len(list(Path("/proc/self/fd").iterdir())) - before - len(idle) > MOST_SENDERS:
-        assert time.monotonic() < deadline
-        heard.poll()
+    wait_for(
+        lambda: len(list(Path("/proc/self/fd").iterdir())) - before - len(idle) <= MOST_SENDERS,
+        each=heard.poll,
+    )
     heard.until_event("more than 64 senders")
     worker.send(foreign_truth(3, 4).tobytes())  # who sends is not silent
     heard.until_frames(7)

@@ -18,6 +18,7 @@ from PIL import Image
 
 import undulog
 from support import golden_pictures
+from support.processes import wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -108,10 +109,7 @@ class Page:
         return last
 
     def wait(self, until, patience_s=120.0):
-        deadline = time.monotonic() + patience_s
-        while not until(self.picture()):
-            assert time.monotonic() < deadline, "the page doesn't show the session"
-            time.sleep(0.5)
+        wait_for(lambda: until(self.picture()), "the page doesn't show the session", patience_s)
 
     def click(self, x, y):
         for kind in ("mousePressed", "mouseReleased"):

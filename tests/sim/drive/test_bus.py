@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import undulog as front
+from support.processes import wait_for
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
@@ -70,10 +71,7 @@ def alive(scenario, *, lockstep=True):
 
 def ended(served):
     """Wait until a virtual robot's run is over."""
-    deadline = time.monotonic() + 30
-    while not served:
-        assert time.monotonic() < deadline, "the robot goes on"
-        time.sleep(0.01)
+    wait_for(lambda: served, "the robot goes on")
 
 
 class Rounded:

@@ -5,39 +5,27 @@ import os
 import pty
 import signal
 import subprocess
-import sys
 import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
-from support import processes
-from support.processes import start
+from support.processes import UNDULOG, process, undulog, wait_for
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import DIR_TX
 
 pytestmark = pytest.mark.slow
 
-UNDULOG = (sys.executable, "-m", "undulog")
 STEP = np.radians(0.01)
-
-
-@contextmanager
-def process(*words, env=None):
-    running = start(*UNDULOG, *words, env=env)
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.kill()
-        running.communicate(timeout=30)
 
 
 @contextmanager
 def served(scenario, *words):
     """A virtual robot: its bus's address, and the process."""
-    with process("sim", "serve", scenario, "--socketcand", "0", "--json", *words) as robot:
+    with process(
+        *UNDULOG, "sim", "serve", scenario, "--socketcand", "0", "--json", *words
+    ) as robot:
         line = robot.stdout.readline()
         assert line, robot.stderr.read()
         ready = json.loads(line)
@@ -48,21 +36,17 @@ def served(scenario, *words):
 @contextmanager
 def recorded(on, path, env):
     """A recorder of that bus, connected."""
-    with process("record", on, "-r", "snake25", "-o", str(path), "--floor", "0", env=env) as one:
-        deadline = time.monotonic() + 60
-        while True:
+    with process(
+        *UNDULOG, "record", on, "-r", "snake25", "-o", str(path), "--floor", "0", env=env
+    ) as one:
+
+        def connected():
             asked = undulog("record", "status", "--json", env=env)
             found = json.loads(asked.stdout or "{}").get("recordings", [])
-            if found and found[0]["sources"][0]["connected"]:
-                break
-            assert one.poll() is None, one.stderr.read()
-            assert time.monotonic() < deadline, asked
-            time.sleep(0.1)
+            return found and found[0]["sources"][0]["connected"]
+
+        wait_for(connected, "the recorder", alive=[one])
         yield one
-
-
-def undulog(*words, env=None):
-    return processes.undulog(*words, env=env)
 
 
 @pytest.fixture
@@ -161,7 +145,7 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
     path = tmp_path / "a.mcap"
     with served("flat", "--lockstep", "--fast") as (on, _):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
-        with process(*words, env=alone) as driving:
+        with process(*UNDULOG, *words, env=alone) as driving:
             under_way(driving, path)
             driving.send_signal(number)
             told, complained = driving.communicate(timeout=60)
@@ -182,11 +166,7 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
 
 def under_way(driving, path):
     """Wait until a drive is in full swing."""
-    deadline = time.monotonic() + 60
-    while not (path.exists() and path.stat().st_size > 0):
-        assert driving.poll() is None, driving.stderr.read()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_for(lambda: path.exists() and path.stat().st_size > 0, alive=[driving])
     time.sleep(1.0)
 
 
@@ -219,7 +199,7 @@ def test_a_killed_robot_ends_the_drive_with_its_name(tmp_path, alone):
     path = tmp_path / "a.mcap"
     with served("flat", "--lockstep", "--fast") as (on, robot):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
-        with process(*words, env=alone) as driving:
+        with process(*UNDULOG, *words, env=alone) as driving:
             under_way(driving, path)
             robot.kill()
             _, complained = driving.communicate(timeout=60)

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import ControlServer
 from undulog.sim.drive.gait_teller import GaitTeller
@@ -109,10 +110,7 @@ def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
 
 
 def teller_told(teller, count):
-    deadline = time.monotonic() + 10
-    while teller.told < count:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    wait_for(lambda: teller.told >= count)
 
 
 def test_no_recorder_there_is_an_error(tmp_path):

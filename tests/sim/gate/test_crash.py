@@ -6,7 +6,6 @@ Robot, controller and listener are three processes; what was on the bus is what 
 import json
 import random
 import re
-import subprocess
 import time
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 
 from support import gate_stage
 from support.gate_stage import JOINTS, Written, staged
-from support.processes import UNDULOG, process, run, undulog
+from support.processes import UNDULOG, process, undulog
 from undulog.capture import Session
 from undulog.capture.log.health.session_check import check_session
 
@@ -92,18 +91,6 @@ def test_a_drive_that_is_killed_has_all_that_was_commanded(seed, small, session,
 # -- a full disk ----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def disk(tmp_path, request):
-    """A file system of so many MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = run("mount", "-t", "tmpfs", "-o", f"size={request.param}m", "tmpfs", folder)
-    if mounted.returncode:
-        pytest.skip(f"a tmpfs can't be mounted here: {mounted.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
 def fill(folder):
     """Take the rest of a disk, as somebody else would who leaves the processors to others."""
     with (folder / "hog").open("wb", buffering=0) as hog:
@@ -134,8 +121,8 @@ def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("disk", [64], indirect=True)
-def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, tmp_path, disk):
+def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, tmp_path, disk_of):
+    disk = disk_of("64m")
     path = disk / "a.mcap"
     with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
         on_stage.wait_for_commands(controller)
@@ -149,8 +136,8 @@ def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("disk", [50], indirect=True)
-def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk):
+def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of):
+    disk = disk_of("50m")
     path = disk / "a.mcap"
     serve = (*UNDULOG, "sim", "serve", "flat", "--socketcand", "0")
     with process(*serve, "--lockstep", "--fast", "--json") as robot:
@@ -167,8 +154,8 @@ def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("disk", [44], indirect=True)
-def test_on_a_disk_without_room_nothing_is_sent(small, session, tmp_path, disk):
+def test_on_a_disk_without_room_nothing_is_sent(small, session, tmp_path, disk_of):
+    disk = disk_of("44m")
     path = disk / "a.mcap"
     with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
         _, err = controller.communicate(timeout=60)

@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from support.processes import wait_for
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
@@ -70,10 +71,7 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
         pumped.server.broadcast(frames(COUNT))
     assert pumped.server.waiting == 0  # it has not listened yet
     pumped.go()
-    deadline = time.monotonic() + 20
-    while pumped.server.clients:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: not (pumped.server.clients))
     pumped.rest()
     sent = list(iter(pumped.server.take, None))
     assert [one.record[24] for one in sent] == list(range(COUNT))

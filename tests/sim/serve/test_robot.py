@@ -9,6 +9,7 @@ import can
 import numpy as np
 import pytest
 
+from support.processes import wait_for
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
@@ -221,10 +222,7 @@ def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, run
 def test_without_commands_it_holds_still_and_says_whose_commands_are_missing(scenario, running):
     live = running(scenario.changed(duration_s=0.5), lockstep=True)
     live.command([0.0] * (JOINTS - 1))
-    deadline = time.monotonic() + 60
-    while "waits for commands of joint04" not in live.said:
-        assert time.monotonic() < deadline, live.said
-        time.sleep(0.05)
+    wait_for(lambda: "waits for commands of joint04" in live.said, live.said)
     live.stop.signal = 15
     served = live.ended()
     assert (served.complete, served.duration_s) == (False, 0.0)
@@ -234,10 +232,7 @@ def test_silence_of_the_controller_is_told_and_so_is_its_return(scenario, runnin
     live = running(scenario.changed(duration_s=30.0), fast=False, wait=True)
 
     def until(part):
-        deadline = time.monotonic() + 60
-        while not any(part in text for text in live.said):
-            assert time.monotonic() < deadline, live.said
-            time.sleep(0.02)
+        wait_for(lambda: any(part in text for text in live.said), live.said)
 
     live.command([0.6] * JOINTS)
     until("no command for 0.5 s: joint01, joint02, joint03, joint04 hold their angles")

@@ -19,7 +19,7 @@ import pytest
 
 import undulog as front
 from support.paths import ROOT
-from support.processes import undulog
+from support.processes import UNDULOG, process, undulog, wait_for
 from undulog.capture import Session, load_robot
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.sources.address import parse_address
@@ -29,7 +29,6 @@ from undulog.sim.drive.link import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
 from undulog.sim.gait.contract import Readings
 
-UNDULOG = [sys.executable, "-m", "undulog"]
 PATIENCE_S = 300
 DURATION_S = 3.0
 STEP = {  # of the robot's DBC, in SI
@@ -67,31 +66,11 @@ to = [0.8, 3.0]
 """
 
 
-def wait_for(condition, what):
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited for {what}"
-        time.sleep(0.05)
-    return found
-
-
-@contextmanager
-def process(*words, **options):
-    started = subprocess.Popen([*UNDULOG, *words], text=True, stdout=subprocess.PIPE, **options)
-    try:
-        yield started
-    finally:
-        if started.poll() is None:
-            started.kill()
-        started.communicate()
-
-
 @contextmanager
 def robot_process(scenario, *words, place="0", **options):
     """A virtual robot, and what it says when it is ready."""
-    with process(
-        "sim", "serve", str(scenario), "--socketcand", place, "--json", *words, **options
-    ) as started:
+    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", place, "--json", *words)
+    with process(*serve, **options) as started:
         yield started, json.loads(started.stdout.readline())
 
 
@@ -111,7 +90,7 @@ def recorder(source, output):
     """A recorder whose source is connected; it is asked to end at the end."""
     control = output.with_suffix(".ctl")
     words = ("--robot", "snake25", "-o", str(output), "--socket", str(control), "--floor", "0")
-    with process("record", f"can0={source}", *words, "--json", "--quiet") as started:
+    with process(*UNDULOG, "record", f"can0={source}", *words, "--json", "--quiet") as started:
 
         def connected():
             assert started.poll() is None, started.stdout.read()

@@ -15,6 +15,7 @@ from can.interfaces.socketcand.socketcand import (
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.processes import wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.messages.frames import (
@@ -105,10 +106,7 @@ class Serving:
             self.bus.send(frames)
 
     def until(self, condition, what):
-        deadline = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < deadline, (what, self.said)
-            time.sleep(0.005)
+        wait_for(condition, what)
 
     def frames(self):
         return np.concatenate([empty_frames(0), *self.pulled])

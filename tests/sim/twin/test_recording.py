@@ -6,14 +6,12 @@ import math
 import os
 import re
 import signal
-import sys
 import time
 
 import numpy as np
 import pytest
 
-from support import processes
-from support.processes import start
+from support.processes import UNDULOG, start, undulog, wait_for
 from undulog.capture import Session
 from undulog.capture.common.errors import OutputExistsError
 from undulog.capture.common.interruption import StopRequest
@@ -35,7 +33,6 @@ from undulog.sim.twin.twin import Twin
 from undulog.sim.twin.urdf import urdf
 
 HUNDREDTH_NS = 10_000_000
-UNDULOG = (sys.executable, "-m", "undulog")
 POWERS = {
     "mechanical": "mechanical_net",
     "mechanical_plus": "mechanical_plus",
@@ -251,10 +248,6 @@ def test_noise_comes_from_the_seed_and_touches_only_reports(tmp_path, scenario, 
     np.testing.assert_array_equal(energy, [sample.energy for sample in truth])
 
 
-def undulog(*words, cwd, **options):
-    return processes.undulog(*words, cwd=cwd, **options)
-
-
 def test_two_processes_write_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         # Another hash seed and another time zone must not matter either.
@@ -276,11 +269,7 @@ def long_run(path):
     """A run of an hour that has begun to write."""
     process = start(*UNDULOG, "sim", "run", "flat", "-o", path, "--duration", "3600")
     part = path.with_name(f"{path.name}.part")
-    deadline = time.monotonic() + 60
-    while not (part.exists() and part.stat().st_size > 0):
-        assert process.poll() is None, process.stderr.read()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_for(lambda: part.exists() and part.stat().st_size > 0, alive=[process])
     time.sleep(1.0)
     return process
 
@@ -379,7 +368,7 @@ def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, capsys, name):
 def test_a_full_disk_leaves_nothing_and_no_traceback(disk_of):
     disk = disk_of("400k")
     words = ["sim", "run", "flat", "-o", str(disk / "run.mcap"), "--duration", "60"]
-    done = processes.undulog(*words)
+    done = undulog(*words)
     assert done.returncode == 1
     assert "run.mcap" in done.stderr
     assert "No space left" in done.stderr

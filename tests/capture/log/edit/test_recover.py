@@ -18,6 +18,7 @@ from rosbags.highlevel import AnyReader
 import undulog
 from support import durable_child as recorder
 from support import processes
+from support.processes import wait_for
 from support.read_back import read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import (
@@ -217,11 +218,11 @@ def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp
     early = {path.name: path.read_bytes() for path in sorted(folder.glob("0*.seg"))[:1]}
     for number in range(1000, 8000):
         recorder.write(sink, number)
-    deadline = time.monotonic() + 30
-    while (folder / next(iter(early))).exists():
-        assert time.monotonic() < deadline, "the first segment was never let go of"
-        sink.tick()
-        time.sleep(0.01)
+    wait_for(
+        lambda: not (folder / next(iter(early))).exists(),
+        "the first segment was never let go of",
+        each=sink.tick,
+    )
     copy = tmp_path / "copy"
     (copy / folder.name).mkdir(parents=True)
     for name, data in early.items():

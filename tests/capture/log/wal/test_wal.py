@@ -2,7 +2,6 @@
 
 import random
 import struct
-import time
 import zlib
 
 import pytest
@@ -10,6 +9,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from mcap.writer import Writer
 
+from support.processes import wait_for
 from support.wal_messages import CHANNEL, check_messages, filled, message
 from undulog.capture.common.errors import (
     DataError,
@@ -153,10 +153,9 @@ def test_segments_go_when_released_and_the_folder_when_all_is(tmp_path):
         wal.append(*message(position))
     before = len(list(folder.glob("0*.seg")))
     wal.release(150)
-    deadline = time.monotonic() + 10
-    while len(list(folder.glob("0*.seg"))) > before / 2:
-        assert time.monotonic() < deadline, "released segments are still there"
-        time.sleep(0.01)
+    wait_for(
+        lambda: len(list(folder.glob("0*.seg"))) <= before / 2, "released segments are still there"
+    )
     assert check_messages(list(recover(folder)))[-1] == 200  # a log in use can be looked at
     wal.release(200)
     wal.close()

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from support.processes import python
+from support.processes import python, wait_for
 from support.wal_messages import MESSAGE, check_messages, message
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.log.wal.wal import WriteAheadLog
@@ -31,10 +31,7 @@ def test_syncing_is_done_off_the_appending_thread(tmp_path, monkeypatch):
     with WriteAheadLog(tmp_path / "w", sync_interval_s=0.01, segment_size=1 << 16) as wal:
         for position in range(1, 1001):
             wal.append(*message(position))
-        deadline = time.monotonic() + 10
-        while wal.synced < 1000:
-            assert time.monotonic() < deadline, "nothing was synced"
-            time.sleep(0.01)
+        wait_for(lambda: wal.synced >= 1000, "nothing was synced")
         assert threads
         assert threading.get_ident() not in threads
         wal.release(1000)
@@ -123,13 +120,9 @@ print(accepted)
 )
 
 
-def run_child(script, *arguments, **options):
-    return python(script, *map(str, arguments), **options)
-
-
 @pytest.mark.parametrize("then", ["close", "release"])
 def test_a_full_disk_is_an_error_that_loses_nothing(small_disk, then):
-    done = run_child(FILL, small_disk / "w", then)
+    done = python(FILL, small_disk / "w", then)
     assert done.returncode == 0, done.stderr
     told, again, last = done.stdout.splitlines()
     accepted, foreseen, error = told.split("|")
@@ -159,7 +152,7 @@ def test_a_limit_on_file_size_is_an_error_not_a_signal(tmp_path):
     def limited():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    done = run_child(FILL, tmp_path / "w", "close", preexec_fn=limited)
+    done = python(FILL, tmp_path / "w", "close", preexec_fn=limited)
     assert done.returncode == 1
     assert "LogWriteError" in done.stderr
     assert "can't be reserved: File too large" in done.stderr

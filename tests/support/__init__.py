@@ -1,1 +1,0 @@
-"""What tests share: builders of sessions, robots and buses, processes, a browser."""
