@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .log.columns.topics import Channel
     from .log.read.session import Session
     from .log.read.signals import JointSignals, Signal
+    from .log.read.view import SessionView
     from .log.write.writer import SessionWriter
     from .robot.description import load_robot, robot_names
     from .robot.model import Robot
@@ -34,6 +35,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "JointSignals": "log.read.signals",
         "Robot": "robot.model",
         "Session": "log.read.session",
+        "SessionView": "log.read.view",
         "SessionWriter": "log.write.writer",
         "Signal": "log.read.signals",
         "load_robot": "robot.description",

@@ -15,7 +15,7 @@ from itertools import chain
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.threads import in_threads
 from undulog.capture.log.read.signals import Signal
@@ -147,7 +147,7 @@ class _Joint:
     driven: bool
 
 
-def find_artefacts(session: Session, columns: Columns) -> tuple[Artefact, ...]:
+def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ...]:
     """Look at the whole session, joint by joint.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.strict_table import read_toml
 from undulog.capture.robot.model import Joint, Servo
@@ -71,7 +71,7 @@ class Limits:
         return (self.lower, self.upper, *sizes, *(-one for one in sizes))
 
 
-def limits_of(session: Session) -> dict[str, Limits]:
+def limits_of(session: SessionView) -> dict[str, Limits]:
     """Limits of the session's joints.
 
     Args:
@@ -104,7 +104,7 @@ def _limits(joint: Joint, changes: Mapping[str, Mapping[str, float]], known: boo
     )
 
 
-def _servo_changes(session: Session) -> dict[str, Mapping[str, float]]:
+def _servo_changes(session: SessionView) -> dict[str, Mapping[str, float]]:
     """Servo values of the attached scenario: of all joints under an empty name, and by name."""
     try:
         scenario: Any = read_toml(session.attachments["scenario.toml"].decode())

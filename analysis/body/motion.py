@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
@@ -33,7 +33,11 @@ _BENT_RAD = float(np.radians(2.0))
 
 
 def body_motion(
-    session: Session, responses: Mapping[str, Series], gait: GaitFit | None, span: Span, warn: Warn
+    session: SessionView,
+    responses: Mapping[str, Series],
+    gait: GaitFit | None,
+    span: Span,
+    warn: Warn,
 ) -> BodyResult | None:
     """Head, middle and tail across the mean heading, beside their null.
 
@@ -80,7 +84,7 @@ def body_motion(
 
 
 def _fit_for_null(
-    session: Session, responses: Mapping[str, Series], gait: GaitFit | None
+    session: SessionView, responses: Mapping[str, Series], gait: GaitFit | None
 ) -> tuple[Robot, GaitFit, Plane]:
     robot = session.robot
     if robot is None:
@@ -101,7 +105,7 @@ def _fit_for_null(
 
 
 def head_poses(
-    session: Session, head: str, span: Span
+    session: SessionView, head: str, span: Span
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The head's poses within a window.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
@@ -43,7 +43,7 @@ class Steps:
 
 
 def body_steps(
-    session: Session, responses: Mapping[str, Series], span: Span, warn: Warn
+    session: SessionView, responses: Mapping[str, Series], span: Span, warn: Warn
 ) -> Steps | None:
     """Follow the centre of mass from cycle to cycle.
 

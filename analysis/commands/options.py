@@ -12,7 +12,7 @@ from undulog.capture.common.console import UNLIMITED, Progress, say
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
-    from undulog.capture import Session
+    from undulog.capture import SessionView
 
     from ..signals.stretch import Options
 
@@ -52,7 +52,7 @@ def chosen(
     return Options(start, stop, command_topic, response_topic, reference_topic)
 
 
-def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[Session]:
+def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[SessionView]:
     """Sessions, one open at a time.
 
     Args:

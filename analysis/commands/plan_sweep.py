@@ -16,7 +16,7 @@ from undulog.capture.common.errors import UsageError
 from .plan import announce
 
 if TYPE_CHECKING:
-    from undulog.capture import Session
+    from undulog.capture import SessionView
 
     from ..plan.designs import PlannedRun
     from ..plan.gait_base import BaseGait
@@ -167,7 +167,7 @@ def _plan(
         say(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
 
 
-def settling(base: BaseGait, session: Session) -> tuple[float, dict[str, str]]:
+def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str]]:
     """How long a chain without contact takes to settle.
 
     Args:
@@ -195,7 +195,7 @@ def settling(base: BaseGait, session: Session) -> tuple[float, dict[str, str]]:
     return max(_LEAST_SETTLE_S, needed_s), facts
 
 
-def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: Session) -> None:
+def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionView) -> None:
     """Refuse commands that leave the servos' linear range.
 
     Args:

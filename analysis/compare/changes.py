@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.strict_table import read_toml
 
 from ..results.comparison import Change
@@ -25,7 +25,7 @@ _FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
 _ORDER = ("robot", *_FILES, "session")
 
 
-def facts_of(session: Session) -> dict[str, str]:
+def facts_of(session: SessionView) -> dict[str, str]:
     """What a session says of how it was made.
 
     Args:

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import UsageError
@@ -98,7 +98,9 @@ class Choices:
 
 
 def compare_sessions(
-    a: Session | Iterable[Session], b: Session | Iterable[Session], choices: Choices | None = None
+    a: SessionView | Iterable[SessionView],
+    b: SessionView | Iterable[SessionView],
+    choices: Choices | None = None,
 ) -> Comparison:
     """Compare two sessions, or two groups of runs: B minus A.
 
@@ -118,14 +120,15 @@ def compare_sessions(
     choices = choices or Choices()
     warnings: dict[str, list[str]] = {}
 
-    def seen(session: Session) -> Seen:
+    def seen(session: SessionView) -> Seen:
         def warn(sentence: str) -> None:
             warnings.setdefault(sentence, []).append(session.path.name)
 
         return see(session, choices.session, warn)
 
     sides = [
-        [seen(one) for one in ([side] if isinstance(side, Session) else side)] for side in (a, b)
+        [seen(one) for one in ([side] if isinstance(side, SessionView) else side)]
+        for side in (a, b)
     ]
     every = sum(map(len, sides))
     said = [

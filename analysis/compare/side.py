@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 
@@ -110,7 +110,7 @@ class Seen:
     offsets: Mapping[str, float]
 
 
-def see(session: Session, options: Options, warn: Warn) -> Seen:
+def see(session: SessionView, options: Options, warn: Warn) -> Seen:
     """Take from a session what a comparison needs.
 
     Args:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.log.read.signals import Signal
@@ -164,7 +164,7 @@ duty, through zero and back in every cycle."""
 
 
 def energy_result(
-    session: Session,
+    session: SessionView,
     columns: Columns,
     energies: Mapping[str, Energies],
     span: Span,
@@ -222,7 +222,7 @@ def energy_result(
     )
 
 
-def electrical_source(session: Session, columns: Columns) -> str | None:
+def electrical_source(session: SessionView, columns: Columns) -> str | None:
     """What electrical energy is made of.
 
     Args:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 
@@ -34,7 +34,7 @@ TOLERANCE = 0.05
 
 
 def check_ledger(
-    session: Session, energies: Iterable[Energies], span: Span, warn: Warn
+    session: SessionView, energies: Iterable[Energies], span: Span, warn: Warn
 ) -> Closure | None:
     """Compare the joints' energies with the ledger's over the same window, and close its balance.
 
@@ -78,7 +78,7 @@ def check_ledger(
     )
 
 
-def booked_energies(session: Session, span: Span) -> dict[str, float] | None:
+def booked_energies(session: SessionView, span: Span) -> dict[str, float] | None:
     """What the twin's ledger books over a window.
 
     Args:

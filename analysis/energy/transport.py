@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.robot.model import Robot
@@ -25,7 +25,7 @@ LEAST_WAY = 0.01
 
 
 def transport(
-    session: Session,
+    session: SessionView,
     responses: Mapping[str, Series],
     energies: Mapping[str, Energies],
     span: Span,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import ComplexArray
 from undulog.capture.common.console import Warn
@@ -53,7 +53,9 @@ _LOW_FLOOR = 0.01
 """A p-value that can't go below this leaves little room under the level."""
 
 
-def analyse_experiment(sessions: Iterable[Session], options: Options | None = None) -> Experiment:
+def analyse_experiment(
+    sessions: Iterable[SessionView], options: Options | None = None
+) -> Experiment:
     """Compute what several sessions tell together.
 
     Args:

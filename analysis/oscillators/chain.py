@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import fdtrc
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
@@ -203,7 +203,7 @@ _NS = 1e9
 
 
 def session_couplings(
-    session: Session, start_s: float | None = None, stop_s: float | None = None
+    session: SessionView, start_s: float | None = None, stop_s: float | None = None
 ) -> tuple[ChainCoupling, ...]:
     """Tell the couplings of each plane's oscillators.
 

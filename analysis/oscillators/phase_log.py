@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import MissingChannelError
 from undulog.capture.log.read.signals import JointSignals, Signal
@@ -53,7 +53,7 @@ class PhaseLog:
 
 
 def read_phases(
-    session: Session, start_ns: int | None = None, stop_ns: int | None = None
+    session: SessionView, start_ns: int | None = None, stop_ns: int | None = None
 ) -> tuple[PhaseLog, ...]:
     """Read the phases of oscillators.
 
@@ -155,7 +155,7 @@ def _held(signal: Signal, t_ns: IntArray) -> FloatArray:
     return values[np.searchsorted(signal.t_ns, t_ns, side="right")]
 
 
-def _angles(session: Session) -> JointSignals | None:
+def _angles(session: SessionView) -> JointSignals | None:
     if RESPONSE_TOPIC not in session.channels:
         return None
     try:

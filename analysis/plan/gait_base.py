@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
@@ -37,7 +37,7 @@ class BaseGait:
     omega: float
 
 
-def base_gait(session: Session) -> BaseGait:
+def base_gait(session: SessionView) -> BaseGait:
     """Fit the gait of a session's commands.
 
     Args:

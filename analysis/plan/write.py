@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.capture import Session, SessionWriter
+from undulog.capture import SessionView, SessionWriter
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.files import part_file
@@ -29,7 +29,7 @@ def write_plan(
     plan: str,
     base: BaseGait,
     runs: Sequence[PlannedRun],
-    like: Session,
+    like: SessionView,
     folder: Path,
     *,
     settle_s: float,
@@ -123,7 +123,7 @@ def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) ->
     return values
 
 
-def _check_limits(base: BaseGait, runs: Sequence[PlannedRun], like: Session) -> None:
+def _check_limits(base: BaseGait, runs: Sequence[PlannedRun], like: SessionView) -> None:
     if like.robot is None:
         return
     joints = {joint.name: joint for joint in like.robot.joints}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.following.fault import Fault
 from undulog.capture.following.find import joints_not_following
@@ -90,7 +90,7 @@ class Following:
     motions: Mapping[str, JointMotion]
 
 
-def following(session: Session, columns: Columns, window: Stretch) -> Following:
+def following(session: SessionView, columns: Columns, window: Stretch) -> Following:
     """Find how the joints follow their commands in a window.
 
     Args:

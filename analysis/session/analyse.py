@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.console import Warn
@@ -54,7 +54,7 @@ _NS = 1e9
 
 
 def within(
-    artefacts: Iterable[Artefact], session: Session, stretch: Stretch
+    artefacts: Iterable[Artefact], session: SessionView, stretch: Stretch
 ) -> tuple[Artefact, ...]:
     """The artefacts that hold in the analysed stretch.
 
@@ -152,7 +152,7 @@ class Measured(Examined):
     offsets: Mapping[str, FloatArray]
 
 
-def analyse_session(session: Session, options: Options | None = None) -> Analysis:
+def analyse_session(session: SessionView, options: Options | None = None) -> Analysis:
     """Compute everything that one session can tell.
 
     Args:
@@ -171,7 +171,7 @@ def analyse_session(session: Session, options: Options | None = None) -> Analysi
 
 
 def examine_session(
-    session: Session, options: Options | None = None, *, with_dead_bands: bool = True
+    session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
 ) -> Examined:
     """Compute what one session tells, and keep the fit.
 
@@ -193,7 +193,7 @@ def examine_session(
 
 
 def measure_session(
-    session: Session, options: Options | None = None, *, with_dead_bands: bool = True
+    session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
 ) -> Measured:
     """Compute what one session tells, and keep what it was computed from.
 
@@ -348,7 +348,9 @@ def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
     return Span(origin_ns, first_s, stop_s, cycles)
 
 
-def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Stretch) -> GaitFacts:
+def _gait_facts(
+    session: SessionView, gait: GaitFit | None, span: Span, stretch: Stretch
+) -> GaitFacts:
     shift_s = (span.origin_ns - session.start_ns) / _NS
     window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
     if gait is None:
@@ -368,7 +370,7 @@ def _gait_facts(session: Session, gait: GaitFit | None, span: Span, stretch: Str
     )
 
 
-def _provenance(session: Session, options: Options) -> Provenance:
+def _provenance(session: SessionView, options: Options) -> Provenance:
     """What makes the same numbers again."""
     digest = hashlib.sha256()
     for path in session.files:  # one, or the parts of a split session

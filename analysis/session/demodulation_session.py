@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
@@ -102,7 +102,7 @@ class LoggedGait:
 
 
 def response_over_time(
-    session: Session, columns: Columns, artefacts: Iterable[Artefact], warn: Warn
+    session: SessionView, columns: Columns, artefacts: Iterable[Artefact], warn: Warn
 ) -> ResponseOverTime | None:
     """Gain and lag of every driven joint in every cycle of its logged phase.
 
@@ -158,7 +158,7 @@ def response_over_time(
     )
 
 
-def _logged(session: Session, warn: Warn) -> LoggedGait | None:
+def _logged(session: SessionView, warn: Warn) -> LoggedGait | None:
     why = f"the session has no {GAIT_TOPIC}"
     if GAIT_TOPIC in session.channels:
         try:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.threads import in_threads
@@ -79,7 +79,7 @@ GAP_SHARE = 0.01
 
 
 def joint_energies(
-    session: Session, columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
+    session: SessionView, columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
 ) -> dict[str, Energies]:
     """Energies of all joints.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.robot.model import Sensor, SensorKind
 
 from ..results.analysis import Window
@@ -36,7 +36,7 @@ class Posture:
 UNKNOWN_POSTURE = Posture()
 
 
-def posture(session: Session, windows: Sequence[Window]) -> Posture:
+def posture(session: SessionView, windows: Sequence[Window]) -> Posture:
     """Read how the robot lay in a session.
 
     Args:
@@ -50,7 +50,7 @@ def posture(session: Session, windows: Sequence[Window]) -> Posture:
     return Posture(_heading(session), _lean(session, windows))
 
 
-def _heading(session: Session) -> float:
+def _heading(session: SessionView) -> float:
     for record in ("undulog.plan", "undulog"):
         text = session.metadata.get(record, {}).get(HEADING)
         if text is not None:
@@ -67,7 +67,7 @@ def _number(text: object) -> float:
     return value if math.isfinite(value) else math.nan
 
 
-def _lean(session: Session, windows: Sequence[Window]) -> float:
+def _lean(session: SessionView, windows: Sequence[Window]) -> float:
     robot = session.robot
     if robot is None or not windows:
         return math.nan
@@ -82,7 +82,7 @@ def _lean(session: Session, windows: Sequence[Window]) -> float:
     return float(np.mean(leans)) if leans else math.nan
 
 
-def _lean_of(session: Session, sensor: Sensor, windows: Sequence[Window]) -> float:
+def _lean_of(session: SessionView, sensor: Sensor, windows: Sequence[Window]) -> float:
     """Lean of the link that carries one accelerometer; its specific force is gravity's opposite."""
     table = session.table(sensor.topic)
     t_s = (table.index.to_numpy() - session.start_ns) * 1e-9

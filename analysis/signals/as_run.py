@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, cast
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.strict_table import read_toml
 from undulog.capture.robot.model import Joint, Link, Robot, Servo
 
@@ -20,7 +20,7 @@ DRAG_RATIO = 10.0
 _SERVO_FIELDS = frozenset(field.name for field in dataclasses.fields(Servo))
 
 
-def scenario_of(session: Session) -> dict[str, Any] | None:
+def scenario_of(session: SessionView) -> dict[str, Any] | None:
     """The attached scenario's tables.
 
     Args:

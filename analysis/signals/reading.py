@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.strict_table import read_toml
@@ -82,7 +82,7 @@ class Columns:
 
 
 def read_columns(
-    session: Session,
+    session: SessionView,
     command_topic: str,
     response_topic: str,
     warn: Warn,
@@ -176,7 +176,7 @@ def read_columns(
     )
 
 
-def settle_time_s(session: Session) -> float:
+def settle_time_s(session: SessionView) -> float:
     """Settling time that the session states [s]; 0 where it states none.
 
     Args:
@@ -188,7 +188,7 @@ def settle_time_s(session: Session) -> float:
     return session.settle_s or 0.0
 
 
-def drag_ratio(session: Session) -> float:
+def drag_ratio(session: SessionView) -> float:
     """Ratio of the drag across a link to that along it, for the viscous null.
 
     Args:
@@ -243,7 +243,7 @@ def _wanted(topics: Sequence[str], warnings: Sequence[str]) -> str:
     return f"{told} ({'; '.join(warnings)})" if warnings else told
 
 
-def _read(session: Session, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
+def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
     """All in one pass if all are there; else one by one, leaving out what is empty."""
     topics: dict[str, list[str]] = {}
     for topic, field in wanted.values():
@@ -263,7 +263,7 @@ def _read(session: Session, wanted: Mapping[str, tuple[str, str]]) -> dict[str, 
         return some
 
 
-def _check_voltage(session: Session, found: dict[str, JointSignals], warn: Warn) -> None:
+def _check_voltage(session: SessionView, found: dict[str, JointSignals], warn: Warn) -> None:
     """E_el needs the voltage at the motor: a bridge's duty times the supply, not the supply."""
     lacking = [
         topic

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError, UsageError
@@ -56,7 +56,7 @@ class Options:
 
 
 def without_breaks(
-    session: Session, columns: Columns, options: Options, warn: Warn
+    session: SessionView, columns: Columns, options: Options, warn: Warn
 ) -> tuple[Columns, str]:
     """Leave out all but the longest stretch in which samples follow each other.
 
@@ -102,7 +102,7 @@ def without_breaks(
     return kept, str(found) if found.others else ""
 
 
-def choose_stretch(session: Session, columns: Columns, options: Options, warn: Warn) -> Stretch:
+def choose_stretch(session: SessionView, columns: Columns, options: Options, warn: Warn) -> Stretch:
     """The stretch to analyse.
 
     Args:
@@ -163,7 +163,7 @@ def choose_stretch(session: Session, columns: Columns, options: Options, warn: W
     return _in_motion(columns, later, options, warn, stated=stated)
 
 
-def recorded(session: Session, columns: Columns, options: Options) -> Stretch:
+def recorded(session: SessionView, columns: Columns, options: Options) -> Stretch:
     """What was recorded of commands and positions, within the user's limits.
 
     Args:
@@ -182,7 +182,7 @@ def recorded(session: Session, columns: Columns, options: Options) -> Stretch:
     )
 
 
-def _recorded(session: Session, columns: Columns) -> Stretch:
+def _recorded(session: SessionView, columns: Columns) -> Stretch:
     """Where commands and responses overlap, or where the one that exists lies."""
     kinds = (columns.command, columns.position)
     spans = [covered([signal.t_ns for signal in kind.values()]) for kind in kinds]
@@ -197,11 +197,11 @@ def _recorded(session: Session, columns: Columns) -> Stretch:
     return both
 
 
-def _absolute(session: Session, time_s: float | None) -> int | None:
+def _absolute(session: SessionView, time_s: float | None) -> int | None:
     return None if time_s is None else session.start_ns + round(time_s * _NS)
 
 
-def _gait_runs(session: Session, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:
+def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:
     """Steady, settled runs of the logged gait with enough cycles; empty if none is known."""
     if GAIT_TOPIC not in session.channels:
         return []

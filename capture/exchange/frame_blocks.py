@@ -19,7 +19,7 @@ from ..log.messages.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from ..log.read.session import Session
+from ..log.read.view import SessionView
 from .can_import import DIRECTIONS_KEY
 from .frame_log import LogBlock
 
@@ -55,7 +55,7 @@ class FrameFacts:
         return list(self.counts)
 
 
-def chosen_buses(session: Session, bus: str | None) -> list[str]:
+def chosen_buses(session: SessionView, bus: str | None) -> list[str]:
     """The buses to export.
 
     Args:
@@ -86,12 +86,14 @@ class _Topic:
     bus: int
     is_fd: bool
 
-    def frames(self, session: Session, start_ns: int | None, stop_ns: int | None) -> FrameArray:
+    def frames(self, session: SessionView, start_ns: int | None, stop_ns: int | None) -> FrameArray:
         read = session.fd_frames if self.is_fd else session.frames
         return read(self.name, start_ns=start_ns, stop_ns=stop_ns)
 
 
-def frame_blocks(session: Session, buses: Sequence[str], *, fd: bool = True) -> Iterator[LogBlock]:
+def frame_blocks(
+    session: SessionView, buses: Sequence[str], *, fd: bool = True
+) -> Iterator[LogBlock]:
     """The frames of some buses, never all in memory.
 
     Those of one topic, which is one kind of frame of one bus, come in the order they were logged.
@@ -150,7 +152,7 @@ def _block(topics: Sequence[_Topic], found: Sequence[FrameArray], done: float) -
     return LogBlock(frames, bus, done, fd_frames, fd_bus, is_fd if len(fd_frames) else None)
 
 
-def frame_facts(session: Session, buses: Sequence[str]) -> FrameFacts:
+def frame_facts(session: SessionView, buses: Sequence[str]) -> FrameFacts:
     """Look once over all frames.
 
     Args:
@@ -181,7 +183,7 @@ def frame_facts(session: Session, buses: Sequence[str]) -> FrameFacts:
     )
 
 
-def _edges(session: Session, topics: Sequence[str]) -> list[int | None]:
+def _edges(session: SessionView, topics: Sequence[str]) -> list[int | None]:
     """Borders of the windows of log times; open at both ends."""
     messages = sum(session.channels[topic].count for topic in topics)
     count = max(1, -(-messages // _MESSAGES_PER_BLOCK))

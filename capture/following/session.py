@@ -8,9 +8,9 @@ import numpy as np
 
 from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
-from ..log.read.session import Session
 from ..log.read.signals import Signal
 from ..log.read.unbroken import longest_unbroken
+from ..log.read.view import SessionView
 from .fault import Fault
 from .find import joints_not_following
 from .motion import JointMotion, Samples
@@ -23,7 +23,7 @@ MOST_JOINTS = 2000
 QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
 
 
-def faults_in_session(session: Session) -> tuple[Fault, ...]:
+def faults_in_session(session: SessionView) -> tuple[Fault, ...]:
     """Find the joints of a session that do not follow their command.
 
     Args:
@@ -66,7 +66,7 @@ def faults_in_session(session: Session) -> tuple[Fault, ...]:
 
 
 def motions_of(
-    session: Session,
+    session: SessionView,
     columns: Mapping[str, Mapping[str, Signal]],
     names: Iterable[str],
     window_ns: tuple[int, int] | None = None,

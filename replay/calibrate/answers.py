@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from undulog.analysis.signals.reading import RESPONSE_TOPIC
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 from undulog.sim.drive.command_session import COMMANDS
@@ -42,7 +42,7 @@ class Measured:
     angles: tuple[FloatArray, ...]
 
 
-def read_measured(session: Session, settle_s: float, end_s: float) -> Measured:
+def read_measured(session: SessionView, settle_s: float, end_s: float) -> Measured:
     """Read what the joints did.
 
     Args:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from undulog.analysis.session.analyse import examine_session
-from undulog.capture import Session
+from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError
 from undulog.sim.scenario.engines import Kernels
@@ -260,7 +260,7 @@ def calibrate(
     )
 
 
-def _omega(session: Session) -> float | None:
+def _omega(session: SessionView) -> float | None:
     """Angular frequency of the commands [rad/s], or None where they are no steady gait."""
     try:
         gait = examine_session(session, with_dead_bands=False).gait

@@ -137,10 +137,8 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     from undulog.capture import Session
 
     from ..record.results import computed, saved
-    from ..samples.renamed import COMMANDS, STATES, RenamedSession
 
-    command = single.command_topic or COMMANDS
-    response = single.response_topic or STATES
+    command, response = single.topics
     options = Options(command_topic=command, response_topic=response)
     folder = output.parent  # on a disk, so that an hour's columns need not be in memory
     with ExitStack() as stack:
@@ -157,13 +155,8 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
         from ..layout.blueprint import build_blueprint
         from ..record.rrd import write_recording
 
-        shown = session
-        if (command, response) != (COMMANDS, STATES):
-            names = {"command_topic": command, "response_topic": response}
-            renamed = RenamedSession.with_joints(file, **names, column_folder=folder)
-            shown = stack.enter_context(renamed)
         recording = write_recording(
-            shown,
+            single.view(session),
             output,
             analysis=layer.analysis,
             steady=layer.steady,

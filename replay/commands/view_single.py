@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from ..content.content import Tab
+
+if TYPE_CHECKING:
+    from undulog.capture import SessionView
+
+_COMMANDS = "/joint_commands"
+_STATES = "/joint_states"
 
 
 @Parameter(name="*")
@@ -36,3 +42,30 @@ class SingleOptions:
         """Options that were given, as they are typed."""
         said = [one.name for one in fields(self) if getattr(self, one.name) is not None]
         return [f"--{name.replace('_', '-')}" for name in said]
+
+    @property
+    def topics(self) -> tuple[str, str]:
+        """JointState topics of commands and responses."""
+        return self.command_topic or _COMMANDS, self.response_topic or _STATES
+
+    def view(self, session: SessionView) -> SessionView:
+        """View a session with commands and responses on the topics of the log contract.
+
+        Args:
+            session: The session.
+
+        Returns:
+            The view; the session itself where they are there already.
+
+        Raises:
+            MissingChannelError: If it has no topic of a name that was given.
+        """
+        names = dict(zip((_COMMANDS, _STATES), self.topics, strict=True))
+        if all(usual == topic for usual, topic in names.items()):
+            return session
+        given = {
+            usual: topic
+            for usual, topic in names.items()
+            if topic != usual or topic in session.channels
+        }
+        return session.view(rename=given)

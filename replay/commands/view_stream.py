@@ -6,12 +6,11 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from undulog.capture import Session
+from undulog.capture import Session, SessionView
 from undulog.capture.common.console import progress, say
 from undulog.capture.common.interruption import interruptible
 
 from ..content.layer import Layer
-from ..samples.renamed import COMMANDS, STATES, RenamedSession
 from ..viewer import viewer
 from .view_single import SingleOptions
 
@@ -35,11 +34,9 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
     """
     if not web:
         viewer.require_display()
-    command = single.command_topic or COMMANDS
-    response = single.response_topic or STATES
     with ExitStack() as stack:
         stop = stack.enter_context(interruptible())
-        session = stack.enter_context(_open(file, command, response))
+        session = single.view(stack.enter_context(Session.open(file)))
         known = _known(session, single)
         if web:
             process, page = viewer.open_server(viewer.WHOLE_IN_MEMORY)
@@ -54,7 +51,7 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         from ..stream.apart import Analysing
         from ..stream.show import NoLongerWantedError, Task, show_session, steps
 
-        analysing = stack.enter_context(Analysing(file, (command, response)))
+        analysing = stack.enter_context(Analysing(file, single.topics))
         try:
             with progress("view", total=steps(session)) as bar:
                 bar.update(0, note=_FIRST)
@@ -74,16 +71,10 @@ def _make_way() -> None:
     os.nice(max(_NICENESS - os.nice(0), 0))
 
 
-def _known(session: Session, single: SingleOptions) -> Layer:
+def _known(session: SessionView, single: SingleOptions) -> Layer:
     """What results say of it."""
     if not single.result:
         return Layer(None)
     from ..record.results import found_before
 
     return found_before(session, single.result)
-
-
-def _open(file: Path, command: str, response: str) -> Session:
-    if (command, response) == (COMMANDS, STATES):
-        return Session.open(file)
-    return RenamedSession.with_joints(file, command_topic=command, response_topic=response)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rerun as rr
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.capture.robot.model import Robot
@@ -50,12 +50,12 @@ class Sources:
         warnings: What is missing or was assumed, a sentence each; grows while it is drawn.
     """
 
-    session: Session
+    session: SessionView
     found: Survey
     warnings: list[str]
 
     @classmethod
-    def of(cls, session: Session, found: Survey | None = None) -> Sources:
+    def of(cls, session: SessionView, found: Survey | None = None) -> Sources:
         """Look through a session.
 
         Args:
@@ -91,7 +91,7 @@ class Sources:
         return self.found.samples.get(entities.COMMANDED, ())
 
 
-def clock_of(session: Session) -> Clock:
+def clock_of(session: SessionView) -> Clock:
     """The session's timelines.
 
     Args:
@@ -116,7 +116,7 @@ class Drawing:
         sources: Sources,
         named: Sequence[Named] = (),
         *,
-        trail: Span = _WHOLE,
+        span: Span = _WHOLE,
     ) -> None:
         """Write how things look, and what doesn't move.
 
@@ -125,7 +125,8 @@ class Drawing:
             clock: Its timelines.
             sources: The session.
             named: Modules that tests name, to be marked.
-            trail: The part of the head's trail that is drawn.
+            span: The part of the session that is at hand: the body's path is read and drawn no
+                further before :meth:`widen`.
         """
         self._rec, self._clock, self._sources = rec, clock, sources
         self._named = [one.joint for one in named]
@@ -134,7 +135,7 @@ class Drawing:
         self._palette = palette_of(robot, [track.name for track in moving])
         self._places = joints.head_middle_tail(robot, sources.commanded or sources.measured)
         self._plots = Plots(rec, clock, sources.found, self._places, self._palette)
-        self._head, self._scene = self._open_scene(trail)
+        self._head, self._scene = self._open_scene(span)
         self.content = self._written()
         """What is drawn by now."""
 
@@ -153,15 +154,15 @@ class Drawing:
         if self._scene is not None:
             self._scene.write(stretch)
 
-    def widen(self, sources: Sources, trail: Span) -> None:
-        """Go on with all of a session of which the beginning is drawn.
+    def widen(self, found: Survey, span: Span) -> None:
+        """Go on with a further part of a session of which the beginning is drawn.
 
         Args:
-            sources: The whole session.
-            trail: The part of the head's trail that isn't drawn yet.
+            found: What the session holds.
+            span: The part of the head's trail that isn't drawn yet.
         """
-        self._sources = sources
-        self._head, self._scene = self._open_scene(trail)
+        self._sources = replace(self._sources, found=found)
+        self._head, self._scene = self._open_scene(span)
 
     def write_words(self) -> None:
         """Write modes, events and remarks."""
@@ -215,7 +216,7 @@ class Drawing:
         self.content = replace(self.content, cycles=cycles, mean=mean)
 
     def write_facts(
-        self, session: Session, layer: Layer, content: Content, *, awaited: bool = False
+        self, session: SessionView, layer: Layer, content: Content, *, awaited: bool = False
     ) -> list[str]:
         """Write the session in words; what was written before is replaced.
 
@@ -262,14 +263,15 @@ class Drawing:
             signals=self._signals(),
         )
 
-    def _open_scene(self, trail: Span) -> tuple[HeadPath | None, Scene | None]:
+    def _open_scene(self, span: Span) -> tuple[HeadPath | None, Scene | None]:
         """The 3D scene, where there is a robot whose joints were measured."""
         sources = self._sources
         robot, measured = sources.session.robot, sources.measured
         if robot is None or not measured:
             return None, None
         times = Track(measured[0].name, sources.found.drawing_ns, np.zeros(0))
-        head = read_head(sources.session, robot, [times], sources.warnings)
+        session = sources.session.view(stop_ns=span.known_ns)
+        head = read_head(session, robot, [times], sources.warnings)
         known = {one.name for one in measured}
         missing = [name for name in robot.joint_names if name not in known]
         if missing:
@@ -279,14 +281,14 @@ class Drawing:
         scene = Scene(
             self._rec,
             self._clock,
-            sources.session,
+            session,
             robot,
             head,
             places=self._places,
             palette=self._palette,
             limit_w=sources.found.power_limit_w,
             warnings=sources.warnings,
-            trail=trail,
+            span=span,
         )
         scene.named = self._named
         return head, scene

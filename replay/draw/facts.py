@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from undulog.analysis.results.analysis import Analysis, GroupFacts
 from undulog.analysis.results.formats import utc
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.console import plain
 
 from ..content.content import Content
@@ -49,7 +49,7 @@ def code(text: str) -> str:
 
 
 def markdown(
-    session: Session,
+    session: SessionView,
     analysis: Analysis | None,
     *,
     notes: Sequence[str],
@@ -135,7 +135,7 @@ def log_facts(rec: rr.RecordingStream, text: str) -> None:
     rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 
-def _robot(session: Session) -> str:
+def _robot(session: SessionView) -> str:
     if session.robot is None:
         return "no robot description"
     count = len(session.robot.joints)

@@ -11,7 +11,7 @@ import rerun as rr
 from undulog.analysis.compare.changes import facts_of
 from undulog.analysis.compare.side import Seen, see
 from undulog.analysis.signals.stretch import Options
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.robot.model import Robot
 
@@ -110,7 +110,7 @@ def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, 
     return tuple(names)
 
 
-def read_side(session: Session, name: str) -> Side:
+def read_side(session: SessionView, name: str) -> Side:
     """Read what side by side needs of a session.
 
     Args:
@@ -142,7 +142,7 @@ def read_side(session: Session, name: str) -> Side:
     )
 
 
-def convert(session: Session, path: Path) -> tuple[Recording, Seen | None]:
+def convert(session: SessionView, path: Path) -> tuple[Recording, Seen | None]:
     """Write the session's own recording, and take from it what a comparison needs.
 
     Args:

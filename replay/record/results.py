@@ -19,13 +19,13 @@ from undulog.analysis.results.null_model import ModelledAnalysis
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
 from undulog.analysis.signals.stretch import Options
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
 
 from ..content.layer import Layer, Named
 
 
-def computed(session: Session, options: Options | None = None) -> Layer:
+def computed(session: SessionView, options: Options | None = None) -> Layer:
     """Analyse a session now; one without a gait can be seen too.
 
     Args:
@@ -47,7 +47,7 @@ def computed(session: Session, options: Options | None = None) -> Layer:
     return Layer(analysis, cycle_maps(measured) if analysis.over_time is None else None)
 
 
-def saved(session: Session, paths: Sequence[Path], options: Options | None = None) -> Layer:
+def saved(session: SessionView, paths: Sequence[Path], options: Options | None = None) -> Layer:
     """Read what was found of a session before.
 
     Args:
@@ -67,7 +67,7 @@ def saved(session: Session, paths: Sequence[Path], options: Options | None = Non
     return known if known.analysis is not None else known.with_numbers(computed(session, options))
 
 
-def found_before(session: Session, paths: Sequence[Path]) -> Layer:
+def found_before(session: SessionView, paths: Sequence[Path]) -> Layer:
     """Read what was found of a session before, and compute nothing.
 
     Args:
@@ -107,7 +107,7 @@ def found_before(session: Session, paths: Sequence[Path]) -> Layer:
 
 
 def _own(
-    result: Analysis | Experiment | Comparison, session: Session, path: Path
+    result: Analysis | Experiment | Comparison, session: SessionView, path: Path
 ) -> Analysis | None:
     """The session's own numbers in a result, or None where it only compares."""
     if isinstance(result, Analysis):

@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.session.cycles import CycleMaps
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import part_file
 
@@ -67,7 +67,7 @@ def recording_id(session_id: str) -> str:
 
 
 def write_recording(
-    session: Session,
+    session: SessionView,
     path: Path,
     *,
     analysis: Analysis | None = None,
@@ -141,7 +141,7 @@ def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStrea
     return rec
 
 
-def send_properties(rec: rr.RecordingStream, session: Session) -> None:
+def send_properties(rec: rr.RecordingStream, session: SessionView) -> None:
     """Say whose recording it is.
 
     Args:

@@ -11,7 +11,7 @@ from typing import Any
 from undulog.analysis.compare.compare import compare_sessions
 from undulog.analysis.results.comparison import Comparison
 from undulog.analysis.signals.reading import RESPONSE_TOPIC
-from undulog.capture import Session
+from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.interruption import StopRequest
 from undulog.sim.drive.driven import Driven, find_driven
@@ -124,7 +124,7 @@ def replay_in_twin(
     return Again(repetition.original, repetition.scenario, recording, same, comparison, why)
 
 
-def compared(first: Session, second: Session) -> tuple[Comparison | None, str | None]:
+def compared(first: SessionView, second: SessionView) -> tuple[Comparison | None, str | None]:
     """Hold a run against the one that its commands were taken from.
 
     Args:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import IntArray
 
 from .tracks import Columns, read_columns
@@ -66,7 +66,7 @@ class Stretch:
 
 
 def stretches(
-    session: Session, wanted: Mapping[str, Sequence[str]], context_ns: int
+    session: SessionView, wanted: Mapping[str, Sequence[str]], context_ns: int
 ) -> Iterator[Stretch]:
     """Read a session stretch by stretch.
 
@@ -97,7 +97,7 @@ def stretches(
         yield Stretch(span, columns)
 
 
-def stretch_length_ns(session: Session, least_ns: int = 0) -> int:
+def stretch_length_ns(session: SessionView, least_ns: int = 0) -> int:
     """Length of the stretches that a session is read in.
 
     Args:
@@ -114,11 +114,11 @@ def stretch_length_ns(session: Session, least_ns: int = 0) -> int:
     return length_ns
 
 
-def _count(session: Session, length_ns: int) -> int:
+def _count(session: SessionView, length_ns: int) -> int:
     return max(1, round((session.end_ns - session.start_ns) / length_ns))
 
 
-def _laborious(session: Session, length_ns: int) -> bool:
+def _laborious(session: SessionView, length_ns: int) -> bool:
     """Whether most stretches are empty, or chunks are read again for many of them.
 
     So it is where the clock jumps in the session.

@@ -1,19 +1,20 @@
 """What only a whole session can tell: which lines there are, how far they swing, when they meet.
 
 It goes through the session once, stretch by stretch, before anything is drawn, and keeps a few
-thousand samples of each line.
+thousand samples of each line. Where the picture can't wait for the whole, the first stretch and a
+little of some others are enough to choose colours, scales and the joints that stand for the body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.robot.model import Robot
@@ -21,8 +22,16 @@ from undulog.capture.robot.model import Robot
 from ..content.entities import MEASURED, MECHANICAL
 from .quantities import power_limit, quantities, segment_power
 from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
-from .stretches import stretches
-from .tracks import OFFSETS, Track, in_turn, resampled, wanted_fields
+from .stretches import STRETCH_NS, stretches
+from .tracks import (
+    OFFSETS,
+    Columns,
+    Track,
+    in_turn,
+    read_columns,
+    resampled,
+    wanted_fields,
+)
 
 GAIT = "/gait"
 
@@ -30,6 +39,11 @@ _KEPT = 4000
 """Samples of each line that are kept, about."""
 _CONTEXT_NS = (500_000_000, 60_000_000_000)
 _REACH_STEPS = 1.2 * GAP_STEPS
+
+_LOOKS = 8
+"""How many stretches after the first one are looked into where not all is read, at most."""
+_LOOK_NS = 2_000_000_000
+"""How long is looked into each of them [ns]."""
 
 _Number = TypeVar("_Number", np.int64, np.float64)
 
@@ -45,6 +59,8 @@ class Survey:
         drawing_ns: Sampling times of the first measured joint, thinned [ns], shape (n,).
         power_limit_w: Power at which a segment's colour is full [W]; None where none is known.
         context_ns: How far about a stretch its drawing has to look [ns].
+        seen: (topic, field) to the joints of which a sample was read.
+        is_whole: Whether all of the session was read.
     """
 
     wanted: Mapping[str, Sequence[str]]
@@ -53,6 +69,8 @@ class Survey:
     drawing_ns: IntArray
     power_limit_w: float | None
     context_ns: int
+    seen: Mapping[tuple[str, str], set[str]]
+    is_whole: bool
 
 
 @dataclass
@@ -63,19 +81,26 @@ class _Line:
     values: list[FloatArray] = field(default_factory=list[FloatArray])
 
 
-def survey(session: Session, rate_hz: float) -> Survey:
+def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Survey:
     """Go through a session.
 
     Args:
         session: The session.
         rate_hz: How many drawing times a second are kept, at most.
+        brief: Of a long session, read the first stretch and a little of some others only.
 
     Returns:
-        What it holds.
+        What it holds, as far as it was read.
     """
     session.forget()  # an hour's index, as pages of the file
-    wanted = _carried(session)
-    every = {topic: 1 + session.channels[topic].count // _KEPT for topic in wanted}
+    looks = _looks(session) if brief else []
+    share, begin = 1.0, session
+    if looks:
+        read_ns = sum(stop_ns - start_ns for start_ns, stop_ns in looks)
+        share = read_ns / (session.end_ns - session.start_ns)
+        begin = session.view(start_ns=looks[0][0], stop_ns=looks[0][1])
+    wanted = _carried(begin)
+    every = {topic: 1 + round(share * session.channels[topic].count) // _KEPT for topic in wanted}
     thin = max(every.values(), default=1)
     takes_turns = any(topic in session.channels for topic in OFFSETS)
     chain = {} if session.robot is None else _ranks(session.robot.joint_names)
@@ -83,10 +108,11 @@ def survey(session: Session, rate_hz: float) -> Survey:
     parts: dict[str, list[tuple[str, ...]]] = {}
     times: list[IntArray] = []
     powers: list[FloatArray] = []
+    seen: dict[tuple[str, str], set[str]] = {}
     step_ns = 0
-    for stretch in stretches(session, wanted, 0):
-        columns = stretch.columns
-        for tracks in columns.values():
+    for columns in _columns(session, wanted, looks):
+        for key, tracks in columns.items():
+            seen.setdefault(key, set()).update(track.name for track in tracks)
             step_ns = max([step_ns, *(typical_step_ns(track.t_ns) for track in tracks)])
         for entity, tracks in quantities(columns).items():
             own = lines.setdefault(entity, {})
@@ -112,10 +138,34 @@ def survey(session: Session, rate_hz: float) -> Survey:
         drawing_ns=_joined(times) if times else np.zeros(0, dtype=np.int64),
         power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
         context_ns=int(np.clip(round(_REACH_STEPS * step_ns), *_CONTEXT_NS)),
+        seen=seen,
+        is_whole=not looks,
     )
 
 
-def _carried(session: Session) -> dict[str, list[str]]:
+def _looks(session: SessionView) -> list[tuple[int, int]]:
+    """Half-open windows that stand for a long session [Unix ns]; none for a short one."""
+    first_ns, last_ns = session.start_ns, session.end_ns
+    every_ns = STRETCH_NS * (1 + (last_ns - first_ns) // (STRETCH_NS * _LOOKS))
+    if every_ns == STRETCH_NS:
+        return []
+    later = range(first_ns + every_ns, last_ns - STRETCH_NS // 2, every_ns)
+    return [(first_ns, first_ns + STRETCH_NS), *((at_ns, at_ns + _LOOK_NS) for at_ns in later)]
+
+
+def _columns(
+    session: SessionView, wanted: Mapping[str, Sequence[str]], looks: Sequence[tuple[int, int]]
+) -> Iterator[Columns]:
+    """Columns of windows of a session; without windows, of all of it, stretch by stretch."""
+    if not looks:
+        yield from (stretch.columns for stretch in stretches(session, wanted, 0))
+    for start_ns, stop_ns in looks:
+        columns = read_columns(session, wanted, start_ns=start_ns, stop_ns=stop_ns)
+        session.forget()
+        yield columns
+
+
+def _carried(session: SessionView) -> dict[str, list[str]]:
     """The fields that come, but for the gait's, which is read as a whole.
 
     The first stretch tells; what is not in it is looked for in the whole session, once.
@@ -132,7 +182,7 @@ def _carried(session: Session) -> dict[str, list[str]]:
     return wanted
 
 
-def _comes(session: Session, topic: str, one: str) -> bool:
+def _comes(session: SessionView, topic: str, one: str) -> bool:
     try:
         session.joints(topic, one)
     except (MissingChannelError, DataError):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.bus.decoded_topics import JOINT_TOPIC
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, MissingChannelError
@@ -63,7 +63,7 @@ MOST_TOPICS = 100
 """JointState topics that are drawn."""
 
 
-def drawn_topics(session: Session) -> tuple[list[str], int]:
+def drawn_topics(session: SessionView) -> tuple[list[str], int]:
     """The JointState topics of a picture.
 
     Args:
@@ -83,7 +83,7 @@ def drawn_topics(session: Session) -> tuple[list[str], int]:
     return [topic for topic in topics if topic in first], len(topics) - len(first)
 
 
-def wanted_fields(session: Session) -> dict[str, list[str]]:
+def wanted_fields(session: SessionView) -> dict[str, list[str]]:
     """What a picture needs of a session's JointState topics.
 
     Args:
@@ -99,7 +99,7 @@ def wanted_fields(session: Session) -> dict[str, list[str]]:
 
 
 def read_columns(
-    session: Session,
+    session: SessionView,
     wanted: Mapping[str, Sequence[str]] | None = None,
     *,
     start_ns: int | None = None,

@@ -1,7 +1,7 @@
 """A session converted stretch by stretch while the viewer shows it.
 
 The viewer gets a layout and the session's first stretch within seconds: what colours and scales
-need of the rest is taken from a glimpse into it. The rest follows, and the session's numbers as
+need of the rest is taken from a brief look into it. The rest follows, and the session's numbers as
 soon as an analysis in another process has them. Nothing is sent before the viewer has taken what
 was sent before it, so one that is slow, or stands still, costs no memory.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import rerun as rr
 import rerun.blueprint as rrb
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.console import Progress
 from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
 from undulog.capture.common.interruption import StopRequest
@@ -33,7 +33,6 @@ from ..samples.survey import GAIT, Survey, survey
 from ..samples.tracks import wanted_fields
 from ..viewer.viewer import Viewer
 from .apart import Analysing
-from .excerpt import Excerpt, Glimpse
 from .foresight import foreseen, same_arrangement
 
 _TAKE_S = 0.1
@@ -47,7 +46,7 @@ class NoLongerWantedError(Exception):
 
 
 class _UnforeseenError(Exception):
-    """The glimpse missed a line."""
+    """The brief survey missed a line."""
 
 
 @dataclass(frozen=True)
@@ -63,42 +62,12 @@ class Task:
         begun: Called when the viewer has the beginning.
     """
 
-    session: Session
+    session: SessionView
     known: Layer
     analysing: Analysing
     front: Tab
     bar: Progress
     begun: Callable[[], None] = lambda: None
-
-
-@dataclass(frozen=True)
-class _Foresight:
-    """What is known of the session before its first stretch is drawn.
-
-    Attributes:
-        found: What it holds, as far as it was looked into.
-        seen: (topic, field) to the joints that came; None where all of it was looked through.
-    """
-
-    found: Survey
-    seen: dict[tuple[str, str], set[str]] | None
-
-    def check(self, stretch: Stretch) -> None:
-        """Look whether a stretch has only what was foreseen.
-
-        Args:
-            stretch: Its samples.
-
-        Raises:
-            _UnforeseenError: If it has more.
-        """
-        if self.seen is None:
-            return
-        for (topic, part), tracks in stretch.columns.items():
-            known = self.seen.get((topic, part), set())
-            new = [track.name for track in tracks if track.name not in known]
-            if new:
-                raise _UnforeseenError(f"{topic} ({part}) of {', '.join(new)}")
 
 
 @dataclass
@@ -192,7 +161,7 @@ class _Sink:
                 return
 
 
-def steps(session: Session) -> int:
+def steps(session: SessionView) -> int:
     """How many steps it takes.
 
     Args:
@@ -223,16 +192,14 @@ def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ..
     session = task.session
     sink = _Sink(viewer, stop)
     try:
-        glimpse = Glimpse.of(session)
-        found = Sources.of(glimpse).found
-        seen = None if glimpse.is_whole else glimpse.seen
+        found = survey(session, BODY_RATE_HZ, brief=True)
         try:
-            return _send(task, sink, _Foresight(found, seen), recording_id(session.session_id))
+            return _send(task, sink, found, recording_id(session.session_id))
         except _UnforeseenError as late:
             note = f"drawn anew, as a second recording: the session begins without {late}"
             again = replace(task, known=replace(task.known, notes=(*task.known.notes, note)))
-            whole = _Foresight(survey(session, BODY_RATE_HZ), None)
-            return _send(again, sink, whole, recording_id(f"{session.session_id}/anew"))
+            found = survey(session, BODY_RATE_HZ)
+            return _send(again, sink, found, recording_id(f"{session.session_id}/anew"))
     except BaseException:
         viewer.close()  # else what it has not taken would be waited for
         raise
@@ -241,19 +208,15 @@ def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ..
             rec.disconnect()
 
 
-def _send(task: Task, sink: _Sink, foresight: _Foresight, identity: str) -> tuple[str, ...]:
+def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, ...]:
     """Draw all of it in one recording."""
     session = task.session
     clock = clock_of(session)
-    parts = stretches(session, foresight.found.wanted, foresight.found.context_ns)
+    parts = stretches(session, found.wanted, found.context_ns)
     first = next(parts)
-    before = first.span.stop_ns if first.span.known_ns is not None else None
-    start = Excerpt.until(session, first.span.known_ns)
     rec = sink.open(identity)
     send_properties(rec, session)
-    sources = Sources.of(start, foresight.found)
-    trail = Span() if before is None else Span(stop_ns=before)
-    drawing = Drawing(rec, clock, sources, task.known.named, trail=trail)
+    drawing = Drawing(rec, clock, Sources.of(session, found), task.known.named, span=first.span)
     words_first = _words(session) <= _FEW_WORDS
     if words_first:
         drawing.write_words()
@@ -264,12 +227,12 @@ def _send(task: Task, sink: _Sink, foresight: _Foresight, identity: str) -> tupl
     drawing.write_facts(session, task.known, early, awaited=task.known.analysis is None)
     drawing.write(first)
     sink.hand_over(rec)
+    drawn = first.span
     del first
     task.begun()
 
-    if before is not None:
-        whole = _whole(session, sources, foresight)
-        drawing.widen(whole, Span(start_ns=before))
+    if drawn.known_ns is not None:
+        drawing.widen(_whole(session, found), Span(start_ns=drawn.stop_ns))
     if not words_first:
         drawing.write_words()
     drawing.write_others()
@@ -278,7 +241,7 @@ def _send(task: Task, sink: _Sink, foresight: _Foresight, identity: str) -> tupl
     numbers = _Numbers(task, drawing)
     done = 1
     for stretch in parts:
-        foresight.check(stretch)
+        _require_nothing_new(stretch, found)
         drawing.write(stretch)
         sink.hand_over(rec)
         numbers.draw()
@@ -322,18 +285,27 @@ class _Numbers:
         return None if computed is None else known.with_numbers(computed)
 
 
-def _whole(session: Session, sources: Sources, foresight: _Foresight) -> Sources:
-    """The whole session's sources, those of its beginning given."""
-    found = foresight.found
-    if foresight.seen is not None:
-        _require_nothing_else(session, found)
-        if "/odom" not in session.channels:  # the joints' times say when the body is drawn
-            found = replace(found, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
-    return Sources(session, found, sources.warnings)
+def _whole(session: SessionView, found: Survey) -> Survey:
+    """What is found, made complete as far as the rest of the drawing needs it."""
+    if found.is_whole:
+        return found
+    _require_nothing_else(session, found)
+    if "/odom" in session.channels:
+        return found
+    # The joints' times say when the body is drawn.
+    return replace(found, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
 
 
-def _require_nothing_else(session: Session, found: Survey) -> None:
-    """Look for fields that begin after all that the glimpse saw."""
+def _require_nothing_new(stretch: Stretch, found: Survey) -> None:
+    """Look for joints in a stretch that a brief survey didn't see."""
+    for key, tracks in stretch.columns.items():
+        new = [track.name for track in tracks if track.name not in found.seen.get(key, ())]
+        if new and not found.is_whole:
+            raise _UnforeseenError("{} ({}) of {}".format(*key, ", ".join(new)))
+
+
+def _require_nothing_else(session: SessionView, found: Survey) -> None:
+    """Look for fields that begin after all that a brief survey saw."""
     for topic, fields in wanted_fields(session).items():
         for one in fields if topic != GAIT else ():
             if one in found.wanted.get(topic, ()):
@@ -345,7 +317,7 @@ def _require_nothing_else(session: Session, found: Survey) -> None:
             raise _UnforeseenError(f"{topic} ({one})")
 
 
-def _words(session: Session) -> int:
+def _words(session: SessionView) -> int:
     """How many modes and events there are."""
     channels = session.channels
     return sum(channels[topic].count for topic in (MODE, "/rosout") if topic in channels)

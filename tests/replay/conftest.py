@@ -135,7 +135,7 @@ def session_file(write, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def write_long(snake25):
-    """Writes minutes of all joints at 5 Hz: more than a glimpse reads."""
+    """Writes minutes of all joints at 5 Hz: more than a brief survey reads."""
 
     def write_session(path, *, seconds=400, odometry=True, heat_from_s=0.0, last_from_s=0.0):
         names = snake25.joint_names

@@ -30,7 +30,7 @@ from typing import cast
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray, frozen
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.null_model import NullModel, read_null_model
@@ -284,7 +284,7 @@ def _share(drawn: FloatArray, seen: FloatArray) -> FloatArray:
 
 
 def analyse_with_null(
-    session: Session, file: Path, options: Options | None = None
+    session: SessionView, file: Path, options: Options | None = None
 ) -> ModelledAnalysis:
     """Everything that one session can tell, and its test against a null model.
 

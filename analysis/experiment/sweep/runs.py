@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 
 from ...estimators.series import Series, clean
@@ -80,7 +80,7 @@ class Signals:
     effort: dict[str, Series]
 
 
-def read_signals(session: Session, options: Options) -> Signals:
+def read_signals(session: SessionView, options: Options) -> Signals:
     """Read what a sweep is computed from.
 
     Args:
@@ -111,7 +111,9 @@ def read_signals(session: Session, options: Options) -> Signals:
     return Signals(command, position, effort)
 
 
-def command_tones(session: Session, options: Options, examined: Examined) -> CommandTones | None:
+def command_tones(
+    session: SessionView, options: Options, examined: Examined
+) -> CommandTones | None:
     """What a session commands, as tones.
 
     Args:

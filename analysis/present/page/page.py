@@ -14,7 +14,7 @@ from importlib.resources import files
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
@@ -45,7 +45,7 @@ from .typeset import cut, digits, sentence, softer, typeset
 
 
 @dataclass(frozen=True)
-class SessionView:
+class AnalysisView:
     """All that the template shows of one session.
 
     Attributes:
@@ -88,8 +88,8 @@ class SessionView:
 
 
 def session_view(
-    analysis: Analysis, session: Session | None, cycles: CycleMaps | None
-) -> SessionView:
+    analysis: Analysis, session: SessionView | None, cycles: CycleMaps | None
+) -> AnalysisView:
     """Prepare what the template shows of one session.
 
     Args:
@@ -107,7 +107,7 @@ def session_view(
     told = analysis.answer
     others = [w for w in map(formats.sentence, analysis.warnings) if w not in told.detail]
     entries = entries_of(analysis.coupling, driven)
-    return SessionView(
+    return AnalysisView(
         analysis=analysis,
         answer=told,
         notices=tuple(cut(warning) for warning in others[:3]),
@@ -141,7 +141,7 @@ LARGEST_BYTES = 3_000_000
 
 def render(
     result: Analysis | Experiment | Comparison,
-    session: Session | None = None,
+    session: SessionView | None = None,
     cycles: CycleMaps | None = None,
 ) -> str:
     """Write the report on one session, on several of an experiment, or on a comparison.
@@ -178,7 +178,7 @@ def render(
 
 def _page(
     result: Analysis | Experiment | Comparison,
-    session: Session | None,
+    session: SessionView | None,
     cycles: CycleMaps | None,
     *,
     left_out: bool,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.palette import joint_hex
@@ -86,7 +86,7 @@ def stretch_s(analysis: Analysis) -> tuple[float, float]:
     return max(first, stop - length), stop
 
 
-def read_traces(session: Session, analysis: Analysis) -> tuple[Trace, ...]:
+def read_traces(session: SessionView, analysis: Analysis) -> tuple[Trace, ...]:
     """Read what :func:`command_response` draws.
 
     Args:

@@ -156,11 +156,12 @@ class Topics:
             return log_ns, message, kind
         return None
 
-    def raw(self, topic: str) -> Iterator[tuple[int, bytes]]:
+    def raw(self, topic: str, window_ns: Window = (None, None)) -> Iterator[tuple[int, bytes]]:
         """The messages of a topic as bytes, in the order of the file.
 
         Args:
             topic: Its name.
+            window_ns: Half-open window of log times [Unix ns]; None for open ends.
 
         Yields:
             Log time [Unix ns] and the message's bytes.
@@ -169,10 +170,15 @@ class Topics:
             MissingChannelError: If the log has no such topic.
         """
         ids = self._channel_ids(topic)
-        for data, offsets in message_blocks(self._file, ids, (None, None), self._warn):
+        start_ns, stop_ns = window_ns
+        for data, offsets in message_blocks(self._file, ids, window_ns, self._warn):
             for offset in offsets.tolist():
                 log_ns, message = message_bytes(data, offset)
-                yield min(log_ns, LAST_NS), message
+                log_ns = min(log_ns, LAST_NS)
+                if (start_ns is None or log_ns >= start_ns) and (
+                    stop_ns is None or log_ns < stop_ns
+                ):
+                    yield log_ns, message
 
     def decoder(self, topic: str) -> Callable[[bytes], Any]:
         """The general decoder of a topic, for messages of any shape.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rerun.components import FillMode
 
 from undulog.analysis.results.analysis import Analysis
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Robot
@@ -91,7 +91,7 @@ def averaged_ns(clock: Clock, analysis: Analysis | None) -> tuple[int, int]:
 
 
 def read_channels(
-    session: Session, wanted: Mapping[str, Sequence[str]], part_ns: tuple[int, int]
+    session: SessionView, wanted: Mapping[str, Sequence[str]], part_ns: tuple[int, int]
 ) -> Channels:
     """Read what is averaged.
 

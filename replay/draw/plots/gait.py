@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.errors import DataError
 
 from ...samples.timeline import Clock, Rhythm
@@ -64,7 +64,9 @@ def changes(states: Sequence[str]) -> list[int]:
     return [i for i, state in enumerate(states) if i == 0 or state != states[i - 1]]
 
 
-def log_mode(rec: rr.RecordingStream, clock: Clock, session: Session, warnings: list[str]) -> int:
+def log_mode(
+    rec: rr.RecordingStream, clock: Clock, session: SessionView, warnings: list[str]
+) -> int:
     """Write the gait mode as a state that lasts until the next one.
 
     Args:
@@ -98,7 +100,7 @@ def log_states(rec: rr.RecordingStream, clock: Clock, states: Sequence[tuple[int
 
 
 def log_events(
-    rec: rr.RecordingStream, clock: Clock, session: Session, warnings: list[str]
+    rec: rr.RecordingStream, clock: Clock, session: SessionView, warnings: list[str]
 ) -> bool:
     """Write events and faults from ``/rosout``.
 
@@ -133,7 +135,7 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
 
 
 def _read(
-    session: Session, topic: str, fields: Mapping[str, type], warnings: list[str]
+    session: SessionView, topic: str, fields: Mapping[str, type], warnings: list[str]
 ) -> list[tuple[int, Any]]:
     """Log time [ns] and message, up to the first one that is damaged; none without the fields."""
     found: list[tuple[int, Any]] = []

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import rerun as rr
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.topics import Channel
 
@@ -40,7 +40,7 @@ _TAKE_TURNS = {"tf2_msgs/msg/TFMessage"}
 _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 
 
-def is_foreign(session: Session) -> bool:
+def is_foreign(session: SessionView) -> bool:
     """Whether undulog has neither recorded nor imported a session.
 
     Args:
@@ -53,7 +53,7 @@ def is_foreign(session: Session) -> bool:
 
 
 def log_others(
-    rec: rr.RecordingStream, clock: Clock, session: Session, warnings: list[str]
+    rec: rr.RecordingStream, clock: Clock, session: SessionView, warnings: list[str]
 ) -> tuple[Signal, ...]:
     """Plot the numbers of every other topic of a foreign bag.
 
@@ -90,7 +90,7 @@ def log_others(
     return tuple(found)
 
 
-def log_words(rec: rr.RecordingStream, clock: Clock, session: Session) -> bool:
+def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
     """Write what String topics of a foreign bag say, each time that it changes, as events.
 
     Args:
@@ -122,7 +122,7 @@ def log_words(rec: rr.RecordingStream, clock: Clock, session: Session) -> bool:
     return bool(said)
 
 
-def _others(session: Session) -> Iterator[tuple[str, Channel]]:
+def _others(session: SessionView) -> Iterator[tuple[str, Channel]]:
     if not is_foreign(session):
         return
     for topic, channel in session.channels.items():
@@ -130,7 +130,7 @@ def _others(session: Session) -> Iterator[tuple[str, Channel]]:
             yield topic, channel
 
 
-def _is_plotted(session: Session, channel: Channel) -> bool:
+def _is_plotted(session: SessionView, channel: Channel) -> bool:
     if not channel.is_ros2 or channel.type_name in _TAKE_TURNS:
         return False
     try:
@@ -156,7 +156,7 @@ def _count(value: Any) -> int:
     return sum(_count(getattr(value, name)) for name in getattr(value, "__slots__", ()))
 
 
-def _lines(session: Session, topic: str) -> tuple[str, ...]:
+def _lines(session: SessionView, topic: str) -> tuple[str, ...]:
     """Fields to plot: those that vary first, if they are many."""
     for table in _tables(session, topic):
         numbers = table.select_dtypes("number")
@@ -171,7 +171,7 @@ def _lines(session: Session, topic: str) -> tuple[str, ...]:
     return ()
 
 
-def _tables(session: Session, topic: str) -> Iterator[Any]:
+def _tables(session: SessionView, topic: str) -> Iterator[Any]:
     """The topic's tables, stretch by stretch, those with rows."""
     length_ns = stretch_length_ns(session)
     for start_ns in range(session.start_ns, session.end_ns + 1, length_ns):

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Robot
@@ -141,7 +141,7 @@ def frames_of(head: HeadPath, end_ns: int) -> Frames:
 
 
 def read_head(
-    session: Session, robot: Robot, positions: Sequence[Track], warnings: list[str]
+    session: SessionView, robot: Robot, positions: Sequence[Track], warnings: list[str]
 ) -> HeadPath:
     """The head's pose from ``/odom``, or held at the origin.
 

@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
@@ -70,7 +70,7 @@ class Readings:
     distance: NDArray[np.float32]
 
 
-def read_ranges(session: Session, robot: Robot, at_ns: IntArray) -> Readings:
+def read_ranges(session: SessionView, robot: Robot, at_ns: IntArray) -> Readings:
     """Read all distance sensors.
 
     Args:

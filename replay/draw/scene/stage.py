@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.robot.model import Robot
 
 from ...content.entities import Color, Places
@@ -27,7 +27,7 @@ class Scene:
         self,
         rec: rr.RecordingStream,
         clock: Clock,
-        session: Session,
+        session: SessionView,
         robot: Robot,
         head: HeadPath,
         *,
@@ -35,7 +35,7 @@ class Scene:
         palette: Mapping[str, Color],
         limit_w: float | None,
         warnings: list[str],
-        trail: Span,
+        span: Span,
     ) -> None:
         """Write what doesn't move, and the head's trail.
 
@@ -49,7 +49,7 @@ class Scene:
             palette: Colour by joint name.
             limit_w: Power at which a segment's colour is full [W]; None where none is known.
             warnings: Grows by a sentence where the surroundings can't be drawn.
-            trail: The part of the trail that is drawn.
+            span: The part of the trail that is drawn.
         """
         self._rec, self._clock, self._robot = rec, clock, robot
         self._places, self._palette, self._limit_w = places, palette, limit_w
@@ -64,7 +64,7 @@ class Scene:
         if world is not None:
             log_surroundings(rec, world)
         if head.tracked:
-            log_trail(rec, clock, head, trail)
+            log_trail(rec, clock, head, span)
 
     def write(self, stretch: Stretch) -> None:
         """Draw a stretch.

@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.components import FillMode
 
-from undulog.capture import Session
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.strict_table import Faults, Table, read_toml
 from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
@@ -74,7 +74,7 @@ _GOAL = (92, 200, 120, 255)
 _RIM_SIDES = 64
 
 
-def world_of(session: Session, warnings: list[str]) -> World | None:
+def world_of(session: SessionView, warnings: list[str]) -> World | None:
     """The world that the session's scenario describes.
 
     Args:

@@ -5,6 +5,7 @@ import math
 import signal
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,12 +14,13 @@ import undulog
 from undulog.analysis.compare.compare import Choices, compare_sessions
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError
+from undulog.capture.common.files import check_stop
 from undulog.capture.common.interruption import StopRequest
 from undulog.capture.common.palette import joint_colors
 from undulog.replay.overlay.alignment import Align, align, times_of
 from undulog.replay.overlay.layout import all_views
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.together import StoppableSession, bring_together
+from undulog.replay.overlay.together import bring_together
 from undulog.replay.overlay.write import Converted, write_beside
 from undulog.replay.samples.timeline import Rhythm
 
@@ -500,8 +502,8 @@ def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
 
 def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path):
     path, stop, steps = tmp_path / "x.rrd", StopRequest(), []
-    with StoppableSession.open(files[0]) as session:
-        session.heed(path, stop)
+    with Session.open(files[0]) as opened:
+        session = opened.view(on_read=partial(check_stop, path, stop))
         assert session.joints("/joint_states").names
         stop.signal = signal.SIGTERM
         for read in (

@@ -17,7 +17,6 @@ from undulog.replay.draw.drawing import clock_of
 from undulog.replay.record.results import computed
 from undulog.replay.record.rrd import recording_id, write_recording
 from undulog.replay.stream.apart import Analysing
-from undulog.replay.stream.excerpt import Excerpt
 from undulog.replay.stream.foresight import foreseen, same_arrangement
 from undulog.replay.stream.show import NoLongerWantedError, Task, show_session
 from undulog.replay.viewer.viewer import Viewer
@@ -110,7 +109,7 @@ def test_a_short_session_arrives_as_it_is_saved(receive, session_file, analysis,
     assert "analysed:" not in facts[0]
 
 
-def test_a_long_session_arrives_whole_after_a_glimpse(receive, long_file, tmp_path, read_back):
+def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, tmp_path, read_back):
     notes, received = receive(long_file)
     with Session.open(long_file) as session:
         layer = computed(session)
@@ -142,7 +141,7 @@ def test_a_long_session_arrives_whole_after_a_glimpse(receive, long_file, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", ["heat_from_s", "last_from_s"])
-def test_what_a_glimpse_missed_makes_a_second_recording(receive, write_long, tmp_path, late):
+def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long, tmp_path, late):
     from_s = 365  # in a stretch that it doesn't look into
     file = write_long(tmp_path / "late.mcap", **{late: from_s})
     notes, received = receive(file, identity=recording_id("long/anew"))
@@ -184,21 +183,6 @@ def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
     assert not same_arrangement(foreseen(before, None), content)
     assert not same_arrangement(before, content)
     assert foreseen(replace(before, commanded=()), rhythm) == replace(before, commanded=())
-
-
-def test_an_excerpt_ends_where_it_was_told_to(long_file):
-    with Session.open(long_file) as session:
-        stop_ns = session.start_ns + 10 * NS
-        part = Excerpt.until(session, stop_ns)
-        whole = session.joints("/joint_states")
-        some = part.joints("/joint_states")
-        first = np.searchsorted(whole.t_ns[0], stop_ns)
-        np.testing.assert_array_equal(some.t_ns[0], whole.t_ns[0][:first])
-        np.testing.assert_array_equal(some.values[3], whole.values[3][:first])
-        assert len(part.columns({}, {"/odom": ["pose.pose.position.x"]})[1]["/odom"]) == first
-        assert part.end_ns == stop_ns
-        assert Excerpt.until(session, None) is session
-        assert session.end_ns > stop_ns
 
 
 def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_path):

@@ -12,7 +12,6 @@ import undulog
 from undulog.capture import Session
 from undulog.capture.common.errors import MissingChannelError
 from undulog.replay.draw.plots.other_topics import is_foreign, log_others
-from undulog.replay.samples.renamed import RenamedSession
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]
@@ -149,18 +148,13 @@ def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, capsys)
     words = ["view", str(bag), "--command-topic", "/none", "--save", str(tmp_path / "a.rrd")]
     assert undulog.run(words) == 1
     assert "has no /none; it has /camera, /currents" in capsys.readouterr().err
-    with pytest.raises(MissingChannelError):
-        RenamedSession.with_joints(bag, command_topic="/none", response_topic="/joint_states")
+    with Session.open(bag) as session, pytest.raises(MissingChannelError):
+        session.view(rename={"/joint_commands": "/none"})
 
 
 def test_a_session_of_our_own_keeps_its_views(session_file):
     with Session.open(session_file) as session:
         assert not is_foreign(session)
         assert log_others(None, None, session, []) == ()
-    with (
-        RenamedSession.with_joints(
-            session_file, command_topic="/joint_commands", response_topic="/joint_states"
-        ) as same,
-        Session.open(session_file) as session,
-    ):
+        same = session.view(rename={one: one for one in ("/joint_commands", "/joint_states")})
         assert dict(same.channels) == dict(session.channels)

@@ -1,0 +1,147 @@
+"""An open log: the file, and the reader of each kind of topic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ...common.arrays import IntArray
+from ...common.errors import DataError, RobotFileError
+from ...robot.description import robot_in_session
+from ...robot.model import Robot
+from ..columns.batches import Window
+from ..columns.columns import Messages
+from ..columns.groups import Group
+from ..columns.topics import Topics
+from ..file.storage import LogFile
+from ..messages.frames import FrameArray, join_batches
+from .joint_reader import JointReader
+from .own_times import StampClock
+from .signals import JointSignals
+
+
+class OpenLog:
+    """A log that is open for reading, shared by a session and all views of it.
+
+    Attributes:
+        path: The file, or the folder of a split session.
+        file: The open file.
+        topics: Its topics.
+        warnings: What is missing or doubtful, one sentence each; grows while columns are read.
+    """
+
+    def __init__(self, path: Path, column_folder: Path | None, threads: int) -> None:
+        """Open a log; see :meth:`.Session.open`."""
+        self.path = path
+        self.file = LogFile(path, column_folder)
+        self.warnings = list(self.file.warnings)
+        self._warned = set(self.warnings)
+        self.topics = Topics(self.file, self._warn, threads=threads)
+        self._clock = StampClock(self.topics, self._warn)
+        self._joints = JointReader(path, self.topics, self._clock, self._warn)
+
+    @cached_property
+    def robot(self) -> Robot | None:
+        """The robot whose description is attached, or None."""
+        attached = {name: item.data for name, item in self.file.attachments.items()}
+        try:
+            return robot_in_session(attached, self.path)
+        except RobotFileError as error:
+            self._warn(f"the attached robot description can't be used: {error}")
+            return None
+
+    def joints(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Read signals in one pass; see :meth:`.SessionView.joint_columns`."""
+        return self._joints.read(wanted, window_ns, self._chain)
+
+    def tables(
+        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+    ) -> dict[str, pd.DataFrame]:
+        """Read tables in one pass, for a window of log times; see :meth:`.SessionView.table`."""
+        return self._as_tables(wanted, self.topics.read(wanted, window_ns))
+
+    def columns(
+        self,
+        joints: Mapping[str, Sequence[str]],
+        tables: Mapping[str, Sequence[str] | None],
+    ) -> tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]:
+        """Read all of the log in one pass; see :meth:`.SessionView.columns`."""
+        requests: dict[str, Sequence[str] | None] = dict(self._joints.requests(joints))
+        if twice := sorted(requests.keys() & tables.keys()):
+            raise DataError(f"{', '.join(twice)}: ask for signals or for a table, not for both")
+        found = self.topics.read(requests | dict(tables), (None, None))
+        read = self._as_tables(tables, found)
+        return self._joints.signals(joints, found, (None, None), self._chain), read
+
+    def frames(
+        self, topic: str, window_ns: Window, dtype: np.dtype[np.void], label: str
+    ) -> FrameArray:
+        """Read frames of one kind; see :meth:`.SessionView.frames`."""
+        batches: list[tuple[IntArray, IntArray, FrameArray]] = []
+        found = self.topics.read({topic: ["data"]}, window_ns)[topic]
+        for group in self._groups(topic, found):
+            data = group.values("data")
+            if data.shape[1] % dtype.itemsize or label not in group.layout.strings.values():
+                kind = f"frames of {dtype.itemsize} bytes"
+                raise DataError(f"{self.path}: {topic} does not hold {kind}, {label}")
+            batches.append((group.times(), group.order(), data.view(dtype)))
+        return join_batches(batches, dtype)
+
+    @property
+    def _chain(self) -> Sequence[str]:
+        return self.robot.joint_names if self.robot is not None else ()
+
+    def _warn(self, sentence: str) -> None:
+        if sentence not in self._warned:
+            self._warned.add(sentence)
+            self.warnings.append(sentence)
+
+    def _groups(self, topic: str, found: Messages) -> list[Group]:
+        if found.unread:
+            why = found.unread[0].why
+            self._warn(f"{topic}: {len(found.unread)} messages can't be read: {why}")
+        return found.groups
+
+    def _as_tables(
+        self, wanted: Mapping[str, Sequence[str] | None], found: dict[str, Messages]
+    ) -> dict[str, pd.DataFrame]:
+        """Tables of some of the messages that were read, which are let go of one by one."""
+        read: dict[str, pd.DataFrame] = {}
+        for topic in wanted:
+            read[topic] = self._table(topic, found.pop(topic))
+        return read
+
+    def _table(self, topic: str, found: Messages) -> pd.DataFrame:
+        groups = self._groups(topic, found)
+        shift_ns = self._clock.shift_ns(topic)
+        frames = [_frame(group, shift_ns) for group in groups]
+        if not frames:
+            return pd.DataFrame(index=pd.Index([], dtype="int64", name="t_ns"))
+        table = pd.concat(frames) if len(frames) > 1 else frames[0]
+        if table.index.is_monotonic_increasing:
+            return table
+        return table.sort_index(kind="stable")
+
+
+def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
+    """One layout group as a table."""
+    columns: dict[str, Any] = {}
+    for path, text in group.strings.items():
+        columns[path] = np.full(len(group), text, dtype=object)
+    for path in group.paths:
+        values = group.values(path)
+        if group.layout.leaves[path].is_array:
+            columns |= {f"{path}[{k}]": values[:, k] for k in range(values.shape[1])}
+        else:
+            columns[path] = values[:, 0]
+    t_ns = group.stamps()
+    if group.is_stamped and (shift_ns or not t_ns.all()):
+        t_ns = np.where(t_ns == 0, group.times(), t_ns + shift_ns)
+    return pd.DataFrame(columns, index=pd.Index(t_ns, name="t_ns"), copy=False)
