@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.common.strict_table import read_toml
-from undulog.capture.robot.model import Joint, Servo
+from undulog.capture.robot.model import Joint
 
 from ..estimators.series import Series
 from ..results.artefact import Span
@@ -75,44 +71,30 @@ def limits_of(session: SessionView) -> dict[str, Limits]:
     """Limits of the session's joints.
 
     Args:
-        session: An open session; a scenario attached to it may have other servos than the robot.
+        session: An open session; a twin may have run other servos than the robot's own.
 
     Returns:
         By joint name; empty without a robot description.
     """
-    robot = session.robot
+    robot = session.robot_as_run
     if robot is None:
         return {}
-    changes = _servo_changes(session)
-    known = bool(changes) or not {"servo", "joints"} & set(robot.assumed)
-    return {joint.name: _limits(joint, changes, known) for joint in robot.joints}
+    # A twin's servos are as they are stated, whatever the robot's may be.
+    known = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
+    return {joint.name: _limits(joint, known) for joint in robot.joints}
 
 
-def _limits(joint: Joint, changes: Mapping[str, Mapping[str, float]], known: bool) -> Limits:
-    fields = {field.name for field in dataclasses.fields(Servo)}
-    own = {**changes.get("", {}), **changes.get(joint.name, {})}
-    servo = dataclasses.replace(joint.servo, **{k: v for k, v in own.items() if k in fields})
-    current = servo.supply_v / servo.resistance_ohm
+def _limits(joint: Joint, known: bool) -> Limits:
+    servo = joint.servo
     return Limits(
         joint.lower,
         joint.upper,
         joint.max_velocity,
         servo.stall_torque,
-        current,
+        servo.supply_v / servo.resistance_ohm,
         servo.supply_v,
         known,
     )
-
-
-def _servo_changes(session: SessionView) -> dict[str, Mapping[str, float]]:
-    """Servo values of the attached scenario: of all joints under an empty name, and by name."""
-    try:
-        scenario: Any = read_toml(session.attachments["scenario.toml"].decode())
-    except (KeyError, ValueError):
-        return {}
-    # A twin's servos are as they are described, whatever the robot's may be.
-    changes = {"": scenario.get("servo", {}), **scenario.get("servo_of", {})}
-    return cast("dict[str, Mapping[str, float]]", changes)
 
 
 def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:

@@ -19,7 +19,7 @@ from ..estimators.spectrum import residual_noise
 from ..response.gait import allowed_model
 from ..results.analysis import BodyPoint
 from ..results.estimate import Estimate
-from ..signals.as_run import DRAG_RATIO
+from ..signals.reading import DRAG_RATIO
 from .null import free_chain, one_cycle, places, viscous_chain
 
 PLACES = ("head", "middle", "tail")

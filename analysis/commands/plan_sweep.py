@@ -180,11 +180,10 @@ def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str
     """
     from ..plan.body_modes import TIME_CONSTANTS, slowest_mode
     from ..plan.write import RAMP_S
-    from ..signals.as_run import robot_as_run, scenario_of
 
-    if session.robot is None:
+    robot = session.robot_as_run
+    if robot is None:
         return _LEAST_SETTLE_S, {}
-    robot = robot_as_run(session.robot, scenario_of(session))
     mode = slowest_mode(robot, [base.names[k] for k in base.driven])
     needed_s = RAMP_S + math.ceil(TIME_CONSTANTS * mode.time_constant_s)
     facts = {

@@ -12,7 +12,6 @@ from undulog.capture import SessionView
 from undulog.capture.robot.model import Sensor, SensorKind
 
 from ..results.analysis import Window
-from ..signals.as_run import scenario_of, start_heading_rad
 
 HEADING = "heading_rad"
 """Key of the metadata records ``undulog.plan`` and ``undulog`` with the heading [rad]."""
@@ -44,7 +43,7 @@ def posture(session: SessionView, windows: Sequence[Window]) -> Posture:
         windows: Whole gait cycles, over which the motion's own acceleration nearly vanishes.
 
     Returns:
-        The heading of its plan's record, else of its own metadata, else of the twin's scenario;
+        The heading of its plan's record, else of its own metadata, else of its twin's start;
         and the lean of its accelerometers, the mean of several.
     """
     return Posture(_heading(session), _lean(session, windows))
@@ -55,8 +54,7 @@ def _heading(session: SessionView) -> float:
         text = session.metadata.get(record, {}).get(HEADING)
         if text is not None:
             return _number(text)
-    heading = start_heading_rad(scenario_of(session))
-    return math.nan if heading is None else heading
+    return math.nan if session.run is None else session.run.start_heading_rad
 
 
 def _number(text: object) -> float:

@@ -10,7 +10,8 @@ forward (out of the head), y left, z up. At zero angle all frames are parallel a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -80,6 +81,13 @@ class Servo:
     def resistance_ohm(self) -> float:
         """Winding resistance R = Kt V / stall torque [ohm]."""
         return self.torque_constant * self.supply_v / self.stall_torque
+
+
+MAY_BE_ZERO = (
+    *("viscous_friction", "coulomb_friction", "static_friction"),
+    *("gear_damping", "backlash"),
+)
+"""Parameters of a servo that may be zero; all others are positive."""
 
 
 @dataclass(frozen=True)
@@ -313,3 +321,26 @@ class Robot:
         lower = np.array([joint.lower for joint in self.joints], dtype=np.float64)
         upper = np.array([joint.upper for joint in self.joints], dtype=np.float64)
         return frozen(lower), frozen(upper)
+
+    def with_modules(
+        self, servo_of: Mapping[str, Mapping[str, float]], mass_factor: Mapping[str, float]
+    ) -> Robot:
+        """Return the robot with other servos and links.
+
+        Args:
+            servo_of: Joint to the parameters of its servo that differ, by name.
+            mass_factor: Link to the factor of its mass and moments of inertia, as a denser material
+                of that shape has it.
+        """
+        joints = tuple(
+            replace(joint, servo=replace(joint.servo, **servo_of.get(joint.name, {})))
+            for joint in self.joints
+        )
+        links = tuple(_heavier(link, mass_factor.get(link.name, 1.0)) for link in self.links)
+        return replace(self, joints=joints, links=links)
+
+
+def _heavier(link: Link, factor: float) -> Link:
+    ixx, iyy, izz = link.inertia
+    inertia = (factor * ixx, factor * iyy, factor * izz)
+    return replace(link, mass=factor * link.mass, inertia=inertia)

@@ -2,7 +2,7 @@
 
 A robot description is what the robot is meant to be. What a scenario changes stays out of the
 robot description that its sessions carry, as a worn servo or a load on one link would: it is in
-the attached scenario alone.
+the attached scenario and the record of what ran.
 """
 
 from __future__ import annotations
@@ -12,15 +12,10 @@ from collections.abc import Mapping
 from typing import TypeAlias
 
 from undulog.capture.common.strict_table import Table
-from undulog.capture.robot.model import Link, Robot, Servo
+from undulog.capture.robot.model import MAY_BE_ZERO, Robot, Servo
 
 Fields: TypeAlias = Mapping[str, float]
 """Parameter name to value."""
-
-_MAY_BE_ZERO = (
-    *("viscous_friction", "coulomb_friction", "static_friction"),
-    *("gear_damping", "backlash"),
-)
 
 MASS_FACTOR = "mass_factor"
 """Multiplies a link's mass and its moments of inertia, as a denser material of that shape would."""
@@ -49,17 +44,19 @@ class Modules:
         Returns:
             As the scenario has it.
         """
-        joints = tuple(
-            dataclasses.replace(
-                joint,
-                servo=dataclasses.replace(
-                    joint.servo, **{**self.servo, **self.servo_of.get(joint.name, {})}
-                ),
-            )
-            for joint in robot.joints
-        )
-        links = tuple(_heavier(link, self.link_of.get(link.name, {})) for link in robot.links)
-        return dataclasses.replace(robot, joints=joints, links=links)
+        servo_of = {
+            name: {**self.servo, **self.servo_of.get(name, {})} for name in robot.joint_names
+        }
+        return robot.with_modules(servo_of, self.mass_factor)
+
+    @property
+    def mass_factor(self) -> Fields:
+        """Factors of mass and moments of inertia by link name, where they are given."""
+        return {
+            name: fields[MASS_FACTOR]
+            for name, fields in self.link_of.items()
+            if MASS_FACTOR in fields
+        }
 
     def tables(self) -> dict[str, dict[str, object]]:
         """The tables of a scenario file that say this; empty ones are left out."""
@@ -117,7 +114,7 @@ def _servo_fields(table: Table) -> dict[str, float]:
     for item in dataclasses.fields(Servo):
         if item.name not in table:
             table.number(item.name, default=0.0)  # asked for, so that a slip of it is recognised
-        elif item.name in _MAY_BE_ZERO:
+        elif item.name in MAY_BE_ZERO:
             given[item.name] = table.number(item.name, at_least=0.0)
         else:
             given[item.name] = table.number(item.name, above=0.0)
@@ -131,10 +128,3 @@ def _link_fields(table: Table) -> dict[str, float]:
         given[MASS_FACTOR] = table.number(MASS_FACTOR, above=0.0)
     table.close()
     return given
-
-
-def _heavier(link: Link, fields: Fields) -> Link:
-    factor = fields.get(MASS_FACTOR, 1.0)
-    ixx, iyy, izz = link.inertia
-    moments = (factor * ixx, factor * iyy, factor * izz)
-    return dataclasses.replace(link, mass=factor * link.mass, inertia=moments)

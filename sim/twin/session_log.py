@@ -12,6 +12,7 @@ scenario gives the same bytes.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import platform
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from undulog.capture.log.messages.topics import PowerTopic
 from undulog.capture.log.write.sensor_channels import open_sensor
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.kinematics import rotation_from_quaternion
+from undulog.capture.robot.run import RUN_RECORD, Run, drag_ratio
 
 from ..physics.energy_flows import JOINT_TERMS
 from ..physics.ledger import TERMS
@@ -93,6 +95,7 @@ class SessionLog:
         description = urdf(robot)
         writer.attach("robot.urdf", "application/xml", description.encode())
         writer.attach("scenario.toml", "application/toml", scenario.toml().encode())
+        writer.note(RUN_RECORD, _run_facts(scenario, twin.kernels))
         self._commands = writer.joint_state("/joint_commands", names, unit="rad")
         self._states = writer.joint_state(
             "/joint_states", names, unit="rad", velocity=True, effort=True
@@ -215,6 +218,21 @@ class SessionLog:
             self.say(
                 "warn", f"{joint.name} passed its limits {joint.lower:g} to {joint.upper:g} rad"
             )
+
+
+def _run_facts(scenario: Scenario, kernels: Kernels) -> dict[str, str]:
+    """Entries of the metadata record of what runs."""
+    ground = scenario.world.ground
+    run = Run(
+        physics_rate_hz=scenario.physics_rate_hz,
+        start_heading_rad=scenario.world.heading,
+        contact=ground is not None or bool(scenario.world.obstacles),
+        drag_ratio=None if ground is None else drag_ratio(ground.mu_normal, ground.mu_tangential),
+        servo_of={joint.name: dataclasses.asdict(joint.servo) for joint in scenario.robot.joints},
+        mass_factor=scenario.modules.mass_factor,
+    )
+    law = {} if ground is None else {"contact_law": ground.law}
+    return {"engine": scenario.engine, "kernels": kernels, **law, **run.record()}
 
 
 def _sampling(slot_s: float) -> str:

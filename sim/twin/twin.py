@@ -69,6 +69,7 @@ class Twin:
 
     Attributes:
         scenario: What it runs.
+        kernels: What computes the force laws.
         gait: Its gait.
         sensed: Sensor samples that arrive by the present tick, there before the gait is asked: a
             gait that speaks over a bus hands them out first.
@@ -94,6 +95,7 @@ class Twin:
         """
         robot, world = scenario.robot, scenario.world
         self.scenario = scenario
+        self.kernels = kernels
         self.gait: Gait = gait or build_gait(scenario)
         self.sensed: list[SensorSample] = []
         self._sensing = Senses(scenario)

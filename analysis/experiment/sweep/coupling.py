@@ -15,7 +15,6 @@ from undulog.capture.robot.model import Servo
 from ...results.coupling import Coupling, rows_of
 from ...results.estimate import Estimate
 from ...results.sweep import ComplexMatrix, LinearCoupling, Route, ToneCoupling
-from ...signals.as_run import robot_as_run
 from ...signals.stretch import Options
 from ..kicks.lti_reading import SINGULAR, reciprocity
 from .chain import Measured, impedance, impedance_behind_servos, inverse, servo_side, transfer
@@ -74,7 +73,8 @@ def sweep_coupling(
             record=f"phase-kicks around one gait ({4 * m} runs and one without a kick), or the "
             "lag sweep without contact",
         )
-    hold_s = (data.period_s - data.physics_step_s) / 2
+    step_s = 0.0 if data.run is None else 1.0 / data.run.physics_rate_hz
+    hold_s = (data.period_s - step_s) / 2
     servos, servo_why = _servos(data, sweep.names)
     tones = tuple(_tone(data, k, hold_s, servos) for k in range(len(sweep.tones)))
     beside = Estimate()
@@ -150,9 +150,9 @@ def _servos(data: SweepData, names: Sequence[str]) -> tuple[list[Servo] | None, 
     """The driven joints' servos, if they are known and linear; and why not."""
     if data.robot is None:
         return None, "the sessions carry no robot description"
-    robot = robot_as_run(data.robot, data.scenario)
+    robot = data.robot
     joints = {joint.name: joint.servo for joint in robot.joints}
-    if data.scenario is None and "servo" in robot.assumed:
+    if data.run is None and "servo" in robot.assumed:
         return None, f"the servo of {robot.name} is assumed, not known"
     if any(name not in joints for name in names):
         return None, f"{robot.name} has other joints"

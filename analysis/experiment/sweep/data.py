@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
@@ -14,11 +13,11 @@ from undulog.capture import Session
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Robot
+from undulog.capture.robot.run import Run
 
 from ...estimators.series import Series
 from ...estimators.settling import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...response.gait import NYQUIST_SHARE
-from ...signals.as_run import physics_step_s, scenario_of, touches
 from ...signals.stretch import Options
 from .chain import Phasors
 from .distortion import Beside
@@ -44,11 +43,10 @@ class SweepData:
             too short for them.
         torque_beside: Torques there.
         period_s: Of the commands: a servo holds each so long [s].
-        physics_step_s: Of a simulated robot; 0 of a real one [s].
         contact: Whether the robot touched anything; None where its sessions don't say.
         drift: Largest drift of a run's responses per cycle, that noise doesn't explain; 0 if none.
-        robot: Its description, or None.
-        scenario: The twin's, or None.
+        robot: The robot as it ran, or None without a description.
+        run: What the twin of the first run had; None of a real robot.
     """
 
     omega: FloatArray
@@ -58,11 +56,10 @@ class SweepData:
     beside: Beside | None
     torque_beside: Beside | None
     period_s: float
-    physics_step_s: float
     contact: bool | None
     drift: float
     robot: Robot | None
-    scenario: dict[str, Any] | None
+    run: Run | None
 
 
 @dataclass(frozen=True)
@@ -94,20 +91,20 @@ def sweep_data(
         DataError: If a driven joint's response is missing in a run, or too short.
     """
     runs: list[_Run] = []
-    scenarios: list[dict[str, Any] | None] = []
+    twins: list[Run | None] = []
     robot: Robot | None = None
     for k in sweep.index:
         tones = commanded[k]
         assert tones is not None  # noqa: S101 - a sweep is made of sessions with tones
         with Session.open(paths[k]) as session:
-            robot = session.robot or robot
-            scenarios.append(scenario_of(session))
+            robot = robot or session.robot_as_run
+            twins.append(session.run)
             signals = read_signals(session, options)
         lost = [name for name in sweep.names if name not in signals.position]
         if lost:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
         runs.append(_fit(sweep, tones.omega, signals, len(sweep.index)))
-    touched = [touches(one) for one in scenarios]
+    touched = [None if one is None else one.contact for one in twins]
     tones_at = list(sweep.tones)
     whole = all(run.torque is not None for run in runs)
     torques = [run.torque for run in runs if run.torque is not None]
@@ -121,11 +118,10 @@ def sweep_data(
         beside=_beside(lines, responses) if lines.size else None,
         torque_beside=_beside(lines, torques) if lines.size and whole else None,
         period_s=float(np.median([run.period_s for run in runs])),
-        physics_step_s=physics_step_s(scenarios[0]),
         contact=True if any(touched) else None if None in touched else False,
         drift=max(run.drift for run in runs),
         robot=robot,
-        scenario=scenarios[0],
+        run=twins[0],
     )
 
 

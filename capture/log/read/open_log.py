@@ -14,6 +14,7 @@ from ...common.arrays import IntArray
 from ...common.errors import DataError, RobotFileError
 from ...robot.description import robot_in_session
 from ...robot.model import Robot
+from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
 from ..columns.batches import Window
 from ..columns.columns import Messages
 from ..columns.groups import Group
@@ -54,6 +55,19 @@ class OpenLog:
         except RobotFileError as error:
             self._warn(f"the attached robot description can't be used: {error}")
             return None
+
+    @cached_property
+    def run(self) -> Run | None:
+        """What a twin ran: its servos, contact and physics rate; None of any other session."""
+        facts = self.file.metadata.get(RUN_RECORD)
+        if facts is not None:
+            try:
+                return run_from_record(facts)
+            except ValueError as error:
+                self._warn(f"the metadata record {RUN_RECORD} can't be used: {error}")
+        scenario = self.file.attachments.get("scenario.toml")
+        names = () if self.robot is None else self.robot.joint_names
+        return None if scenario is None else run_from_scenario(scenario.data, names)
 
     def joints(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window

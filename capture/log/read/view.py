@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...common.errors import MissingChannelError
 from ...robot.model import Robot
+from ...robot.run import Run
 from ..columns.batches import Window
 from ..columns.topics import Channel
 from ..messages.frames import (
@@ -193,6 +194,18 @@ class SessionView:
     def robot(self) -> Robot | None:
         """The robot whose description is attached, or None."""
         return self._log.robot
+
+    @property
+    def run(self) -> Run | None:
+        """What a twin ran: its servos, contact and physics rate; None of any other session."""
+        return self._log.run
+
+    @property
+    def robot_as_run(self) -> Robot | None:
+        """The robot with the servos and masses that a twin ran with; else as described."""
+        if self.robot is None or self.run is None:
+            return self.robot
+        return self.robot.with_modules(self.run.servo_of, self.run.mass_factor)
 
     @property
     def verdict(self) -> str | None:
