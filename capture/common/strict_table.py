@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import difflib
 import math
+import operator
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeVar, cast
 
@@ -34,9 +36,6 @@ _SMALLEST = 1e-30
 
 def read_toml(text: str) -> dict[str, Any]:
     """Read a TOML text of any origin.
-
-    Args:
-        text: The text.
 
     Returns:
         Its tables: at most 64 of them, or arrays, in each other, and integers of 64 bits.
@@ -65,14 +64,7 @@ def read_toml(text: str) -> dict[str, Any]:
 
 
 def shown(value: object) -> str:
-    """A value as a fault message shows it.
-
-    Args:
-        value: Anything TOML can hold.
-
-    Returns:
-        Strings quoted, tables and long arrays by kind.
-    """
+    """A TOML value as a fault message shows it: strings quoted, tables by kind, arrays cut."""
     if isinstance(value, Mapping):
         return "a table"
     if isinstance(value, bool):
@@ -84,19 +76,53 @@ def shown(value: object) -> str:
 
 
 def listed(words: Iterable[str], found: object = None) -> str:
-    """The valid words, nearest first named where ``found`` looks like a slip.
-
-    Args:
-        words: The valid words.
-        found: What stands there.
-
-    Returns:
-        ``a, b, c`` and, for a near miss, ``; did you mean b?``.
-    """
+    """The valid words, ``a, b, c``; where ``found`` is nearly one, ``(did you mean b?)`` after."""
     valid = list(words)
     near = difflib.get_close_matches(found, valid, n=1) if isinstance(found, str) else []
     hint = f" (did you mean {near[0]}?)" if near else ""
     return (", ".join(valid) or "none") + hint
+
+
+_COMPARISONS = {
+    ">": operator.gt,
+    ">=": operator.ge,
+    "<=": operator.le,
+    "other than": operator.ne,
+}
+
+
+@dataclass(frozen=True)
+class Bound:
+    """One bound of a number, in words as a fault shows it: ``>= 0``."""
+
+    comparison: str
+    limit: float
+
+    def holds(self, number: float) -> bool:
+        """Whether a number is within the bound."""
+        return _COMPARISONS[self.comparison](number, self.limit)
+
+    def __str__(self) -> str:
+        """The bound in words."""
+        return f"{self.comparison} {self.limit:g}"
+
+
+def above(limit: float) -> Bound:
+    """The number must be greater than the limit."""
+    return Bound(">", limit)
+
+
+def at_least(limit: float) -> Bound:
+    """The number must not be less than the limit."""
+    return Bound(">=", limit)
+
+
+def at_most(limit: float) -> Bound:
+    """The number must not be greater than the limit."""
+    return Bound("<=", limit)
+
+
+NONZERO = Bound("other than", 0.0)
 
 
 class Faults:
@@ -122,7 +148,12 @@ class Faults:
 
 
 class Table:
-    """One TOML table, with optional defaults behind it."""
+    """One TOML table, with optional defaults behind it.
+
+    Attributes:
+        values: The parsed table.
+        faults: Where its faults are noted.
+    """
 
     def __init__(
         self,
@@ -139,32 +170,28 @@ class Table:
             faults: Where faults are noted.
             defaults: Looked into for keys that this table lacks.
         """
-        self._values = values
+        self.values = values
+        self.faults = faults
         self._where = where
-        self._faults = faults
         self._defaults = defaults
         self._asked: dict[str, None] = {}
 
     def __contains__(self, key: str) -> bool:
         """Whether the table itself has the key."""
         self._asked[key] = None
-        return key in self._values
+        return key in self.values
+
+    def over(self, defaults: Table) -> Table:
+        """The same table, nothing read yet, with defaults behind it."""
+        return Table(self.values, self._where, self.faults, defaults)
+
+    def replaced(self, values: Mapping[str, Any]) -> Table:
+        """A table of other values in the same place."""
+        return Table(values, self._where, self.faults)
 
     def key(self, key: str) -> str:
-        """The full key, e.g. ``joints[3].plane``.
-
-        Args:
-            key: Key in this table.
-
-        Returns:
-            Key from the top of the file.
-        """
+        """The full key, e.g. ``joints[3].plane``."""
         return f"{self._where}.{key}" if self._where else key
-
-    @property
-    def faults(self) -> Faults:
-        """Where faults of this table are noted."""
-        return self._faults
 
     def fault(self, key: str, valid: str, found: str | None = None) -> None:
         """Note a fault of one key.
@@ -176,13 +203,10 @@ class Table:
         """
         where, value = self.look(key)
         text = found or ("nothing" if value is None else shown(value))
-        self._faults.add(where, text, valid)
+        self.faults.add(where, text, valid)
 
     def look(self, key: str) -> tuple[str, object]:
         """Look a key up, first here, then in the defaults.
-
-        Args:
-            key: Key in this table.
 
         Returns:
             The full key where it was found and the value; the key here and None where absent.
@@ -190,20 +214,12 @@ class Table:
         self._asked[key] = None
         if self._defaults is not None:
             where, value = self._defaults.look(key)
-            if key not in self._values and value is not None:
+            if key not in self.values and value is not None:
                 return where, value
-        return self.key(key), self._values.get(key)
+        return self.key(key), self.values.get(key)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A string; ``""`` after a fault.
-
-        Args:
-            key: Key in this table.
-            default: Taken when absent; None makes it required.
-
-        Returns:
-            The string.
-        """
+        """A string; ``""`` after a fault. Without a default it is required."""
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
@@ -212,175 +228,87 @@ class Table:
             return ""
         return value
 
-    def name(self, key: str) -> str:
-        """A name that can be part of a topic; ``""`` after a fault.
-
-        Args:
-            key: Key in this table.
-
-        Returns:
-            The name.
-        """
+    def name(self, key: str, default: str | None = None) -> str:
+        """A name that can be part of a topic; ``""`` after a fault."""
         value = self.look(key)[1]
+        if value is None and default is not None:
+            return default
         if not isinstance(value, str) or not NAME_PATTERN.fullmatch(value):
             self.fault(key, "a name of letters, digits, _ and -, beginning with a letter")
             return ""
         return value
 
-    def choice(self, key: str, kinds: Iterable[_Choice]) -> _Choice | None:
-        """One of a few words; None after a fault.
-
-        Args:
-            key: Key in this table.
-            kinds: The words.
-
-        Returns:
-            The member.
-        """
+    def choice(
+        self, key: str, kinds: Iterable[_Choice], default: _Choice | None = None
+    ) -> _Choice | None:
+        """One of a few words; None after a fault. Without a default it is required."""
         value = self.look(key)[1]
+        if value is None and default is not None:
+            return default
         words = {str(kind): kind for kind in kinds}
         if not isinstance(value, str) or value not in words:
             self.fault(key, listed(words, value))
             return None
         return words[value]
 
-    def number(
-        self,
-        key: str,
-        *,
-        default: float | None = None,
-        above: float | None = None,
-        at_least: float | None = None,
-        at_most: float | None = None,
-        nonzero: bool = False,
-    ) -> float:
-        """A finite number; NaN after a fault.
+    def number(self, key: str, *bounds: Bound, default: float | None = None) -> float:
+        """A finite number within the bounds; NaN after a fault. Without a default it is required.
 
-        Args:
-            key: Key in this table.
-            default: Taken when absent; None makes it required.
-            above: The value must be greater.
-            at_least: The value must not be less.
-            at_most: The value must not be greater.
-            nonzero: The value must not be zero.
-
-        Returns:
-            The number.
+        A default need not be within the bounds.
         """
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
         number = finite_number(value)
-        fits = (
-            number is not None
-            and (above is None or number > above)
-            and (at_least is None or number >= at_least)
-            and (at_most is None or number <= at_most)
-            and not (nonzero and number == 0)
-            and _is_usual(number)
-        )
-        if number is None or not fits:
-            bounds = [
-                *([f"> {above:g}"] if above is not None else []),
-                *([f">= {at_least:g}"] if at_least is not None else []),
-                *([f"<= {at_most:g}"] if at_most is not None else []),
-                *(["other than 0"] if nonzero else []),
-            ]
-            if number is not None and not _is_usual(number):
-                bounds.append(_USUAL)
-            self.fault(key, " ".join(["a finite number", " and ".join(bounds)]).strip())
-            return math.nan
-        return number
+        usual = number is None or _is_usual(number)
+        if number is not None and usual and all(bound.holds(number) for bound in bounds):
+            return number
+        words = [str(bound) for bound in bounds] + ([] if usual else [_USUAL])
+        self.fault(key, f"a finite number {' and '.join(words)}".strip())
+        return math.nan
 
-    def integer(self, key: str, *, at_least: int) -> int:
-        """A whole number; the least valid one after a fault.
-
-        Args:
-            key: Key in this table.
-            at_least: The value must not be less.
-
-        Returns:
-            The number.
-        """
+    def integer(self, key: str, least: int, default: int | None = None) -> int:
+        """A whole number from ``least`` on, which stands in after a fault."""
         value = self.look(key)[1]
-        if isinstance(value, bool) or not isinstance(value, int) or value < at_least:
-            self.fault(key, f"a whole number >= {at_least}")
-            return at_least
+        if value is None and default is not None:
+            return default
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            self.fault(key, f"a whole number >= {least}")
+            return least
         return value
 
     def flag(self, key: str, *, default: bool) -> bool:
-        """True or false; the default after a fault.
-
-        Args:
-            key: Key in this table.
-            default: Taken when absent.
-
-        Returns:
-            The truth value.
-        """
+        """True or false; the default when absent or after a fault."""
         value = self.look(key)[1]
         if value is None or isinstance(value, bool):
             return default if value is None else value
         self.fault(key, "true or false")
         return default
 
-    def triple(
+    def numbers(
         self,
         key: str,
-        *,
-        default: tuple[float, float, float] | None = None,
-        above: float | None = None,
-    ) -> tuple[float, float, float]:
-        """Three finite numbers; NaN after a fault.
+        count: int,
+        *bounds: Bound,
+        default: tuple[float, ...] | None = None,
+    ) -> tuple[float, ...]:
+        """An array of finite numbers, each within the bounds; NaN after a fault.
 
-        Args:
-            key: Key in this table.
-            default: Taken when absent; None makes it required.
-            above: Each value must be greater.
-
-        Returns:
-            The numbers.
+        Without a default it is required.
         """
-        if default is not None and self.look(key)[1] is None:
-            return default
-        x, y, z = self._numbers(key, 3, above)
-        return x, y, z
-
-    def pair(
-        self,
-        key: str,
-        *,
-        default: tuple[float, float] | None = None,
-        above: float | None = None,
-    ) -> tuple[float, float]:
-        """Two finite numbers; NaN after a fault.
-
-        Args:
-            key: Key in this table.
-            default: Taken when absent; None makes it required.
-            above: Each value must be greater.
-
-        Returns:
-            The numbers.
-        """
-        if default is not None and self.look(key)[1] is None:
-            return default
-        x, y = self._numbers(key, 2, above)
-        return x, y
-
-    def _numbers(self, key: str, count: int, above: float | None) -> list[float]:
-        """An array of finite numbers; NaN after a fault."""
         value = self.look(key)[1]
+        if value is None and default is not None:
+            return default
         entries = cast("list[object]", value) if isinstance(value, list) else []
-        numbers = [n for n in map(finite_number, entries) if n is not None and _is_usual(n)]
-        bad = above is not None and any(number <= above for number in numbers)
-        if len(entries) != count or len(numbers) != count or bad:
-            bound = f", each > {above:g}" if above is not None else ""
-            if any(not _is_usual(n) for n in map(finite_number, entries) if n is not None):
-                bound += f", each {_USUAL}"
-            self.fault(key, f"an array of {count} finite numbers{bound}")
-            return [math.nan] * count
-        return numbers
+        numbers = [n for n in map(finite_number, entries) if n is not None]
+        usual = all(_is_usual(number) for number in numbers)
+        bad = any(not bound.holds(number) for bound in bounds for number in numbers)
+        if len(entries) != count or len(numbers) != count or bad or not usual:
+            words = [str(bound) for bound in bounds] + ([] if usual else [_USUAL])
+            each = "".join(f", each {word}" for word in words)
+            self.fault(key, f"an array of {count} finite numbers{each}")
+            return (math.nan,) * count
+        return tuple(numbers)
 
     def words(self, key: str, *, valid: Iterable[str] | None = None) -> tuple[str, ...]:
         """An array of different strings; empty when absent, without the bad ones after a fault.
@@ -388,9 +316,6 @@ class Table:
         Args:
             key: Key in this table.
             valid: The words to choose from; any string when None.
-
-        Returns:
-            The words.
         """
         value = self.look(key)[1]
         if value is None:
@@ -403,61 +328,45 @@ class Table:
         for i, word in enumerate(cast("list[object]", value)):
             where = f"{self.look(key)[0]}[{i}]"
             if not isinstance(word, str):
-                self._faults.add(where, shown(word), "a string")
+                self.faults.add(where, shown(word), "a string")
             elif choices is not None and word not in choices:
-                self._faults.add(where, shown(word), listed(choices, word))
+                self.faults.add(where, shown(word), listed(choices, word))
             elif word in good:
-                self._faults.add(where, shown(word), "a word that is not there already")
+                self.faults.add(where, shown(word), "a word that is not there already")
             else:
                 good[word] = None
         return tuple(good)
 
     def table(self, key: str, defaults: Table | None = None) -> Table:
-        """A sub-table; an empty one when absent or after a fault.
-
-        Args:
-            key: Key in this table.
-            defaults: Defaults of the sub-table.
-
-        Returns:
-            The sub-table.
-        """
+        """A sub-table, with its defaults; an empty one when absent or after a fault."""
         self._asked[key] = None
-        value = self._values.get(key, {})
+        value = self.values.get(key, {})
         if not isinstance(value, dict):
             self.fault(key, "a table")
             value = {}
-        return Table(cast("dict[str, Any]", value), self.key(key), self._faults, defaults)
+        return Table(cast("dict[str, Any]", value), self.key(key), self.faults, defaults)
 
-    def tables(self, key: str) -> list[tuple[dict[str, Any], str]]:
-        """An array of tables; empty when absent, without the bad ones after a fault.
-
-        Args:
-            key: Key in this table.
-
-        Returns:
-            Each table with its full key, ready for :class:`Table`.
-        """
+    def tables(self, key: str) -> list[Table]:
+        """An array of tables; empty when absent, without the bad ones after a fault."""
         self._asked[key] = None
-        value = self._values.get(key, [])
+        value = self.values.get(key, [])
         if not isinstance(value, list):
             self.fault(key, "an array of tables")
             return []
-        good: list[tuple[dict[str, Any], str]] = []
+        good: list[Table] = []
         for i, entry in enumerate(cast("list[object]", value)):
             where = f"{self.key(key)}[{i}]"
             if isinstance(entry, dict):
-                good.append((cast("dict[str, Any]", entry), where))
+                good.append(Table(cast("dict[str, Any]", entry), where, self.faults))
             else:
-                self._faults.add(where, shown(entry), "a table")
+                self.faults.add(where, shown(entry), "a table")
         return good
 
     def close(self) -> None:
         """Note every key of this table that nobody asked for."""
-        for key in self._values:
+        for key in self.values:
             if key not in self._asked:
-                near = listed(self._asked, key)
-                self._faults.add(self.key(key), "an unknown key", near)
+                self.faults.add(self.key(key), "an unknown key", listed(self._asked, key))
 
 
 _USUAL = f"0 or of a size from {_SMALLEST:g} to {_LARGEST:g}"
@@ -468,14 +377,7 @@ def _is_usual(number: float) -> bool:
 
 
 def finite_number(value: object) -> float | None:
-    """A finite number, else None; booleans are not numbers.
-
-    Args:
-        value: From TOML or JSON.
-
-    Returns:
-        The number.
-    """
+    """A finite number from TOML or JSON, else None; booleans are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

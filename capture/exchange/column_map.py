@@ -25,11 +25,12 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from ..common.config import Positive, read_field
 from ..common.errors import Fault, FaultyFileError, UsageError
 from ..common.files import read_input
-from ..common.strict_table import Faults, Table, listed, read_toml
+from ..common.strict_table import NONZERO, Faults, Table, listed, read_toml
 from ..robot.bus_map import JOINT_QUANTITIES
 from ..robot.model import Quantity, Robot
 from ..robot.units import TIME_UNITS, unit_for, valid_units
@@ -58,8 +59,8 @@ class Column:
     joint: str
     quantity: Quantity
     unit: str
-    wrap: float = 0.0
-    scale: float = 1.0
+    wrap: Positive = 0.0
+    scale: Annotated[float, NONZERO] = 1.0
     offset: float = 0.0
 
 
@@ -176,9 +177,7 @@ def _parse(values: dict[str, Any], robot: Robot) -> tuple[ColumnMap, tuple[Fault
     entries = top.tables("columns")
     if not entries:
         top.fault("columns", "at least one column")
-    columns = tuple(
-        _column(Table(entry, where, faults), robot.joint_names) for entry, where in entries
-    )
+    columns = tuple(_column(entry, robot.joint_names) for entry in entries)
     top.close()
     _note_repeated(faults, columns)
     return ColumnMap(time_column, time_unit, columns, delimiter), faults.all()
@@ -199,9 +198,9 @@ def _column(table: Table, joints: Iterable[str]) -> Column:
         joint=joint,
         quantity=quantity or Quantity.POSITION,
         unit=unit,
-        wrap=table.number("wrap", default=0.0, above=0),
-        scale=table.number("scale", default=1.0, nonzero=True),
-        offset=table.number("offset", default=0.0),
+        wrap=read_field(table, Column, "wrap"),
+        scale=read_field(table, Column, "scale"),
+        offset=read_field(table, Column, "offset"),
     )
     table.close()
     return column

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from ..common.config import read_field
 from ..common.errors import UsageError
 from ..common.strict_table import Faults, Table, listed
 from .model import Bus, BusPoll, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
@@ -112,23 +113,21 @@ def read_bus(
             table.faults.add(f"{table.key('databases')}: {name}", "no such file", valid)
         else:
             databases[name] = text
-    bitrate = table.integer("bitrate", at_least=1)
+    bitrate: int = read_field(table, Bus, "bitrate")
     messages = database_messages(databases, table.faults)
     if len(databases) != len(names):
         messages = None  # what a missing database holds is not a fault of the map
     signals: dict[BusSignal, None] = {}
-    for values, where in table.tables("signals"):
-        for expanded in _expanded(values, joints):
-            entry = Table(expanded, where, table.faults)
+    for each in table.tables("signals"):
+        for entry in _expanded(each, joints):
             signal = _signal(entry, messages, joints, sensors)
             entry.close()
             if signal in signals:
                 entry.fault("signal", "one entry a signal, target and quantity", "a repeated entry")
             signals[signal] = None
     polls: dict[BusPoll, None] = {}
-    for values, where in table.tables("polls"):
-        for expanded in _expanded(values, joints):
-            entry = Table(expanded, where, table.faults)
+    for each in table.tables("polls"):
+        for entry in _expanded(each, joints):
             polls[_poll(entry, messages, joints)] = None
             entry.close()
     table.close()
@@ -150,7 +149,7 @@ def _poll(
     if messages is None or message not in messages:
         return BusPoll(message, ())
     known = {each.name: each for each in messages[message].signals}
-    numbers = [(name, table.integer(name, at_least=0)) for name in known if name in table]
+    numbers = [(name, table.integer(name, 0)) for name in known if name in table]
     for name, number in numbers:
         if number >> known[name].length:
             table.fault(name, f"a raw number of {known[name].length} bits")
@@ -158,15 +157,17 @@ def _poll(
     return BusPoll(message, tuple(numbers))
 
 
-def _expanded(values: dict[str, Any], joints: tuple[Joint, ...]) -> list[dict[str, Any]]:
+def _expanded(entry: Table, joints: tuple[Joint, ...]) -> list[Table]:
     """The entry itself, or one entry a joint where its target is the placeholder."""
-    if values.get("target") != _PLACEHOLDER:
-        return [values]
+    if entry.values.get("target") != _PLACEHOLDER:
+        return [entry]
     return [
-        {
-            key: value.replace(_PLACEHOLDER, joint.name) if isinstance(value, str) else value
-            for key, value in values.items()
-        }
+        entry.replaced(
+            {
+                key: value.replace(_PLACEHOLDER, joint.name) if isinstance(value, str) else value
+                for key, value in entry.values.items()
+            }
+        )
         for joint in joints
     ]
 
@@ -213,8 +214,8 @@ def _signal(
         target=target,
         quantity=quantity or Quantity.POSITION,
         unit=unit,
-        scale=entry.number("scale", default=1.0, nonzero=True),
-        offset=entry.number("offset", default=0.0),
+        scale=read_field(entry, BusSignal, "scale"),
+        offset=read_field(entry, BusSignal, "offset"),
         axis=axis,
         unknown=_code(entry, "unknown", dbc),
         out_of_range=_code(entry, "out_of_range", dbc),
@@ -227,7 +228,7 @@ def _code(entry: Table, key: str, dbc: Signal | None) -> int | None:
         return None
     least = -(1 << (dbc.length - 1)) if dbc is not None and dbc.is_signed else 0
     greatest = least + (1 << dbc.length) - 1 if dbc is not None else None
-    number = entry.integer(key, at_least=least if dbc is not None else -(1 << 63))
+    number = entry.integer(key, least if dbc is not None else -(1 << 63))
     if dbc is not None and dbc.is_float:
         entry.fault(key, "leave it out: a float has numbers for that, NaN and inf")
     elif greatest is not None and number > greatest:

@@ -31,13 +31,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..common.config import read, read_field, read_fields, read_required
 from ..common.errors import Fault, RobotFileError
 from ..common.files import Shelf
 from ..common.strict_table import Faults, Table, listed, read_toml
 from .bus_map import read_bus
 from .mesh import MESH_TYPES, is_mesh, read_meshes
 from .model import ClockDomain, Joint, Link, Plane, Robot, Sensor, SensorKind, Servo
-from .safety import JOINT_LIMITS, OnFault, Safety
+from .safety import JOINT_LIMITS, Safety
 
 
 def note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
@@ -67,36 +68,26 @@ def read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
         The joints, the one next to the head first.
     """
     common, servo = defaults.table("joint"), defaults.table("servo")
-    entries = _chain(top) if "chain" in top else top.tables("joints")
-    if not entries:
+    tables = _chain(top) if "chain" in top else top.tables("joints")
+    if not tables:
         top.fault("joints", "an array of at least one table, the joint next to the head first")
-    joints: list[Joint] = []
-    for values, where in entries:
-        table = Table(values, where, top.faults, common)
-        joint = Joint(
-            name=table.name("name"),
-            plane=table.choice("plane", Plane) or Plane.HORIZONTAL,
-            lower=table.number("lower", default=Joint.lower),
-            upper=table.number("upper", default=Joint.upper),
-            max_velocity=table.number("max_velocity", default=Joint.max_velocity, above=0),
-            servo=_servo(table.table("servo", servo)),
-        )
-        if joint.lower >= joint.upper:
-            table.fault("upper", f"more than lower = {joint.lower:g}", f"{joint.upper:g}")
-        table.close()
-        joints.append(joint)
-    if entries:
+    joints = tuple(_joint(table.over(common), servo) for table in tables)
+    if tables:
         common.close()
         servo.close()
-    return tuple(joints)
+    return joints
 
 
-def _chain(top: Table) -> list[tuple[dict[str, Any], str]]:
-    """Entries for ``joints`` of a chain that is described by its length."""
+def _joint(table: Table, servo: Table) -> Joint:
+    return read(table, Joint, servo=lambda: read(table.table("servo", servo), Servo))
+
+
+def _chain(top: Table) -> list[Table]:
+    """Tables for ``joints`` of a chain that is described by its length."""
     if "joints" in top:
         top.fault("joints", "leave it out: the chain has them")
     table = top.table("chain")
-    count = table.integer("joints", at_least=1)
+    count = table.integer("joints", 1)
     if count > LONGEST_CHAIN:
         table.fault("joints", f"at most {LONGEST_CHAIN}")
         count = 1
@@ -104,7 +95,8 @@ def _chain(top: Table) -> list[tuple[dict[str, Any], str]]:
     table.close()
     names = numbered("joint", count)
     return [
-        ({"name": name, "plane": planes[i % len(planes)]}, "chain") for i, name in enumerate(names)
+        table.replaced({"name": name, "plane": planes[i % len(planes)]})
+        for i, name in enumerate(names)
     ]
 
 
@@ -122,35 +114,6 @@ def numbered(word: str, count: int) -> list[str]:
     return [f"{word}{i:0{width}d}" for i in range(1, count + 1)]
 
 
-def _servo(table: Table) -> Servo:
-    servo = Servo(
-        supply_v=table.number("supply_v", default=Servo.supply_v, above=0),
-        stall_torque=table.number("stall_torque", default=Servo.stall_torque, above=0),
-        torque_constant=table.number("torque_constant", default=Servo.torque_constant, above=0),
-        proportional_gain=table.number(
-            "proportional_gain", default=Servo.proportional_gain, above=0
-        ),
-        rotor_inertia=table.number("rotor_inertia", default=Servo.rotor_inertia, above=0),
-        viscous_friction=table.number(
-            "viscous_friction", default=Servo.viscous_friction, at_least=0
-        ),
-        coulomb_friction=table.number(
-            "coulomb_friction", default=Servo.coulomb_friction, at_least=0
-        ),
-        gear_stiffness=table.number("gear_stiffness", default=Servo.gear_stiffness, above=0),
-        gear_damping=table.number("gear_damping", default=Servo.gear_damping, at_least=0),
-        backlash=table.number("backlash", default=Servo.backlash, at_least=0),
-        static_friction=table.number("static_friction", default=Servo.static_friction, at_least=0),
-        stribeck_speed=table.number("stribeck_speed", default=Servo.stribeck_speed, above=0),
-    )
-    if 0 < servo.static_friction < servo.coulomb_friction:
-        table.fault(
-            "static_friction", f"0, or at least coulomb_friction = {servo.coulomb_friction:g}"
-        )
-    table.close()
-    return servo
-
-
 def read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...]:
     """Read ``links``, or make one more than joints as ``defaults`` say.
 
@@ -163,38 +126,27 @@ def read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...
         The links, the head first.
     """
     common = defaults.table("link")
-    entries = top.tables("links")
+    tables = top.tables("links")
     if "links" not in top:
-        entries = [({"name": name}, "defaults.link") for name in numbered("link", joint_count + 1)]
-    elif len(entries) != joint_count + 1:
-        top.fault("links", f"{joint_count + 1}, one more than joints", str(len(entries)))
-    links: list[Link] = []
-    for values, where in entries:
-        table = Table(values, where, top.faults, common)
-        link = Link(
-            name=table.name("name"),
-            length=table.number("length", above=0),
-            radius=table.number("radius", above=0),
-            mass=table.number("mass", above=0),
-            inertia=table.triple("inertia", above=0),
-            mesh=table.text("mesh", ""),
-            mesh_scale=table.number("mesh_scale", default=Link.mesh_scale, above=0),
-        )
-        if link.mesh and not is_mesh(link.mesh):
-            table.fault("mesh", f"a file {listed(MESH_TYPES)}, or leave it out")
-        # Each principal moment of a rigid body is at most the sum of the other two.
-        if 2 * max(link.inertia) > sum(link.inertia) * (1 + 1e-12):
-            table.fault("inertia", "moments of which none exceeds the sum of the other two")
-        table.close()
-        links.append(link)
-    if entries:
+        tables = [common.replaced({"name": name}) for name in numbered("link", joint_count + 1)]
+    elif len(tables) != joint_count + 1:
+        top.fault("links", f"{joint_count + 1}, one more than joints", str(len(tables)))
+    links = tuple(_link(table.over(common)) for table in tables)
+    if tables:
         common.close()
     note_repeated(top.faults, "links", [link.name for link in links])
-    return tuple(links)
+    return links
 
 
-_ANY_SIGN = ("max_temperature",)
-_TIMES = ("reply_timeout_s", "max_late_s")
+def _link(table: Table) -> Link:
+    link = read_fields(table, Link)
+    if link.mesh and not is_mesh(link.mesh):
+        table.fault("mesh", f"a file {listed(MESH_TYPES)}, or leave it out")
+    # Each principal moment of a rigid body is at most the sum of the other two.
+    if 2 * max(link.inertia) > sum(link.inertia) * (1 + 1e-12):
+        table.fault("inertia", "moments of which none exceeds the sum of the other two")
+    table.close()
+    return link
 
 
 def read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
@@ -211,29 +163,17 @@ def read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
         if "safety_of" in top:
             top.fault("safety_of", "leave it out: there is no safety for it to differ from")
         return None
-    table = top.table("safety")
-    common = {limit: _limit(table, limit) for limit in (*JOINT_LIMITS, *_TIMES)}
-    fault_after_s = table.number("fault_after_s", default=Safety.fault_after_s, above=0)
-    on_fault = Safety.on_fault
-    if "on_fault" in table:
-        on_fault = table.choice("on_fault", OnFault) or on_fault
-    table.close()
+
+    safety = read(top.table("safety"), Safety, of=tuple)
     singles = top.table("safety_of")
     of: list[tuple[str, str, float]] = []
     for joint in joints:
         own = singles.table(joint.name)
-        given = ((joint.name, limit, _limit(own, limit)) for limit in JOINT_LIMITS)
-        of += [(name, limit, value) for name, limit, value in given if value is not None]
+        given = [(joint.name, limit, read_field(own, Safety, limit)) for limit in JOINT_LIMITS]
+        of += [one for one in given if one[2] is not None]
         own.close()
     singles.close()
-    return Safety(**common, fault_after_s=fault_after_s, on_fault=on_fault, of=tuple(of))
-
-
-def _limit(table: Table, name: str) -> float | None:
-    """One limit; None where it isn't given."""
-    if name not in table:
-        return None
-    return table.number(name, above=None if name in _ANY_SIGN else 0)
+    return replace(safety, of=tuple(of))
 
 
 _RANGED = (SensorKind.IR, SensorKind.SONAR)
@@ -253,14 +193,12 @@ def read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[
     common = {kind: defaults.table(kind) for kind in SensorKind}
     used: set[SensorKind] = set()
     sensors: list[Sensor] = []
-    for values, where in top.tables("sensors"):
-        kind = Table(values, where, top.faults).choice("kind", SensorKind)
+    for entry in top.tables("sensors"):
+        kind = entry.choice("kind", SensorKind)
         if kind is not None:
             used.add(kind)
-            table = Table(values, where, top.faults, common[kind])
-            table.choice("kind", SensorKind)
+            table = entry.over(common[kind])
             sensors.append(_sensor(table, kind, [link.name for link in links]))
-            table.close()
     for kind, table in common.items():
         if kind in used:
             table.close()
@@ -272,38 +210,37 @@ def read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[
 
 
 def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
-    name, link = table.name("name"), table.text("link")
-    if link and link not in link_names:
-        table.fault("link", listed(link_names, link))
-    position = table.triple("position")
-    rpy = table.triple("rpy", default=(0.0, 0.0, 0.0))
-    range_min = range_max = field_of_view = None
-    axes: tuple[str, ...] = ()
-    fields = ["link", "position", "rpy"]
-    if kind in _RANGED:
-        range_min = table.number("range_min", at_least=0)
-        range_max = table.number("range_max", above=0)
-        if range_min >= range_max:
-            table.fault("range_max", f"more than range_min = {range_min:g}", f"{range_max:g}")
-        field_of_view = table.number("field_of_view", above=0, at_most=6.29)
-        fields += ["range_min", "range_max", "field_of_view"]
-    else:
-        axes = table.words("axes", valid=("x", "y", "z"))
-        if not axes:
+    ranges = ("range_min", "range_max", "field_of_view") if kind in _RANGED else ()
+    fields = ("link", "position", "rpy", *(ranges or ("axes",)))
+
+    def link() -> str:
+        name = table.text("link")
+        if name and name not in link_names:
+            table.fault("link", listed(link_names, name))
+        return name
+
+    def given(name: str) -> Any:
+        return read_required(table, Sensor, name) if name in ranges else None
+
+    def axes() -> tuple[str, ...]:
+        found = table.words("axes", valid=("x", "y", "z")) if not ranges else ()
+        if not ranges and not found:
             table.fault("axes", 'an array of the measured axes, e.g. ["x", "y"]')
-        fields += ["axes"]
-    return Sensor(
-        name=name,
-        kind=kind,
+        return found
+
+    sensor = read_fields(
+        table,
+        Sensor,
         link=link,
-        position=position,
-        rpy=rpy,
-        range_min=range_min,
-        range_max=range_max,
-        field_of_view=field_of_view,
+        range_min=lambda: given("range_min"),
+        range_max=lambda: given("range_max"),
+        field_of_view=lambda: given("field_of_view"),
         axes=axes,
-        assumed=table.words("assumed", valid=fields),
+        assumed=tuple,
     )
+    sensor = replace(sensor, assumed=table.words("assumed", valid=fields))
+    table.close()
+    return sensor
 
 
 _SHELF = Shelf("robot", "undulog.capture.robot", "shipped", RobotFileError)

@@ -10,13 +10,16 @@ forward (out of the head), y left, z up. At zero angle all frames are parallel a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 
 from ..common.arrays import FloatArray, IntArray, frozen
+from ..common.config import Count, Name, NonNegative, Positive
+from ..common.strict_table import NONZERO, above, at_most
 from .safety import Safety
 
 
@@ -64,18 +67,23 @@ class Servo:
         stribeck_speed: v_s, rotor speed over which friction falls from t_s to t_c [rad/s].
     """
 
-    supply_v: float = 6.0
-    stall_torque: float = 1.5
-    torque_constant: float = 1.0
-    proportional_gain: float = 8.0
-    rotor_inertia: float = 1.5e-3
-    viscous_friction: float = 0.005
-    coulomb_friction: float = 0.03
-    gear_stiffness: float = 40.0
-    gear_damping: float = 0.05
-    backlash: float = 0.0
-    static_friction: float = 0.0
-    stribeck_speed: float = 0.05
+    supply_v: Positive = 6.0
+    stall_torque: Positive = 1.5
+    torque_constant: Positive = 1.0
+    proportional_gain: Positive = 8.0
+    rotor_inertia: Positive = 1.5e-3
+    viscous_friction: NonNegative = 0.005
+    coulomb_friction: NonNegative = 0.03
+    gear_stiffness: Positive = 40.0
+    gear_damping: NonNegative = 0.05
+    backlash: NonNegative = 0.0
+    static_friction: NonNegative = 0.0
+    stribeck_speed: Positive = 0.05
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """A rotor at rest withstands no less than a moving one."""
+        if 0 < self.static_friction < self.coulomb_friction:
+            yield "static_friction", f"0, or at least coulomb_friction = {self.coulomb_friction:g}"
 
     @property
     def resistance_ohm(self) -> float:
@@ -103,12 +111,17 @@ class Joint:
         servo: Its servo.
     """
 
-    name: str
+    name: Name
     plane: Plane
     lower: float = -math.pi / 6
     upper: float = math.pi / 6
-    max_velocity: float = 10.0
+    max_velocity: Positive = 10.0
     servo: Servo = field(default_factory=Servo)
+
+    def contradictions(self) -> Iterator[tuple[str, str, str]]:
+        """The upper limit is above the lower one."""
+        if self.lower >= self.upper:
+            yield "upper", f"more than lower = {self.lower:g}", f"{self.upper:g}"
 
 
 @dataclass(frozen=True)
@@ -126,13 +139,13 @@ class Link:
         mesh_scale: Metres in one unit of that file.
     """
 
-    name: str
-    length: float
-    radius: float
-    mass: float
-    inertia: tuple[float, float, float]
+    name: Name
+    length: Positive
+    radius: Positive
+    mass: Positive
+    inertia: Annotated[tuple[float, float, float], above(0.0)]
     mesh: str = ""
-    mesh_scale: float = 1.0
+    mesh_scale: Positive = 1.0
 
 
 @dataclass(frozen=True)
@@ -152,16 +165,22 @@ class Sensor:
         assumed: Names of the fields that were assumed rather than known.
     """
 
-    name: str
+    name: Name
     kind: SensorKind
     link: str
     position: tuple[float, float, float]
-    rpy: tuple[float, float, float]
-    range_min: float | None = None
-    range_max: float | None = None
-    field_of_view: float | None = None
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    range_min: NonNegative | None = None
+    range_max: Positive | None = None
+    field_of_view: Annotated[float, above(0.0), at_most(6.29)] | None = None
     axes: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
+
+    def contradictions(self) -> Iterator[tuple[str, str, str]]:
+        """A range has an extent."""
+        least, most = self.range_min, self.range_max
+        if least is not None and most is not None and least >= most:
+            yield "range_max", f"more than range_min = {least:g}", f"{most:g}"
 
     @property
     def topic(self) -> str:
@@ -224,7 +243,7 @@ class BusSignal:
     target: str
     quantity: Quantity
     unit: str
-    scale: float = 1.0
+    scale: Annotated[float, NONZERO] = 1.0
     offset: float = 0.0
     axis: str = ""
     unknown: int | None = None
@@ -256,7 +275,7 @@ class Bus:
     """
 
     databases: tuple[str, ...]
-    bitrate: int
+    bitrate: Count
     signals: tuple[BusSignal, ...]
     polls: tuple[BusPoll, ...] = ()
 
@@ -281,7 +300,7 @@ class Robot:
         safety: How far it may be driven, or None.
     """
 
-    name: str
+    name: Name
     description: str
     clock: ClockDomain
     links: tuple[Link, ...]

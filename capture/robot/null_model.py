@@ -23,6 +23,7 @@ from typing import Any, cast
 import numpy as np
 
 from ..common.arrays import ComplexArray, FloatArray, frozen
+from ..common.config import Name, NonNegative, Positive, read, read_field, write
 from ..common.errors import Fault, NullModelError
 from ..common.files import read_input, write_text
 from ..common.strict_table import Faults, Table
@@ -41,10 +42,10 @@ class SharedParameter:
         reach: The model holds for abs(x) up to this.
     """
 
-    name: str
+    name: Name
     unit: str
-    value: float
-    reach: float
+    value: Positive
+    reach: Positive
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class NullModel:
     """
 
     robot: str
-    frequency_hz: float
+    frequency_hz: Positive
     joints: tuple[str, ...]
     command: ComplexArray
     parameters: tuple[SharedParameter, ...]
@@ -77,7 +78,7 @@ class NullModel:
     slope: ComplexArray
     curvature: ComplexArray
     modules: Mapping[str, ComplexArray]
-    error: float
+    error: NonNegative
     made_by: str
 
     @property
@@ -130,7 +131,7 @@ def write_null_model(path: Path, model: NullModel) -> None:
             "amplitude_rad": np.abs(model.command).tolist(),
             "phase_rad": np.angle(model.command).tolist(),
         },
-        "parameters": [vars(one) for one in model.parameters],
+        "parameters": [write(one) for one in model.parameters],
         "covariance": model.covariance.tolist(),
         "response": _pair(model.response),
         "slope": _pair(model.slope),
@@ -172,11 +173,11 @@ def read_null_model(path: Path) -> NullModel:
     m = len(joints)
     amplitude = _array(gait, "amplitude_rad", (m,))
     phase = _array(gait, "phase_rad", (m,))
-    parameters = tuple(_parameter(*one, faults) for one in top.tables("parameters"))
+    parameters = tuple(read(one, SharedParameter) for one in top.tables("parameters"))
     k = len(parameters)
     model = NullModel(
-        robot=top.text("robot"),
-        frequency_hz=gait.number("frequency_hz", above=0.0),
+        robot=read_field(top, NullModel, "robot"),
+        frequency_hz=read_field(gait, NullModel, "frequency_hz"),
         joints=joints,
         command=frozen(np.asarray(amplitude * np.exp(1j * phase), dtype=np.complex128)),
         parameters=parameters,
@@ -184,9 +185,9 @@ def read_null_model(path: Path) -> NullModel:
         response=_complex(top, "response", (m,)),
         slope=_complex(top, "slope", (k, m)),
         curvature=_complex(top, "curvature", (k, k, m)),
-        modules=dict(_module(*one, m, faults) for one in top.tables("modules")),
-        error=top.number("error", at_least=0.0),
-        made_by=top.text("made_by"),
+        modules=dict(_module(one, m) for one in top.tables("modules")),
+        error=read_field(top, NullModel, "error"),
+        made_by=read_field(top, NullModel, "made_by"),
     )
     if not model.modules:
         top.fault("modules", "at least one kind of deviation, e.g. stall_torque")
@@ -197,20 +198,7 @@ def read_null_model(path: Path) -> NullModel:
     return model
 
 
-def _parameter(values: dict[str, Any], where: str, faults: Faults) -> SharedParameter:
-    table = Table(values, where, faults)
-    one = SharedParameter(
-        name=table.name("name"),
-        unit=table.text("unit"),
-        value=table.number("value", above=0.0),
-        reach=table.number("reach", above=0.0),
-    )
-    table.close()
-    return one
-
-
-def _module(values: dict[str, Any], where: str, m: int, faults: Faults) -> tuple[str, ComplexArray]:
-    table = Table(values, where, faults)
+def _module(table: Table, m: int) -> tuple[str, ComplexArray]:
     kind, effect = table.name("kind"), _parts(table, (m, m))
     table.close()
     return kind, effect

@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 
 from ..common.arrays import FloatArray, frozen
+from ..common.config import Positive
 
 JOINT_LIMITS = (
     "max_rate",
@@ -50,15 +51,15 @@ class Safety:
         of: Limits that single joints have otherwise: joint, limit, value.
     """
 
-    max_rate: float | None = None
-    ramp_rate: float | None = None
-    max_tracking_error: float | None = None
-    max_current: float | None = None
+    max_rate: Positive | None = None
+    ramp_rate: Positive | None = None
+    max_tracking_error: Positive | None = None
+    max_current: Positive | None = None
     max_temperature: float | None = None
-    min_voltage: float | None = None
-    reply_timeout_s: float | None = None
-    max_late_s: float | None = None
-    fault_after_s: float = 0.3
+    min_voltage: Positive | None = None
+    reply_timeout_s: Positive | None = None
+    max_late_s: Positive | None = None
+    fault_after_s: Positive = 0.3
     on_fault: OnFault = OnFault.RAMP_DOWN
     of: tuple[tuple[str, str, float], ...] = ()
 

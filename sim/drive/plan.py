@@ -49,10 +49,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from undulog.capture.common.config import Name, NonNegative, read_field
 from undulog.capture.common.errors import Fault, PlanError
 from undulog.capture.common.files import is_file
 from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
@@ -61,9 +61,9 @@ from undulog.capture.robot.model import Plane, Robot
 from ..gait.contract import WALK, GaitTick, Readings
 from ..gait.rhythm import Change, IntegratedPhase, Swing, started
 from ..gait.serpentine import Serpentine
-from ..gait.wave import PlaneGait, Wave, WaveGenerator
+from ..gait.wave import PlaneGait, WaveGenerator
 from ..scenario.gaits_toml import read_gait
-from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from ..scenario.scenario import LONGEST_S, Length, Scenario
 from ..scenario.scenario_file import load_scenario, scenario_names
 
 
@@ -78,9 +78,9 @@ class Segment:
         mode: One word for what it is about.
     """
 
-    duration_s: float
+    duration_s: Length
     planes: Mapping[Plane, PlaneGait]
-    transition_s: float = 1.0
+    transition_s: NonNegative = 1.0
     mode: str = WALK
 
 
@@ -97,7 +97,7 @@ class Plan:
         segments: At least one; all have the planes of ``start``.
     """
 
-    name: str
+    name: Name
     description: str
     scenario: Scenario
     start: Mapping[Plane, PlaneGait]
@@ -179,9 +179,6 @@ def _starts(plan: Plan) -> list[float]:
     return [0.0, *accumulate(segment.duration_s for segment in plan.segments[:-1])]
 
 
-_HIGHEST_HZ = CONTROL_RATE_HZ / 4
-
-
 def is_plan(text: str) -> bool:
     """Whether TOML text is a plan rather than a scenario.
 
@@ -218,8 +215,8 @@ def parse_plan(text: str, source: Path) -> Plan:
     faults = Faults()
     top = Table(values, "", faults)
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "plan"
-    name = top.name("name") if "name" in top else stem
-    description = top.text("description")
+    name: str = read_field(top, Plan, "name", stem)
+    description: str = read_field(top, Plan, "description")
     scenario = _scenario(top, source.parent)
     start, ramp_s = _start(top, scenario)
     segments = _segments(top, start)
@@ -247,7 +244,7 @@ def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait
     robot = scenario.robot if scenario is not None else None
     given = "gait" in top
     if given:
-        gait = read_gait(top.table("gait"), robot, max_frequency_hz=_HIGHEST_HZ)
+        gait = read_gait(top.table("gait"), robot)
     elif scenario is not None:
         gait = scenario.gait
     else:
@@ -260,9 +257,8 @@ def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait
 
 def _segments(top: Table, start: Mapping[Plane, PlaneGait]) -> tuple[Segment, ...]:
     segments: list[Segment] = []
-    for values, where in top.tables("segments"):
+    for table in top.tables("segments"):
         planes = segments[-1].planes if segments else start
-        table = Table(values, where, top.faults)
         segments.append(_segment(table, planes))
         table.close()
     if not segments:
@@ -273,9 +269,9 @@ def _segments(top: Table, start: Mapping[Plane, PlaneGait]) -> tuple[Segment, ..
 
 
 def _segment(table: Table, before: Mapping[Plane, PlaneGait]) -> Segment:
-    duration_s = table.number("duration_s", at_least=1 / CONTROL_RATE_HZ, at_most=LONGEST_S)
+    duration_s: float = read_field(table, Segment, "duration_s")
     shorter = min(Segment.transition_s, duration_s)
-    transition_s = table.number("transition_s", default=shorter, at_least=0.0)
+    transition_s: float = read_field(table, Segment, "transition_s", shorter)
     if transition_s > duration_s:
         table.fault("transition_s", f"at most the segment's duration_s = {duration_s:g}")
     planes = dict(before)
@@ -289,7 +285,7 @@ def _segment(table: Table, before: Mapping[Plane, PlaneGait]) -> Segment:
         part = table.table(plane)
         planes[plane] = _changed(part, before[plane])
         part.close()
-    mode = table.text("mode", WALK)
+    mode: str = read_field(table, Segment, "mode")
     if not mode.strip():
         table.fault("mode", "a word, e.g. walk")
     return Segment(duration_s, planes, transition_s, mode)
@@ -297,14 +293,6 @@ def _segment(table: Table, before: Mapping[Plane, PlaneGait]) -> Segment:
 
 def _changed(part: Table, before: PlaneGait) -> PlaneGait:
     """A plane's values after a change."""
-    values: dict[str, Any] = {
-        "amplitude": part.number("amplitude", default=before.amplitude, at_least=0.0),
-        "frequency_hz": part.number(
-            "frequency_hz", default=before.frequency_hz, above=0.0, at_most=_HIGHEST_HZ
-        ),
-        "lag": part.number("lag", default=before.lag, at_least=0.0),
-        "offset": part.number("offset", default=before.offset),
-    }
-    if "wave" in part:
-        values["wave"] = part.choice("wave", Wave) or before.wave
-    return dataclasses.replace(before, **values)
+    names = ("amplitude", "frequency_hz", "lag", "offset", "wave")
+    after = {name: read_field(part, PlaneGait, name, getattr(before, name)) for name in names}
+    return dataclasses.replace(before, **after)

@@ -56,6 +56,9 @@ class Readings:
         return cls(unknown, unknown)
 
 
+CONTROL_RATE_HZ = 100
+"""Rate of control and log."""
+
 WALK = "walk"
 """The mode of a gait that only goes on."""
 

@@ -18,15 +18,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.config import NonNegative
+from undulog.capture.common.strict_table import at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
 from .contract import Readings
 from .rhythm import Change, IntegratedPhase, Swing, started
-from .wave import Wave, WaveGenerator
+from .wave import Frequency, Wave, WaveGenerator
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,9 @@ class DelayLine:
         phase: Phase of the master at the start [rad].
     """
 
-    amplitude: float
-    frequency_hz: float
-    delay_s: float
+    amplitude: NonNegative
+    frequency_hz: Frequency
+    delay_s: Annotated[float, at_least(0.0), at_most(10.0)]
     wave: Wave = Wave.HEAD_TO_TAIL
     offset: float = 0.0
     phase: float = 0.0
@@ -73,7 +76,7 @@ class DelayBlocks:
     """
 
     planes: dict[Plane, DelayLine] = field(default_factory=dict[Plane, DelayLine])
-    ramp_s: float = 2.0
+    ramp_s: NonNegative = 2.0
 
 
 class DelayBlockGait(WaveGenerator):

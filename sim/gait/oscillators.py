@@ -20,16 +20,19 @@ random amount, and the way back shows the coupling.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.config import NonNegative
+from undulog.capture.common.strict_table import above, at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
-from .contract import Readings
+from .contract import CONTROL_RATE_HZ, Readings
 from .coupled import Coupling, HopfOscillators, PhaseOscillators
 from .coupled import Oscillators as OscillatorState
 from .rhythm import Change, IntegratedPhase, Swing
@@ -80,8 +83,13 @@ class Approach:
         self._target = target
 
 
-Numbers: TypeAlias = "float | tuple[float, ...]"
+_STRONGEST = float(CONTROL_RATE_HZ)
+"""Greatest coupling, feedback and rate of an oscillator [1/s]."""
+
+Numbers: TypeAlias = float | tuple[float, ...]
 """One number for all, or one for each."""
+Rates: TypeAlias = Annotated[Numbers, at_least(-_STRONGEST), at_most(_STRONGEST)]
+PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
 
 
 _KICK_SEED = 1
@@ -118,16 +126,21 @@ class OscillatorChain(PlaneGait):
     """
 
     oscillator: OscillatorKind = OscillatorKind.PHASE
-    forward: Numbers = 5.0
-    backward: Numbers = 5.0
-    detuning: Numbers = 0.0
+    forward: Rates = 5.0
+    backward: Rates = 5.0
+    detuning: Rates = 0.0
     start_phase: Numbers = 0.0
-    approach_rate: float = 4.0
-    attraction: float = 5.0
-    feedback: float = 0.0
+    approach_rate: PositiveRate = 4.0
+    attraction: PositiveRate = 5.0
+    feedback: Annotated[float, at_least(0.0), at_most(_STRONGEST)] = 0.0
     feedback_bias: Numbers = 0.0
-    kick_every_s: float = 0.0
-    kick_size: float = 0.0
+    kick_every_s: NonNegative = 0.0
+    kick_size: NonNegative = 0.0
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Feedback is measured against an amplitude."""
+        if self.feedback > 0.0 and self.amplitude == 0.0:
+            yield "amplitude", "> 0 with feedback, which is measured against it"
 
 
 @dataclass(frozen=True)

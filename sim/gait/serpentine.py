@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from undulog.capture.common.config import NonNegative
 from undulog.capture.robot.model import Plane, Robot
 
 from .contract import Readings
@@ -24,7 +25,7 @@ class Serpentine:
     """
 
     planes: dict[Plane, PlaneGait] = field(default_factory=dict[Plane, PlaneGait])
-    ramp_s: float = 2.0
+    ramp_s: NonNegative = 2.0
 
 
 class SerpentineGait(WaveGenerator):

@@ -6,14 +6,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.config import NonNegative
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.strict_table import above, at_most
 from undulog.capture.robot.model import Plane, Robot
 
-from .contract import WALK, GaitTick, Modulation, Readings
+from .contract import CONTROL_RATE_HZ, WALK, GaitTick, Modulation, Readings
 from .rhythm import Change, Rhythm, within_limits
 
 
@@ -22,6 +25,10 @@ class Wave(StrEnum):
 
     HEAD_TO_TAIL = "head-to-tail"
     TAIL_TO_HEAD = "tail-to-head"
+
+
+Frequency: TypeAlias = Annotated[float, above(0.0), at_most(CONTROL_RATE_HZ / 4)]
+"""A frequency that the control rate can carry [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +44,9 @@ class PlaneGait:
         phase: phi_0, the phase of the plane's first joint at the start [rad].
     """
 
-    amplitude: float
-    frequency_hz: float
-    lag: float
+    amplitude: NonNegative
+    frequency_hz: Frequency
+    lag: NonNegative
     wave: Wave = Wave.HEAD_TO_TAIL
     offset: float = 0.0
     phase: float = 0.0

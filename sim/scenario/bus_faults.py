@@ -24,8 +24,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
+from undulog.capture.common.config import NonNegative, Positive, read_field
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.strict_table import Table, listed
+from undulog.capture.common.strict_table import Table, above, at_most, listed
 from undulog.capture.robot.model import Robot
 
 
@@ -83,8 +84,8 @@ class BusFault:
     kind: FaultKind
     joint: str = ""
     value: float = 0.0
-    from_s: float = 0.0
-    for_s: float = math.inf
+    from_s: NonNegative = 0.0
+    for_s: Positive = math.inf
 
     def acts(self, time_s: float) -> bool:
         """Whether it acts.
@@ -119,8 +120,7 @@ def read_faults(top: Table, robot: Robot | None) -> tuple[BusFault, ...]:
         The faults, without those that are wrong.
     """
     found: list[BusFault] = []
-    for values, where in top.tables("faults"):
-        table = Table(values, where, top.faults)
+    for table in top.tables("faults"):
         kind = table.choice("kind", FaultKind)
         if kind is not None:
             found.append(_read(table, kind, robot))
@@ -138,12 +138,16 @@ def _read(table: Table, kind: FaultKind, robot: Robot | None) -> BusFault:
         if robot is not None and joint not in robot.joint_names:
             table.fault("joint", listed(robot.joint_names, joint))
     if grammar.value is not None:
-        value = table.number("value", above=0.0, at_most=grammar.value[1])
+        value = table.number("value", above(0.0), at_most(grammar.value[1]))
     elif "value" in table:
         table.fault("value", f"leave it out: {kind} has no number")
-    from_s = table.number("from_s", default=0.0, at_least=0.0)
-    for_s = table.number("for_s", above=0.0) if "for_s" in table else math.inf
-    return BusFault(kind, joint, value, from_s, for_s)
+    return BusFault(
+        kind,
+        joint,
+        value,
+        from_s=read_field(table, BusFault, "from_s"),
+        for_s=read_field(table, BusFault, "for_s"),
+    )
 
 
 def parse_faults(texts: Iterable[str], robot: Robot) -> tuple[BusFault, ...]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
-from undulog.capture.common.strict_table import Table
+from undulog.capture.common.config import NonNegative, Positive, read
+from undulog.capture.common.strict_table import Table, at_least, at_most
 from undulog.capture.robot.model import Plane, Robot, SensorKind
 
 from .sensor_layout import Layout, layout
+
+Share: TypeAlias = Annotated[float, at_least(0.0), at_most(1.0)]
 
 
 class ControllerKind(StrEnum):
@@ -38,9 +41,9 @@ class Calibration:
         turn_radius_m: Of the turn with the course's largest offset [m].
     """
 
-    slip_ratio: float = 50.0
-    turn_gain: float = 1.6
-    turn_radius_m: float = 0.42
+    slip_ratio: Positive = 50.0
+    turn_gain: NonNegative = 1.6
+    turn_radius_m: NonNegative = 0.42
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,8 @@ class Lookout:
         memory_s: How long an echo is kept [s]: a gait period, so that the head has swung once.
     """
 
-    half_width_m: float = 0.3
-    memory_s: float = 2.0
+    half_width_m: Positive = 0.3
+    memory_s: NonNegative = 2.0
 
 
 @dataclass(frozen=True)
@@ -69,12 +72,12 @@ class HeadSteering:
         filter_s: Time constant of the offset [s].
     """
 
-    f0: float = 0.22
-    k: float = 2.0
-    range_m: float = 1.0
-    margin_m: float = 0.05
-    hold_s: float = 1.0
-    filter_s: float = 0.25
+    f0: NonNegative = 0.22
+    k: NonNegative = 2.0
+    range_m: NonNegative = 1.0
+    margin_m: NonNegative = 0.05
+    hold_s: NonNegative = 1.0
+    filter_s: NonNegative = 0.25
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,9 @@ class SideShrinking:
         filter_s: Time constant of the amplitude [s].
     """
 
-    smallest: float = 0.3
-    k: float = 3.0
-    filter_s: float = 0.5
+    smallest: Share = 0.3
+    k: NonNegative = 3.0
+    filter_s: NonNegative = 0.5
 
 
 @dataclass(frozen=True)
@@ -103,10 +106,10 @@ class TailHaste:
         filter_s: Time constant of omega [s].
     """
 
-    gain: float = 0.5
-    k: float = 2.0
-    range_m: float = 0.4
-    filter_s: float = 0.25
+    gain: Share = 0.5
+    k: NonNegative = 2.0
+    range_m: NonNegative = 0.4
+    filter_s: NonNegative = 0.25
 
 
 @dataclass(frozen=True)
@@ -119,9 +122,14 @@ class RandomTurns:
         longest_s: Longest time [s].
     """
 
-    largest: float = 0.15
-    shortest_s: float = 2.0
-    longest_s: float = 6.0
+    largest: NonNegative = 0.15
+    shortest_s: Positive = 2.0
+    longest_s: Positive = 6.0
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """The longest time is no shorter than the shortest one."""
+        if self.longest_s < self.shortest_s:
+            yield "longest_s", f"at least shortest_s = {self.shortest_s:g}"
 
 
 @dataclass(frozen=True)
@@ -134,9 +142,9 @@ class TargetHeading:
         filter_s: Time constant with which the compass puts the reckoned heading right [s].
     """
 
-    gain: float = 0.35
-    largest: float = 0.2
-    filter_s: float = 2.0
+    gain: NonNegative = 0.35
+    largest: NonNegative = 0.2
+    filter_s: NonNegative = 2.0
 
 
 @dataclass(frozen=True)
@@ -155,7 +163,7 @@ class Controller:
     """
 
     kind: ControllerKind
-    near_hold_s: float = 1.0
+    near_hold_s: NonNegative = 1.0
     calibration: Calibration = Calibration()
     lookout: Lookout = Lookout()
     head: HeadSteering = HeadSteering()
@@ -164,7 +172,13 @@ class Controller:
     course: RandomTurns | TargetHeading | None = None
 
 
-_WITH_SIDES = (ControllerKind.CORRIDOR, ControllerKind.AVOIDANCE)
+_PARTS: dict[ControllerKind, dict[str, type[Any]]] = {
+    ControllerKind.RANDOM_WALK: {"course": RandomTurns},
+    ControllerKind.TARGET_FOLLOWING: {"course": TargetHeading},
+    ControllerKind.CORRIDOR: {"side": SideShrinking},
+    ControllerKind.AVOIDANCE: {"side": SideShrinking, "tail": TailHaste},
+}
+"""What the kinds have beside what all have."""
 
 
 def read_controller(
@@ -190,31 +204,18 @@ def read_controller(
         table.fault("kind", "a [world.target] to follow")
     if robot is not None:
         _check(table, kind, robot, layout(robot))
-    controller = Controller(
-        kind=kind,
-        near_hold_s=table.number("near_hold_s", default=Controller.near_hold_s, at_least=0.0),
-        calibration=_calibration(table.table("calibration")),
-        lookout=_lookout(table.table("lookout")),
-        head=_head(table.table("head")),
-        side=_side(table.table("side")) if kind in _WITH_SIDES else None,
-        tail=_tail(table.table("tail")) if kind is ControllerKind.AVOIDANCE else None,
-        course=_course(table, kind),
+
+    def part(name: str) -> Any:
+        return read(table.table(name), _PARTS[kind][name]) if name in _PARTS[kind] else None
+
+    return read(
+        table,
+        Controller,
+        kind=lambda: kind,
+        side=lambda: part("side"),
+        tail=lambda: part("tail"),
+        course=lambda: part("course"),
     )
-    table.close()
-    return controller
-
-
-def controller_table(controller: Controller) -> dict[str, Any]:
-    """A controller as the table that :func:`read_controller` reads.
-
-    Args:
-        controller: The controller.
-
-    Returns:
-        Values for TOML, every one written out.
-    """
-    values = dataclasses.asdict(controller)
-    return {key: value for key, value in values.items() if value is not None}
 
 
 def _check(table: Table, kind: ControllerKind, robot: Robot, roles: Layout) -> None:
@@ -222,9 +223,9 @@ def _check(table: Table, kind: ControllerKind, robot: Robot, roles: Layout) -> N
     missing: list[str] = []
     if not roles.head:
         missing.append("a range sensor that looks ahead from its first link")
-    if kind in _WITH_SIDES and not roles.sides:
+    if "side" in _PARTS[kind] and not roles.sides:
         missing.append("a range sensor that looks sideways")
-    if kind is ControllerKind.AVOIDANCE and not roles.tail:
+    if "tail" in _PARTS[kind] and not roles.tail:
         missing.append("a range sensor on its last link")
     compasses = [one for one in robot.sensors if one.kind is SensorKind.COMPASS]
     on_head = [one for one in compasses if one.link == robot.links[0].name]
@@ -234,84 +235,3 @@ def _check(table: Table, kind: ControllerKind, robot: Robot, roles: Layout) -> N
         missing.append("horizontal joints")
     if missing:
         table.fault("kind", f"a robot with {' and '.join(missing)}; {robot.name} has none")
-
-
-def _calibration(table: Table) -> Calibration:
-    default = Calibration
-    calibration = Calibration(
-        slip_ratio=table.number("slip_ratio", default=default.slip_ratio, above=0.0),
-        turn_gain=table.number("turn_gain", default=default.turn_gain, at_least=0.0),
-        turn_radius_m=table.number("turn_radius_m", default=default.turn_radius_m, at_least=0.0),
-    )
-    table.close()
-    return calibration
-
-
-def _lookout(table: Table) -> Lookout:
-    lookout = Lookout(
-        half_width_m=table.number("half_width_m", default=Lookout.half_width_m, above=0.0),
-        memory_s=table.number("memory_s", default=Lookout.memory_s, at_least=0.0),
-    )
-    table.close()
-    return lookout
-
-
-def _head(table: Table) -> HeadSteering:
-    default = HeadSteering
-    head = HeadSteering(
-        f0=table.number("f0", default=default.f0, at_least=0.0),
-        k=table.number("k", default=default.k, at_least=0.0),
-        range_m=table.number("range_m", default=default.range_m, at_least=0.0),
-        margin_m=table.number("margin_m", default=default.margin_m, at_least=0.0),
-        hold_s=table.number("hold_s", default=default.hold_s, at_least=0.0),
-        filter_s=table.number("filter_s", default=default.filter_s, at_least=0.0),
-    )
-    table.close()
-    return head
-
-
-def _side(table: Table) -> SideShrinking:
-    default = SideShrinking
-    side = SideShrinking(
-        smallest=table.number("smallest", default=default.smallest, at_least=0.0, at_most=1.0),
-        k=table.number("k", default=default.k, at_least=0.0),
-        filter_s=table.number("filter_s", default=default.filter_s, at_least=0.0),
-    )
-    table.close()
-    return side
-
-
-def _tail(table: Table) -> TailHaste:
-    default = TailHaste
-    tail = TailHaste(
-        gain=table.number("gain", default=default.gain, at_least=0.0, at_most=1.0),
-        k=table.number("k", default=default.k, at_least=0.0),
-        range_m=table.number("range_m", default=default.range_m, at_least=0.0),
-        filter_s=table.number("filter_s", default=default.filter_s, at_least=0.0),
-    )
-    table.close()
-    return tail
-
-
-def _course(table: Table, kind: ControllerKind) -> RandomTurns | TargetHeading | None:
-    if kind is ControllerKind.RANDOM_WALK:
-        part, default = table.table("course"), RandomTurns
-        turns = RandomTurns(
-            largest=part.number("largest", default=default.largest, at_least=0.0),
-            shortest_s=part.number("shortest_s", default=default.shortest_s, above=0.0),
-            longest_s=part.number("longest_s", default=default.longest_s, above=0.0),
-        )
-        if turns.longest_s < turns.shortest_s:
-            part.fault("longest_s", f"at least shortest_s = {turns.shortest_s:g}")
-        part.close()
-        return turns
-    if kind is ControllerKind.TARGET_FOLLOWING:
-        part, default = table.table("course"), TargetHeading
-        heading = TargetHeading(
-            gain=part.number("gain", default=default.gain, at_least=0.0),
-            largest=part.number("largest", default=default.largest, at_least=0.0),
-            filter_s=part.number("filter_s", default=default.filter_s, at_least=0.0),
-        )
-        part.close()
-        return heading
-    return None

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.config import Count, NonNegative, Positive
+from undulog.capture.common.strict_table import at_least
 
-from .obstacles import Cylinder, Obstacle, Target, columns, into_axes, to_circles, to_rectangles
+from .obstacles import (
+    Cylinder,
+    Obstacle,
+    PositivePair,
+    Target,
+    columns,
+    into_axes,
+    to_circles,
+    to_rectangles,
+)
+
+Seed: TypeAlias = Annotated[int, at_least(0)]
 
 STREAM = 2
 """Number of the random stream that places and radii are drawn from."""
@@ -33,14 +47,20 @@ class RandomField:
         seed: Of places and radii; the scenario's if None.
     """
 
-    count: int
-    size: tuple[float, float]
+    count: Count
+    size: PositivePair
     centre: tuple[float, float] = (0.0, 0.0)
-    radius: tuple[float, float] = (0.05, 0.15)
-    height: float = 0.3
-    clear: float = 0.3
-    gap: float = 0.2
-    seed: int | None = None
+    radius: PositivePair = (0.05, 0.15)
+    height: Positive = 0.3
+    clear: NonNegative = 0.3
+    gap: NonNegative = 0.2
+    seed: Seed | None = None
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """The least radius is no greater than the greatest one."""
+        least, greatest = self.radius
+        if least > greatest:
+            yield "radius", "[least, greatest]"
 
     def cylinders(
         self,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Any, TypeVar, cast
+from typing import Any, TypeAlias, cast
 
+from undulog.capture.common.config import Declared, declared, read, read_fields, write
 from undulog.capture.common.strict_table import Table
 from undulog.capture.robot.model import Plane, Robot
 
@@ -14,15 +14,7 @@ from ..gait.build import GaitParameters
 from ..gait.delay_blocks import DelayBlocks, DelayLine
 from ..gait.oscillators import Numbers, OscillatorChain, OscillatorChains, OscillatorKind
 from ..gait.serpentine import Serpentine
-from ..gait.wave import PlaneGait, Wave
-
-_Part = TypeVar("_Part")
-
-LONGEST_DELAY_S = 10.0
-"""Longest delay from one joint to the next."""
-
-STRONGEST = 100.0
-"""Greatest coupling, feedback and rate of an oscillator [1/s]: the control rate."""
+from ..gait.wave import PlaneGait
 
 
 class GaitKind(StrEnum):
@@ -33,32 +25,35 @@ class GaitKind(StrEnum):
     OSCILLATORS = "oscillators"
 
 
-def read_gait(table: Table, robot: Robot | None, *, max_frequency_hz: float) -> GaitParameters:
+PlaneParameters: TypeAlias = PlaneGait | DelayLine | OscillatorChain
+_KINDS: dict[GaitKind, tuple[type[GaitParameters], type[PlaneParameters]]] = {
+    GaitKind.SERPENTINE: (Serpentine, PlaneGait),
+    GaitKind.DELAY_BLOCKS: (DelayBlocks, DelayLine),
+    GaitKind.OSCILLATORS: (OscillatorChains, OscillatorChain),
+}
+
+
+def read_gait(table: Table, robot: Robot | None) -> GaitParameters:
     """Read the gait; faults are noted in the table.
 
     Args:
         table: The table ``[gait]``.
         robot: Who is to do it; None where that is a fault already.
-        max_frequency_hz: What the control rate can carry.
 
     Returns:
         The parameters; of use only if no fault was noted.
     """
-    kind = table.choice("kind", GaitKind) if "kind" in table else GaitKind.SERPENTINE
-    if kind is GaitKind.OSCILLATORS:
-        chains = _planes(table, robot, _oscillator_chain, max_frequency_hz)
-        table.close()
-        return OscillatorChains(chains)
-    ramp_s = table.number("ramp_s", default=Serpentine.ramp_s, at_least=0.0)
-    if kind is GaitKind.DELAY_BLOCKS:
-        lines = _planes(table, robot, _delay_line, max_frequency_hz)
-        table.close()
-        return DelayBlocks(lines, ramp_s)
-    if kind is None:  # a fault already, and no way to tell which keys belong here
-        return Serpentine({}, ramp_s)
-    waves = _planes(table, robot, _plane_gait, max_frequency_hz)
-    table.close()
-    return Serpentine(waves, ramp_s)
+    kind = table.choice("kind", GaitKind, GaitKind.SERPENTINE)
+    if kind is None:  # no way to tell which keys belong here
+        return read_fields(table, Serpentine, planes=dict)
+    gait, part = _KINDS[kind]
+
+    def plane(part_table: Table, count: int | None) -> PlaneParameters:
+        if part is OscillatorChain:
+            return _oscillator_chain(part_table, count)
+        return read(part_table, part)
+
+    return read(table, gait, planes=lambda: _planes(table, robot, plane))
 
 
 def gait_table(parameters: GaitParameters) -> dict[str, Any]:
@@ -70,15 +65,12 @@ def gait_table(parameters: GaitParameters) -> dict[str, Any]:
     Returns:
         Keys and values, every one written out.
     """
-    values: dict[str, Any] = {}
-    if isinstance(parameters, OscillatorChains):
-        values["kind"] = GaitKind.OSCILLATORS
-    else:
-        delayed = isinstance(parameters, DelayBlocks)
-        values["kind"] = GaitKind.DELAY_BLOCKS if delayed else GaitKind.SERPENTINE
-        values["ramp_s"] = parameters.ramp_s
+    values = write(parameters)
+    del values["planes"]
+    kind = next(kind for kind, (gait, _) in _KINDS.items() if isinstance(parameters, gait))
+    values = {"kind": kind, **values}
     for plane, one in parameters.planes.items():
-        part = values[str(plane)] = dataclasses.asdict(one)
+        part = values[str(plane)] = write(one)
         if part.get("oscillator") is OscillatorKind.PHASE:
             del part["attraction"]  # which only Hopf oscillators have
     return values
@@ -87,18 +79,15 @@ def gait_table(parameters: GaitParameters) -> dict[str, Any]:
 def _planes(
     table: Table,
     robot: Robot | None,
-    read: Callable[[Table, float, int | None], _Part],
-    max_frequency_hz: float,
-) -> dict[Plane, _Part]:
+    read_plane: Callable[[Table, int | None], PlaneParameters],
+) -> dict[Plane, PlaneParameters]:
     """The driven planes."""
-    planes: dict[Plane, _Part] = {}
+    planes: dict[Plane, PlaneParameters] = {}
     for plane in Plane:
         if plane not in table:
             continue
         count = None if robot is None else len(robot.joint_indices(plane))
-        part = table.table(plane)
-        planes[plane] = read(part, max_frequency_hz, count)
-        part.close()
+        planes[plane] = read_plane(table.table(plane), count)
         if robot is not None and not count:
             table.fault(plane, f"leave it out: {robot.name} has no {plane} joints")
     if not planes:
@@ -106,72 +95,35 @@ def _planes(
     return planes
 
 
-def _common(part: Table, max_frequency_hz: float) -> dict[str, Any]:
-    """What every kind of plane has."""
-    wave = part.choice("wave", Wave) if "wave" in part else None
-    return {
-        "amplitude": part.number("amplitude", at_least=0.0),
-        "frequency_hz": part.number("frequency_hz", above=0.0, at_most=max_frequency_hz),
-        "wave": wave or Wave.HEAD_TO_TAIL,
-        "offset": part.number("offset", default=0.0),
-        "phase": part.number("phase", default=0.0),
-    }
+def _oscillator_chain(part: Table, count: int | None) -> OscillatorChain:
+    def numbers(name: str, number: int | None) -> Callable[[], Numbers]:
+        return lambda: _numbers(part, declared(OscillatorChain)[name], number)
 
-
-def _plane_gait(part: Table, max_frequency_hz: float, _: int | None) -> PlaneGait:
-    return PlaneGait(**_common(part, max_frequency_hz), lag=part.number("lag", at_least=0.0))
-
-
-def _delay_line(part: Table, max_frequency_hz: float, _: int | None) -> DelayLine:
-    delay_s = part.number("delay_s", at_least=0.0, at_most=LONGEST_DELAY_S)
-    return DelayLine(**_common(part, max_frequency_hz), delay_s=delay_s)
-
-
-def _oscillator_chain(part: Table, max_frequency_hz: float, count: int | None) -> OscillatorChain:
-    default = OscillatorChain
-    kind = part.choice("oscillator", OscillatorKind) if "oscillator" in part else default.oscillator
     pairs = None if count is None else count - 1
-    attraction = default.attraction
-    if "attraction" in part:
-        attraction = part.number("attraction", above=0.0, at_most=STRONGEST)
-        if kind is OscillatorKind.PHASE:
-            part.fault("attraction", "leave it out: phase oscillators have no radius to attract")
-    chain = OscillatorChain(
-        **_common(part, max_frequency_hz),
-        lag=part.number("lag", at_least=0.0),
-        oscillator=kind or default.oscillator,
-        forward=_numbers(part, "forward", pairs, default.forward, most=STRONGEST),
-        backward=_numbers(part, "backward", pairs, default.backward, most=STRONGEST),
-        detuning=_numbers(part, "detuning", count, default.detuning, most=STRONGEST),
-        start_phase=_numbers(part, "start_phase", count, default.start_phase),
-        approach_rate=part.number(
-            "approach_rate", default=default.approach_rate, above=0.0, at_most=STRONGEST
-        ),
-        attraction=attraction,
-        feedback=part.number("feedback", default=default.feedback, at_least=0.0, at_most=STRONGEST),
-        feedback_bias=_numbers(part, "feedback_bias", count, default.feedback_bias),
-        kick_every_s=part.number("kick_every_s", default=default.kick_every_s, at_least=0.0),
-        kick_size=part.number("kick_size", default=default.kick_size, at_least=0.0),
+    chain = read_fields(
+        part,
+        OscillatorChain,
+        forward=numbers("forward", pairs),
+        backward=numbers("backward", pairs),
+        detuning=numbers("detuning", count),
+        start_phase=numbers("start_phase", count),
+        feedback_bias=numbers("feedback_bias", count),
     )
-    if chain.feedback > 0.0 and chain.amplitude == 0.0:
-        part.fault("amplitude", "> 0 with feedback, which is measured against it")
+    if chain.oscillator is OscillatorKind.PHASE and "attraction" in part:
+        part.fault("attraction", "leave it out: phase oscillators have no radius to attract")
+    part.close()
     return chain
 
 
-def _numbers(
-    part: Table, key: str, count: int | None, default: Numbers, *, most: float | None = None
-) -> Numbers:
+def _numbers(part: Table, one: Declared, count: int | None) -> Numbers:
     """One number, or an array of ``count``."""
-    value = part.look(key)[1]
-    least = None if most is None else -most
-    if value is None:
-        return default
+    value = part.look(one.key)[1]
     if not isinstance(value, list):
-        return part.number(key, at_least=least, at_most=most)
+        return part.number(one.key, *one.bounds, default=one.default)
     entries = cast("list[object]", value)
     if count is not None and len(entries) != count:
-        part.fault(key, f"a number, or an array of {count}", f"an array of {len(entries)}")
-        return default
-    names = [f"{part.key(key)}[{i}]" for i in range(len(entries))]
-    listed = Table(dict(zip(names, entries, strict=True)), "", part.faults)
-    return tuple(listed.number(name, at_least=least, at_most=most) for name in names)
+        part.fault(one.key, f"a number, or an array of {count}", f"an array of {len(entries)}")
+        return one.default
+    each = {f"{part.key(one.key)}[{i}]": entry for i, entry in enumerate(entries)}
+    listed = Table(each, "", part.faults)
+    return tuple(listed.number(name, *one.bounds) for name in each)

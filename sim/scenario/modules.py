@@ -11,8 +11,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TypeAlias
 
-from undulog.capture.common.strict_table import Table
-from undulog.capture.robot.model import MAY_BE_ZERO, Robot, Servo
+from undulog.capture.common.config import read_field
+from undulog.capture.common.strict_table import Table, above
+from undulog.capture.robot.model import Robot, Servo
 
 Fields: TypeAlias = Mapping[str, float]
 """Parameter name to value."""
@@ -110,21 +111,13 @@ def _check_rest(top: Table, robot: Robot) -> None:
 
 def _servo_fields(table: Table) -> dict[str, float]:
     """The servo parameters that a table gives."""
-    given: dict[str, float] = {}
-    for item in dataclasses.fields(Servo):
-        if item.name not in table:
-            table.number(item.name, default=0.0)  # asked for, so that a slip of it is recognised
-        elif item.name in MAY_BE_ZERO:
-            given[item.name] = table.number(item.name, at_least=0.0)
-        else:
-            given[item.name] = table.number(item.name, above=0.0)
+    names = [item.name for item in dataclasses.fields(Servo) if item.name in table]
+    given = {name: read_field(table, Servo, name) for name in names}
     table.close()
     return given
 
 
 def _link_fields(table: Table) -> dict[str, float]:
-    given: dict[str, float] = {}
-    if MASS_FACTOR in table:
-        given[MASS_FACTOR] = table.number(MASS_FACTOR, above=0.0)
+    given = {MASS_FACTOR: table.number(MASS_FACTOR, above(0.0))} if MASS_FACTOR in table else {}
     table.close()
     return given

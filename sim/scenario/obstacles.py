@@ -12,16 +12,20 @@ s from -1 to 1. All arrays are over p pairs of a segment and a shape, the compon
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, frozen
+from undulog.capture.common.config import Key, NonNegative, Positive
+from undulog.capture.common.strict_table import above
 
 _TINY = 1e-300
 """Makes 0/0 a zero."""
+
+PositivePair: TypeAlias = Annotated[tuple[float, float], above(0.0)]
 
 
 class Closest(NamedTuple):
@@ -173,8 +177,8 @@ class Cylinder:
     """
 
     position: tuple[float, float]
-    radius: float
-    height: float = 0.3
+    radius: Positive
+    height: Positive = 0.3
 
 
 @dataclass(frozen=True)
@@ -189,9 +193,9 @@ class Box:
     """
 
     position: tuple[float, float]
-    size: tuple[float, float]
+    size: PositivePair
     heading: float = 0.0
-    height: float = 0.3
+    height: Positive = 0.3
 
 
 @dataclass(frozen=True)
@@ -205,10 +209,15 @@ class Wall:
         height: [m].
     """
 
-    start: tuple[float, float]
-    end: tuple[float, float]
-    thickness: float = 0.02
-    height: float = 0.3
+    start: Annotated[tuple[float, float], Key("from")]
+    end: Annotated[tuple[float, float], Key("to")]
+    thickness: Positive = 0.02
+    height: Positive = 0.3
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """The wall has a length."""
+        if self.start == self.end:
+            yield "to", "another point than from"
 
     @property
     def box(self) -> Box:
@@ -235,7 +244,7 @@ class Target:
     """
 
     position: tuple[float, float]
-    radius: float = 0.3
+    radius: Positive = 0.3
 
 
 @dataclass(frozen=True)
@@ -249,10 +258,10 @@ class ObstacleMaterial:
         slip_speed: The smoothing: at this slip speed friction reaches 1/sqrt(2) of Coulomb's [m/s].
     """
 
-    stiffness: float = 5000.0
-    damping: float = 20.0
-    mu: float = 0.3
-    slip_speed: float = 0.01
+    stiffness: Positive = 5000.0
+    damping: NonNegative = 20.0
+    mu: NonNegative = 0.3
+    slip_speed: Positive = 0.01
 
 
 class Cylinders(NamedTuple):

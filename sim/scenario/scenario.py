@@ -8,28 +8,35 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import tomlkit
 
+from undulog.capture.common.config import Name, NonNegative, write
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.strict_table import at_least, at_most
 from undulog.capture.robot.model import Robot
 
 from ..gait.build import GaitParameters
+from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import BusFault
-from .controllers import Controller, controller_table
+from .controllers import Controller
 from .engines import EngineKind
+from .field import Seed
 from .gaits_toml import gait_table
 from .modules import Modules
 from .sensors import Noise, SensorModels
 from .world import Push, World
 from .world_toml import body_length, world_table
 
-CONTROL_RATE_HZ = 100
-"""Rate of control and log."""
-
 LONGEST_S = 86400.0
 """Longest run."""
+
+Length: TypeAlias = Annotated[float, at_least(1 / CONTROL_RATE_HZ), at_most(LONGEST_S)]
+"""Length of a run [s]."""
+PhysicsRate: TypeAlias = Annotated[int, at_least(2 * CONTROL_RATE_HZ)]
+Epoch: TypeAlias = Annotated[int, at_least(1_000_000_000)]
+"""Unix time from 2001 on [s]: viewers misread stamps near zero."""
 
 
 @dataclass(frozen=True)
@@ -57,21 +64,21 @@ class Scenario:
         controller: What changes the gait by what the sensors say; None: nothing does.
     """
 
-    name: str
+    name: Name
     description: str
     robot_name: str
     robot: Robot
     gait: GaitParameters
-    duration_s: float
-    settle_s: float = 0.0
+    duration_s: Length
+    settle_s: NonNegative = 0.0
     world: World = field(default_factory=World)
     noise: Noise = field(default_factory=Noise)
     sensing: SensorModels = field(default_factory=SensorModels)
     modules: Modules = field(default_factory=Modules)
     disturbances: tuple[Push, ...] = ()
-    seed: int = 1
-    epoch_s: int = 1_735_689_600  # 2025-01-01T00:00:00Z: near zero, viewers misread stamps
-    physics_rate_hz: int = 1000
+    seed: Seed = 1
+    epoch_s: Epoch = 1_735_689_600  # 2025-01-01T00:00:00Z
+    physics_rate_hz: PhysicsRate = 1000
     engine: EngineKind = EngineKind.BULLET
     faults: tuple[BusFault, ...] = ()
     controller: Controller | None = None
@@ -138,14 +145,14 @@ class Scenario:
             "engine": self.engine,
             "gait": gait_table(self.gait),
             "world": world_table(self.world),
-            "noise": dataclasses.asdict(self.noise),
-            "sensing": dataclasses.asdict(self.sensing),
+            "noise": write(self.noise),
+            "sensing": write(self.sensing),
             **self.modules.tables(),
         }
         if self.controller is not None:
-            values["controller"] = controller_table(self.controller)
+            values["controller"] = write(self.controller)
         if self.disturbances:
-            values["disturbances"] = [dataclasses.asdict(push) for push in self.disturbances]
+            values["disturbances"] = [write(push) for push in self.disturbances]
         if self.faults:
             values["faults"] = [fault.as_table() for fault in self.faults]
         return tomlkit.dumps(values)

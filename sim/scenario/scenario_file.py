@@ -91,19 +91,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from undulog.capture.common.config import read, read_field
 from undulog.capture.common.errors import Fault, ScenarioError, UsageError
 from undulog.capture.common.files import Shelf, is_file
 from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.capture.robot.model import Plane, Robot
 
+from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import read_faults
 from .controllers import read_controller
-from .engines import EngineKind
 from .gaits_toml import read_gait
 from .modules import read_modules
-from .scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
-from .sensors import read_noise, read_sensing
+from .scenario import LONGEST_S, Scenario
+from .sensors import Noise, read_sensing
 from .world import read_pushes
 from .world_toml import read_world
 
@@ -175,21 +176,20 @@ def parse_scenario(
     stem = source.stem if NAME_PATTERN.fullmatch(source.stem) else "scenario"
     robot_name = top.text("robot")
     robot = robot or _robot(top, robot_name, source.parent)
-    seed = top.integer("seed", at_least=0) if "seed" in top else Scenario.seed
+    seed: int = read_field(top, Scenario, "seed")
     parts: dict[str, Any] = {
-        "name": top.name("name") if "name" in top else stem,
-        "description": top.text("description"),
+        "name": read_field(top, Scenario, "name", stem),
+        "description": read_field(top, Scenario, "description"),
         "robot_name": robot_name,
-        "gait": read_gait(top.table("gait"), robot, max_frequency_hz=CONTROL_RATE_HZ / 4),
+        "gait": read_gait(top.table("gait"), robot),
         "world": read_world(top.table("world"), robot, seed),
-        "noise": read_noise(top.table("noise")),
+        "noise": read(top.table("noise"), Noise),
         "sensing": read_sensing(top.table("sensing"), robot, 1 / CONTROL_RATE_HZ),
         "modules": read_modules(top, robot),
         "disturbances": read_pushes(top, robot),
         "faults": read_faults(top, robot),
         "seed": seed,
-        "engine": (top.choice("engine", EngineKind) if "engine" in top else None)
-        or Scenario.engine,
+        "engine": read_field(top, Scenario, "engine"),
         **_times(top),
     }
     if "controller" in top:
@@ -242,27 +242,16 @@ def _change(values: dict[str, Any], key: str, value: object, faults: Faults) -> 
         faults.add(key, "a part of what is no table", "a key of a table, e.g. servo.stall_torque")
 
 
-def _times(top: Table) -> dict[str, float]:
-    duration_s = top.number("duration_s", at_least=1 / CONTROL_RATE_HZ, at_most=LONGEST_S)
-    settle_s = top.number("settle_s", default=0.0, at_least=0.0)
-    if settle_s > duration_s:
-        top.fault("settle_s", f"at most duration_s = {duration_s:g}")
-    rate, epoch_s = Scenario.physics_rate_hz, Scenario.epoch_s
-    if "physics_rate_hz" in top:
-        rate = top.integer("physics_rate_hz", at_least=2 * CONTROL_RATE_HZ)
-        if rate % (2 * CONTROL_RATE_HZ):  # whole steps in half a control period
-            top.fault("physics_rate_hz", f"a multiple of {2 * CONTROL_RATE_HZ}")
-    if "epoch_s" in top:
-        # Viewers misread stamps near zero, so not before 2001.
-        epoch_s = top.integer("epoch_s", at_least=1_000_000_000)
-        if epoch_s + LONGEST_S > _LATEST_EPOCH_S:
-            top.fault("epoch_s", f"at most {_LATEST_EPOCH_S - round(LONGEST_S)}")
-    return {
-        "duration_s": duration_s,
-        "settle_s": settle_s,
-        "physics_rate_hz": rate,
-        "epoch_s": epoch_s,
-    }
+def _times(top: Table) -> dict[str, Any]:
+    names = ("duration_s", "settle_s", "physics_rate_hz", "epoch_s")
+    times = {name: read_field(top, Scenario, name) for name in names}
+    if times["settle_s"] > times["duration_s"]:
+        top.fault("settle_s", f"at most duration_s = {times['duration_s']:g}")
+    if times["physics_rate_hz"] % (2 * CONTROL_RATE_HZ):  # whole steps in half a control period
+        top.fault("physics_rate_hz", f"a multiple of {2 * CONTROL_RATE_HZ}")
+    if times["epoch_s"] + LONGEST_S > _LATEST_EPOCH_S:
+        top.fault("epoch_s", f"at most {_LATEST_EPOCH_S - round(LONGEST_S)}")
+    return times
 
 
 def _robot(top: Table, name: str, folder: Path) -> Robot | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from undulog.capture.common.strict_table import Table
+from undulog.capture.common.config import Count, NonNegative, Positive, read, read_fields
+from undulog.capture.common.strict_table import Table, at_least, at_most
 from undulog.capture.robot.model import Robot
 
 
@@ -19,9 +20,9 @@ class Noise:
         effort: [N m].
     """
 
-    position: float = 0.0
-    velocity: float = 0.0
-    effort: float = 0.0
+    position: NonNegative = 0.0
+    velocity: NonNegative = 0.0
+    effort: NonNegative = 0.0
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,10 @@ class ServoPolling:
         command_resolution: Step in which the servos take commands [rad]; 0: none.
     """
 
-    slot_s: float = 0.0
-    resolution: float = 0.0
-    dead_band: float = 0.0
-    command_resolution: float = 0.0
+    slot_s: NonNegative = 0.0
+    resolution: NonNegative = 0.0
+    dead_band: NonNegative = 0.0
+    command_resolution: NonNegative = 0.0
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,11 @@ class InfraredModel:
         peak: Distance of the greatest voltage; nearer things are told as farther [m].
     """
 
-    hold_s: float = 0.038
-    noise_v: float = 0.029
-    adc_bits: int = 12
-    adc_v: float = 3.3
-    peak: float = 0.15
+    hold_s: Positive = 0.038
+    noise_v: NonNegative = 0.029
+    adc_bits: Count = 12
+    adc_v: Positive = 3.3
+    peak: Positive = 0.15
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,10 @@ class SonarModel:
         rays: How many rays stand for the cone.
     """
 
-    rate_hz: float = 20.0
-    noise: float = 0.005
-    resolution: float = 0.01
-    rays: int = 61
+    rate_hz: Positive = 20.0
+    noise: NonNegative = 0.005
+    resolution: NonNegative = 0.01
+    rays: Count = 61
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,9 @@ class AccelerometerModel:
         resolution: [m/s^2]; 1 mg by default.
     """
 
-    rate_hz: float = 100.0
-    noise: float = 0.03
-    resolution: float = 9.80665e-3
+    rate_hz: Positive = 100.0
+    noise: NonNegative = 0.03
+    resolution: NonNegative = 9.80665e-3
 
 
 @dataclass(frozen=True)
@@ -107,11 +108,11 @@ class CompassModel:
         north: Direction of magnetic north, about z from the world's x [rad].
     """
 
-    rate_hz: float = 20.0
-    noise: float = 2e-7
-    resolution: float = 1e-7
-    horizontal_field: float = 2e-5
-    inclination: float = 1.1344640137963142  # 65 degrees
+    rate_hz: Positive = 20.0
+    noise: NonNegative = 2e-7
+    resolution: NonNegative = 1e-7
+    horizontal_field: Positive = 2e-5
+    inclination: Annotated[float, at_least(-1.57), at_most(1.57)] = 1.1344640137963142  # 65 degrees
     north: float = 0.0
 
 
@@ -136,21 +137,6 @@ class SensorModels:
     enabled: bool = True
 
 
-def read_noise(table: Table) -> Noise:
-    """Read ``[noise]``.
-
-    Args:
-        table: The table.
-
-    Returns:
-        Standard deviations, 0 where nothing is given.
-    """
-    names = [item.name for item in dataclasses.fields(Noise)]
-    noise = Noise(**{name: table.number(name, default=0.0, at_least=0.0) for name in names})
-    table.close()
-    return noise
-
-
 def read_sensing(table: Table, robot: Robot | None, period_s: float) -> SensorModels:
     """Read ``[sensing]``.
 
@@ -162,84 +148,13 @@ def read_sensing(table: Table, robot: Robot | None, period_s: float) -> SensorMo
     Returns:
         The models, with defaults where nothing is given.
     """
-    models = SensorModels(
-        servo=_servo(table.table("servo"), robot, period_s),
-        ir=_infrared(table.table("ir")),
-        sonar=_sonar(table.table("sonar")),
-        accelerometer=_accelerometer(table.table("accelerometer")),
-        compass=_compass(table.table("compass")),
-        enabled=table.flag("enabled", default=SensorModels.enabled),
-    )
-    table.close()
-    return models
+    return read(table, SensorModels, servo=lambda: _servo(table.table("servo"), robot, period_s))
 
 
 def _servo(table: Table, robot: Robot | None, period_s: float) -> ServoPolling:
-    def step(key: str) -> float:
-        return table.number(key, default=0.0, at_least=0.0)
-
-    servo = ServoPolling(
-        slot_s=step("slot_s"),
-        resolution=step("resolution"),
-        dead_band=step("dead_band"),
-        command_resolution=step("command_resolution"),
-    )
+    servo = read_fields(table, ServoPolling)
     if robot is not None and servo.slot_s * len(robot.joints) >= period_s:
         longest = f"{len(robot.joints)} joints' turns in a control period of {period_s:g} s"
         table.fault("slot_s", f"less than {period_s / len(robot.joints):g}, for {longest}")
     table.close()
     return servo
-
-
-def _infrared(table: Table) -> InfraredModel:
-    default = InfraredModel
-    model = InfraredModel(
-        hold_s=table.number("hold_s", default=default.hold_s, above=0.0),
-        noise_v=table.number("noise_v", default=default.noise_v, at_least=0.0),
-        adc_bits=table.integer("adc_bits", at_least=1) if "adc_bits" in table else default.adc_bits,
-        adc_v=table.number("adc_v", default=default.adc_v, above=0.0),
-        peak=table.number("peak", default=default.peak, above=0.0),
-    )
-    table.close()
-    return model
-
-
-def _sonar(table: Table) -> SonarModel:
-    default = SonarModel
-    model = SonarModel(
-        rate_hz=table.number("rate_hz", default=default.rate_hz, above=0.0),
-        noise=table.number("noise", default=default.noise, at_least=0.0),
-        resolution=table.number("resolution", default=default.resolution, at_least=0.0),
-        rays=table.integer("rays", at_least=1) if "rays" in table else default.rays,
-    )
-    table.close()
-    return model
-
-
-def _accelerometer(table: Table) -> AccelerometerModel:
-    default = AccelerometerModel
-    model = AccelerometerModel(
-        rate_hz=table.number("rate_hz", default=default.rate_hz, above=0.0),
-        noise=table.number("noise", default=default.noise, at_least=0.0),
-        resolution=table.number("resolution", default=default.resolution, at_least=0.0),
-    )
-    table.close()
-    return model
-
-
-def _compass(table: Table) -> CompassModel:
-    default = CompassModel
-    model = CompassModel(
-        rate_hz=table.number("rate_hz", default=default.rate_hz, above=0.0),
-        noise=table.number("noise", default=default.noise, at_least=0.0),
-        resolution=table.number("resolution", default=default.resolution, at_least=0.0),
-        horizontal_field=table.number(
-            "horizontal_field", default=default.horizontal_field, above=0.0
-        ),
-        inclination=table.number(
-            "inclination", default=default.inclination, at_least=-1.57, at_most=1.57
-        ),
-        north=table.number("north", default=default.north),
-    )
-    table.close()
-    return model

@@ -11,6 +11,7 @@ from enum import StrEnum
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.config import NonNegative, Positive, read_fields
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.strict_table import Table, listed
 from undulog.capture.robot.model import Robot
@@ -56,14 +57,14 @@ class Ground:
         drag_normal: c_n of the viscous law, a link's drag across the body [N s/m].
     """
 
-    stiffness: float = 2000.0
-    damping: float = 20.0
-    mu_tangential: float = 0.05
-    mu_normal: float = 0.5
-    slip_speed: float = 0.01
+    stiffness: Positive = 2000.0
+    damping: NonNegative = 20.0
+    mu_tangential: NonNegative = 0.05
+    mu_normal: NonNegative = 0.5
+    slip_speed: Positive = 0.01
     law: FrictionLaw = FrictionLaw.ELLIPSE
-    drag_tangential: float = 1.0
-    drag_normal: float = 10.0
+    drag_tangential: NonNegative = 1.0
+    drag_normal: NonNegative = 10.0
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,8 @@ class Push:
 
     link: str
     force: tuple[float, float, float]
-    start_s: float
-    duration_s: float
+    start_s: NonNegative
+    duration_s: Positive
 
 
 def pushes_during(
@@ -116,19 +117,11 @@ def read_pushes(top: Table, robot: Robot | None) -> tuple[Push, ...]:
     Returns:
         The pushes.
     """
-    return tuple(
-        _read_push(Table(values, where, top.faults), robot)
-        for values, where in top.tables("disturbances")
-    )
+    return tuple(_read_push(table, robot) for table in top.tables("disturbances"))
 
 
 def _read_push(table: Table, robot: Robot | None) -> Push:
-    push = Push(
-        link=table.text("link"),
-        force=table.triple("force"),
-        start_s=table.number("start_s", at_least=0.0),
-        duration_s=table.number("duration_s", above=0.0),
-    )
+    push = read_fields(table, Push)
     names = [] if robot is None else [link.name for link in robot.links]
     if robot is not None and push.link and push.link not in names:
         table.fault("link", listed(names, push.link))

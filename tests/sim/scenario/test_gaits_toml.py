@@ -80,7 +80,7 @@ gaits = st.one_of(
 
 def read(text, robot=ROBOT):
     faults = Faults()
-    gait = read_gait(Table(tomllib.loads(text), "gait", faults), robot, max_frequency_hz=25.0)
+    gait = read_gait(Table(tomllib.loads(text), "gait", faults), robot)
     return gait, {fault.key: str(fault) for fault in faults.all()}
 
 
