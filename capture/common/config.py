@@ -29,6 +29,7 @@ from typing import (
     TypeAlias,
     TypeVar,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -97,8 +98,9 @@ def _reader(
         return lambda table, default: table.numbers(key, count, *bounds, default=default)
     if isinstance(kind, type) and issubclass(kind, StrEnum):
         return lambda table, default: table.choice(key, kind, default)
-    if dataclasses.is_dataclass(kind):
-        return lambda table, _: read(table.table(key), kind)
+    if dataclasses.is_dataclass(cast("object", kind)):
+        part = cast("type[Any]", kind)
+        return lambda table, _: read(table.table(key), part)
     readers: dict[Any, Callable[[Table, Any], Any]] = {
         float: lambda table, default: table.number(key, *bounds, default=default),
         int: lambda table, default: table.integer(key, int(bounds[0].limit), default),
@@ -175,5 +177,6 @@ def write(value: Any) -> dict[str, Any]:
     for name, one in declared(value.__class__).items():
         part = getattr(value, name)
         if part is not None:
-            table[one.key] = write(part) if dataclasses.is_dataclass(part) else part
+            nested = dataclasses.is_dataclass(cast("object", part))
+            table[one.key] = write(part) if nested else part
     return table
