@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rich.cells import cell_len
 from rich.text import Text
 
 from .console import plain
 
-Cells = list[tuple[str, str]]
+Cells = Sequence[tuple[str, str]]
 """Text and style of each cell of a row."""
 
 _GAP = 2
@@ -24,56 +25,69 @@ class Column:
         title: Its head, with the unit.
         width: Least width in characters.
         left: Whether it holds words; numbers go to the right.
-        wide: Shown only where there is room for all columns.
+        spare: Where the table is too wide, columns of the same number are left out together, the
+            least number first; 0 stays.
     """
 
     title: str
-    width: int
+    width: int = 0
     left: bool = False
-    wide: bool = False
+    spare: int = 0
 
 
-def table(columns: Sequence[Column], rows: Sequence[Cells], width: int) -> list[Text]:
-    """A table no wider than the terminal; the first column gives way.
+def table(
+    columns: Sequence[Column], rows: Sequence[Cells], width: int, *, cropped: bool = False
+) -> tuple[list[Text], list[str]]:
+    """Lay out a table, without columns that it can spare where the terminal is too narrow.
 
     Args:
         columns: The columns.
         rows: A cell for each column, also for those that may not be shown.
         width: Characters in a line.
+        cropped: Whether no line may be longer, whatever it takes: the last columns go too, and the
+            first gives way.
 
     Returns:
-        The head and one line a row.
+        The head and one line a row; the titles of the columns left out, in the order they went.
     """
+    texts = [[_printable(text) for text, _ in row] for row in rows]
     needed = [
-        max(column.width, *(len(row[k][0]) for row in rows)) if rows else column.width
+        max(column.width, cell_len(plain(column.title)), *(cell_len(row[k]) for row in texts), 0)
         for k, column in enumerate(columns)
     ]
-    whole = sum(needed) + _GAP * (len(needed) - 1) <= width
-    shown = [k for k, column in enumerate(columns) if whole or not column.wide]
-    first = needed[shown[0]]
-    while (
-        len(shown) > 1 and sum(needed[k] + _GAP for k in shown) - _GAP - width > first - _NARROWEST
-    ):
-        shown.pop()  # a narrow terminal loses the last columns
-    widths = {k: needed[k] for k in shown}
-    spare = width - sum(widths.values()) - _GAP * (len(shown) - 1)
-    widths[shown[0]] = max(_NARROWEST, widths[shown[0]] + min(spare, 0))
-    titles: Cells = [(column.title, "bold") for column in columns]
+    shown, left_out = list(range(len(columns))), list[str]()
+
+    def excess() -> int:
+        return sum(needed[k] + _GAP for k in shown) - _GAP - width
+
+    for number in sorted({column.spare for column in columns} - {0}):
+        if excess() <= 0:
+            break
+        left_out += [columns[k].title for k in shown if columns[k].spare == number]
+        shown = [k for k in shown if columns[k].spare != number]
+    if cropped:
+        while len(shown) > 1 and excess() > needed[shown[0]] - _NARROWEST:
+            shown.pop()
+        needed[shown[0]] = max(_NARROWEST, needed[shown[0]] - max(excess(), 0))
+    heads = [plain(column.title) for column in columns]
     lines: list[Text] = []
-    for cells in (titles, *rows):
+    for cells, styles in (
+        (heads, ["bold"] * len(heads)),
+        *zip(texts, ([style for _, style in row] for row in rows), strict=True),
+    ):
         line = Text(no_wrap=True)
         for k in shown:
-            text, style = cells[k]
-            padded = cut(text, widths[k])
-            before = 0 if columns[k].left else widths[k] - len(padded)
-            line.append(" " * (before + (_GAP if k != shown[0] else 0)))
-            line.append(padded, style)
-            if columns[k].left:
-                line.append(" " * (widths[k] - len(padded)))
+            text = cut(cells[k], needed[k])
+            space = " " * (needed[k] - cell_len(text))
+            line.append(" " * _GAP if k != shown[0] else "")
+            line.append("" if columns[k].left else space)
+            line.append(text, styles[k])
+            line.append(space if columns[k].left else "")
         line.rstrip()
-        line.truncate(width)
+        if cropped:
+            line.truncate(width)
         lines.append(line)
-    return lines
+    return lines, list(dict.fromkeys(left_out))
 
 
 def fit(text: str, width: int) -> str:
@@ -93,5 +107,10 @@ def cut(text: str, width: int) -> str:
         text: Any text; a device may have put anything into it.
         width: Characters.
     """
-    clean = "".join(c if c.isprintable() else " " for c in plain(text))  # odd spaces
-    return clean if len(clean) <= width else clean[: max(width - 1, 0)] + "…"
+    clean = Text(_printable(text))
+    clean.truncate(max(width, 1), overflow="ellipsis")
+    return clean.plain
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in plain(text))  # odd spaces

@@ -45,9 +45,9 @@ SOURCE_COLUMNS = (
     Column("load", 5),
     Column("drift/ppm", 9),
     Column("jitter/ms", 9),
-    Column("frames", 11, wide=True),
-    Column("bus errors", 10, wide=True),
-    Column("reconnects", 10, wide=True),
+    Column("frames", 11, spare=1),
+    Column("bus errors", 10, spare=1),
+    Column("reconnects", 10, spare=1),
 )
 TOPIC_COLUMNS = (
     Column("topic", 16, left=True),
@@ -57,8 +57,8 @@ TOPIC_COLUMNS = (
     Column("missing", 7),
     Column("jitter", 6),
     Column("lost", 6),
-    Column("messages", 10, wide=True),
-    Column("joints", 20, left=True, wide=True),
+    Column("messages", 10, spare=1),
+    Column("joints", 20, left=True, spare=1),
 )
 
 
@@ -74,7 +74,8 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
         The screen's lines.
     """
     head = [*_headline(snapshot, width), *_verdict(snapshot, width)]
-    sources = table(SOURCE_COLUMNS, [_source_cells(each) for each in snapshot.sources], width)
+    cells = [_source_cells(each) for each in snapshot.sources]
+    sources, _ = table(SOURCE_COLUMNS, cells, width, cropped=True)
     events = [_event(event, snapshot, width) for event in snapshot.events[-_EVENTS:]]
     if events:
         events = [Text(), Text("latest events", style="bold"), *events]
@@ -87,7 +88,7 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
     if len(rows) > room:
         hidden = len(rows) - max(room - 1, 0)
         rows = rows[: max(room - 1, 0)]
-    topics = table(TOPIC_COLUMNS, rows, width) if rows else []
+    topics = table(TOPIC_COLUMNS, rows, width, cropped=True)[0] if rows else []
     if hidden:
         topics.append(Text(f"and {hidden} more", style=_MUTED))
     lines = [*head, Text(), *sources, *([Text(), *topics] if topics else []), *events]

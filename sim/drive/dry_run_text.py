@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from undulog.capture.common.text_table import Column, table
 
 from ..gate.limits import safety_example
 from .dry_run import DryRun, Verdict
@@ -18,22 +19,7 @@ if TYPE_CHECKING:
 
 
 _NOTHING = "-"
-_GAP = 2
-
-
-@dataclass(frozen=True)
-class _Column:
-    """One column.
-
-    Attributes:
-        title: Its head, with the unit.
-        cell: What stands in it.
-        spare: A narrow terminal goes without the columns of the greatest number first; 0 stays.
-    """
-
-    title: str
-    cell: Callable[[JointDemand], str]
-    spare: int = 0
+_TOO_NARROW = "; the terminal is too narrow for all of it, --json has it"
 
 
 def _number(value: float, form: str) -> str:
@@ -52,25 +38,25 @@ def _share(name: str) -> Callable[[JointDemand], str]:
     return cell
 
 
-_COLUMNS = (
-    _Column("joint", lambda joint: joint.name),
-    _Column("from °", lambda joint: _degrees(joint.least), 2),
-    _Column("to °", lambda joint: _degrees(joint.greatest), 2),
-    _Column("%", _share("range")),
-    _Column("°/s", lambda joint: _degrees(joint.rate, ".0f"), 1),
-    _Column("%", _share("rate")),
-    _Column("°/s²", lambda joint: _degrees(joint.acceleration, ".0f"), 5),
-    _Column("error °", lambda joint: _degrees(joint.tracking_error), 1),
-    _Column("%", _share("tracking error")),
-    _Column("N m", lambda joint: _number(joint.torque_peak, ".3f"), 1),
-    _Column("%", _share("torque")),
-    _Column("rms", lambda joint: _number(joint.torque_rms, ".3f"), 4),
-    _Column("A", lambda joint: _number(joint.current_peak, ".2f"), 1),
-    _Column("%", _share("current")),
-    _Column("net J", lambda joint: _number(joint.energy_net_j, ".3f"), 3),
-    _Column("abs J", lambda joint: _number(joint.energy_abs_j, ".3f"), 4),
-    _Column("el. J", lambda joint: _number(joint.energy_el_j, ".3f"), 3),
-    _Column("clamped", lambda joint: _number(joint.clamped or math.nan, ".0%"), 3),
+_COLUMNS: tuple[tuple[Column, Callable[[JointDemand], str]], ...] = (
+    (Column("joint", left=True), lambda joint: joint.name),
+    (Column("from °", spare=4), lambda joint: _degrees(joint.least)),
+    (Column("to °", spare=4), lambda joint: _degrees(joint.greatest)),
+    (Column("%"), _share("range")),
+    (Column("°/s", spare=5), lambda joint: _degrees(joint.rate, ".0f")),
+    (Column("%"), _share("rate")),
+    (Column("°/s²", spare=1), lambda joint: _degrees(joint.acceleration, ".0f")),
+    (Column("error °", spare=5), lambda joint: _degrees(joint.tracking_error)),
+    (Column("%"), _share("tracking error")),
+    (Column("N m", spare=5), lambda joint: _number(joint.torque_peak, ".3f")),
+    (Column("%"), _share("torque")),
+    (Column("rms", spare=2), lambda joint: _number(joint.torque_rms, ".3f")),
+    (Column("A", spare=5), lambda joint: _number(joint.current_peak, ".2f")),
+    (Column("%"), _share("current")),
+    (Column("net J", spare=3), lambda joint: _number(joint.energy_net_j, ".3f")),
+    (Column("abs J", spare=2), lambda joint: _number(joint.energy_abs_j, ".3f")),
+    (Column("el. J", spare=3), lambda joint: _number(joint.energy_el_j, ".3f")),
+    (Column("clamped", spare=3), lambda joint: _number(joint.clamped or math.nan, ".0%")),
 )
 
 
@@ -84,30 +70,13 @@ def joint_table(joints: Sequence[JointDemand], width: int) -> Iterator[str]:
     Yields:
         What the percentages are of, the heads, a line for each joint.
     """
-    columns, left = list(_COLUMNS), ""
-    while _needed(joints, columns) > width and (most := max(one.spare for one in columns)):
-        columns = [one for one in columns if one.spare != most]
-        left = "; the terminal is too narrow for all of it, --json has it"
+    rows = [[(cell(joint), "") for _, cell in _COLUMNS] for joint in joints]
+    lines, left_out = table([column for column, _ in _COLUMNS], rows, width)
     yield (
         "% of the limit: half the range, [safety]'s rate, tracking error and current, the servo's "
-        f"stall torque{left}"
+        f"stall torque{_TOO_NARROW if left_out else ''}"
     )
-    widths = [_width(joints, one) for one in columns]
-    for cells in (
-        [one.title for one in columns],
-        *([one.cell(joint) for one in columns] for joint in joints),
-    ):
-        first, *others = zip(cells, widths, strict=True)
-        line = first[0].ljust(first[1])
-        yield line + "".join(f"{cell:>{wide + _GAP}}" for cell, wide in others)
-
-
-def _width(joints: Sequence[JointDemand], column: _Column) -> int:
-    return max(len(column.title), *(len(column.cell(joint)) for joint in joints))
-
-
-def _needed(joints: Sequence[JointDemand], columns: Sequence[_Column]) -> int:
-    return sum(_width(joints, one) + _GAP for one in columns) - _GAP
+    yield from (line.plain for line in lines)
 
 
 _NAMED = 3

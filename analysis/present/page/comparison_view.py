@@ -6,16 +6,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from markupsafe import Markup
+
 from undulog.capture.common.palette import joint_hex
 
 from ...compare.answer import WORDS, in_people_units, signed
 from ...compare.decisions import SIGNIFICANT
-from ...results import formats
 from ...results.analysis import SessionFacts
-from ...results.comparison import BODY, Comparison, Difference, Waveform
+from ...results.comparison import BODY, Comparison
 from ...results.estimate import Estimate
-from ...results.formats import degrees, scaled
-from ..text.comparison import cells, margin_told, method
+from ...results.formats import scaled
+from ..text.comparison import margin_told, method
 from .motion import waveforms_drawing
 from .svg import (
     INK,
@@ -30,7 +31,7 @@ from .svg import (
     legend,
     new_figure,
 )
-from .tables import Fact
+from .tables import Fact, joint_mark
 from .trials import Trial
 
 _DASHED = (0, (5, 3))
@@ -125,71 +126,6 @@ _VERDICTS = {
 
 
 @dataclass(frozen=True)
-class DifferenceRow:
-    """One quantity of one joint, or of the body, in the units people read.
-
-    Attributes:
-        place: Joint name, or ``the body``.
-        quantity: In words.
-        a: On side A, with its unit.
-        b: On side B.
-        difference: B minus A.
-        unit: Of ``difference``, with its own space.
-        decimals: Digits after the point of ``difference``.
-        p: Holm's, for the whole family.
-        size: In margins.
-        sure: Whether it is beyond doubt.
-    """
-
-    place: str
-    quantity: str
-    a: str
-    b: str
-    difference: Estimate
-    unit: str
-    decimals: int
-    p: float
-    size: float
-    sure: bool
-
-
-@dataclass(frozen=True)
-class NamedRow:
-    """A joint that answers differently, ranked.
-
-    Attributes:
-        name: The joint.
-        color: Of the joint.
-        size: Of gain and lag together, in margins.
-        p: Holm's.
-        rows: What differs, gain and lag.
-    """
-
-    name: str
-    color: str
-    size: float
-    p: float
-    rows: tuple[DifferenceRow, ...]
-
-
-@dataclass(frozen=True)
-class WaveformRow:
-    """How far two mean cycles are apart.
-
-    Attributes:
-        name: The joint.
-        rms_deg: Root mean square [deg].
-        largest: The largest difference [deg].
-        at_deg: Its phase [deg].
-    """
-
-    name: str
-    rms_deg: float
-    largest: Estimate
-    at_deg: float
-
-
-@dataclass(frozen=True)
 class ComparisonView:
     """All that the template shows of a comparison.
 
@@ -198,12 +134,10 @@ class ComparisonView:
         sentence: The answer.
         sides: Letter and session, A first.
         facts: Key figures.
-        named: Joints that answer differently, the largest difference first.
+        marks: Of the joints that answer differently.
         differences: Of every joint, as a picture; None where there are none.
         waveforms: Mean cycles, or None.
-        cycles: How far they are apart, head to tail.
         trials: What is shown to be the same.
-        rows: Every quantity, those beyond doubt first.
         method: How it was made.
     """
 
@@ -211,12 +145,10 @@ class ComparisonView:
     sentence: str
     sides: tuple[tuple[str, SessionFacts], ...]
     facts: tuple[Fact, ...]
-    named: tuple[NamedRow, ...]
+    marks: tuple[Markup, ...]
     differences: Drawing | None
     waveforms: Drawing | None
-    cycles: tuple[WaveformRow, ...]
     trials: tuple[Trial, ...]
-    rows: tuple[DifferenceRow, ...]
     method: str
 
 
@@ -229,19 +161,16 @@ def comparison_view(comparison: Comparison) -> ComparisonView:
     Returns:
         The view.
     """
-    rows = tuple(_row(one) for one in comparison.differences)
     sides = (("A", comparison.a), ("B", comparison.b))
     return ComparisonView(
         comparison=comparison,
         sentence=comparison.answer,
         sides=tuple((letter, one) for letter, sessions in sides for one in sessions),
         facts=tuple(_facts(comparison)),
-        named=_named(comparison, rows),
+        marks=_marks(comparison),
         differences=differences_of(comparison, "differences") if joints_of(comparison) else None,
         waveforms=waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
-        cycles=tuple(_cycle(one) for one in comparison.waveforms),
         trials=_trials(comparison),
-        rows=rows,
         method=method(comparison),
     )
 
@@ -285,47 +214,10 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
     return differences_drawing(names, panels, title="B minus A of every joint", prefix=prefix)
 
 
-def _row(one: Difference) -> DifferenceRow:
-    a, b, *_ = cells(one)
-    quantity, unit = in_people_units(one)
-    return DifferenceRow(
-        place="the body" if one.place == BODY else one.place,
-        quantity=WORDS[one.quantity],
-        a=a,
-        b=b,
-        difference=quantity,
-        unit=unit,
-        decimals=formats.decimals_for([quantity], most=2),
-        p=one.p_holm,
-        size=one.size,
-        sure=one.p_holm < SIGNIFICANT,
-    )
-
-
-def _named(comparison: Comparison, rows: tuple[DifferenceRow, ...]) -> tuple[NamedRow, ...]:
+def _marks(comparison: Comparison) -> tuple[Markup, ...]:
     names = joints_of(comparison)
     colors = dict(zip(names, joint_hex(len(names)), strict=True)) if names else {}
-    return tuple(
-        NamedRow(
-            one.name,
-            colors[one.name],
-            one.size,
-            one.p_holm,
-            tuple(
-                row
-                for word in (WORDS["gain"], WORDS["lag"])
-                for row in rows
-                if row.place == one.name and row.quantity == word
-            ),
-        )
-        for one in comparison.named
-    )
-
-
-def _cycle(one: Waveform) -> WaveformRow:
-    return WaveformRow(
-        one.name, math.degrees(one.rms_rad), degrees(one.largest), math.degrees(one.largest_at_rad)
-    )
+    return tuple(joint_mark(colors[one.name], "horizontal") for one in comparison.named)
 
 
 def _trials(comparison: Comparison) -> tuple[Trial, ...]:

@@ -20,13 +20,14 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
 
 from ...results import formats
-from ...results.analysis import Analysis, BodyPoint, Index, JointResult
+from ...results.analysis import Analysis, JointResult
 from ...results.answer import Answer
 from ...results.comparison import Comparison
 from ...results.deciding import beyond
-from ...results.estimate import Estimate, Provenance
+from ...results.estimate import Provenance
 from ...results.experiment import Experiment
 from ...session.cycles import CycleMaps
+from .. import tables
 from .artefacts import ArtefactRow, artefact_rows, flagged_joints
 from .comparison_view import comparison_view
 from .driven import is_driven
@@ -39,7 +40,7 @@ from .oscillators import ChainView, chain_views
 from .segments import segments
 from .signals import command_response, read_traces
 from .svg import Drawing
-from .tables import Column, Fact, energy_columns, key_figures, response_columns
+from .tables import Fact, estimate, grid, joint_mark, key_figures, known, number, p_value
 from .trials import LEVEL_NOTE, Trial, session_trials
 from .typeset import cut, digits, sentence, softer, typeset
 
@@ -53,9 +54,7 @@ class AnalysisView:
         answer: The answer in one sentence.
         notices: The first few warnings, cut to a line or two.
         facts: Key figures.
-        colors: One colour a joint.
-        response: Columns of the table of responses.
-        energy: Columns of the table of energies.
+        marks: One a joint.
         trials: Tests with their verdicts.
         segments: Gain, lag and energy.
         signals: Command against response, or None.
@@ -72,9 +71,7 @@ class AnalysisView:
     answer: Answer
     notices: tuple[str, ...]
     facts: tuple[Fact, ...]
-    colors: tuple[str, ...]
-    response: tuple[Column, ...]
-    energy: tuple[Column, ...]
+    marks: tuple[Markup, ...]
     trials: tuple[Trial, ...]
     segments: Drawing | None
     signals: Drawing | None
@@ -101,6 +98,7 @@ def session_view(
         The view.
     """
     joints = analysis.joints
+    colors = joint_hex(len(joints)) if joints else ()
     traces = read_traces(session, analysis) if session is not None else ()
     body = analysis.body
     driven = tuple(joint.name for joint in joints if is_driven(joint))
@@ -112,9 +110,10 @@ def session_view(
         answer=told,
         notices=tuple(cut(warning) for warning in others[:3]),
         facts=tuple(key_figures(analysis)),
-        colors=joint_hex(len(joints)) if joints else (),
-        response=response_columns(joints),
-        energy=energy_columns(joints),
+        marks=tuple(
+            joint_mark(color, joint.plane, driven=is_driven(joint))
+            for color, joint in zip(colors, joints, strict=True)
+        ),
         trials=session_trials(analysis.heterogeneity),
         segments=segments(joints, "segments-figure") if _anything(joints) else None,
         signals=command_response(traces, len(joints), "signals-figure") if traces else None,
@@ -237,22 +236,19 @@ def _environment() -> Environment:
         "utc": formats.utc,
         "plain": plain,
         "filename": formats.filename,
-        "p_value": formats.p_value,
-        "degrees": formats.degrees,
         "scaled": formats.scaled,
-        "relative": formats.relative,
         "decimals": formats.decimals_for,
         "softer": softer,
         "typeset": typeset,
         "cut": cut,
         "digits": digits,
-        "points": _point_rows,
-        "index": _index_row,
-        "driven": is_driven,
         "sentence": sentence,
         "again": _commands_to_make_it_again,
     }
     environment.filters.update(filters)
+    environment.globals.update(
+        tables=tables, grid=grid, num=number, est=estimate, p=p_value, known=known
+    )
     return environment
 
 
@@ -263,27 +259,3 @@ def _commands_to_make_it_again(provenance: Provenance) -> str:
     if not command.startswith(numbers):
         return f"{command} -o comparison.html"
     return f"{command}\nundulog report {command.removeprefix(numbers)} -o report.html"
-
-
-def _point_rows(analysis: Analysis) -> list[tuple[str, BodyPoint]]:
-    """Observed points and their nulls, place by place: label and point."""
-    body = analysis.body
-    if body is None:
-        return []
-    rows: list[tuple[str, BodyPoint]] = []
-    for point in body.observed:
-        rows.append(("measured", point))
-        for name, nulls in body.null.items():
-            rows += [(f"perfect tracking, {name}", n) for n in nulls if n.place == point.place]
-    return rows
-
-
-def _index_row(index: Index) -> tuple[Estimate, str, int]:
-    """An index in the unit people read: value, unit, decimals."""
-    quantity = Estimate(index.value, index.ci95)
-    unit = index.unit
-    if unit == "rad":
-        quantity, unit = formats.degrees(quantity), "°"
-    elif unit == "1":
-        unit = ""
-    return quantity, unit, formats.decimals_for([quantity], least=0)

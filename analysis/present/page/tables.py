@@ -1,34 +1,26 @@
-"""Key figures and the columns of the tables of joints."""
+"""Key figures, tables and numbers as HTML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+from markupsafe import Markup, escape
 
 from undulog.capture.common.console import plain
 
 from ...results import formats
-from ...results.analysis import Analysis, JointResult
+from ...results.analysis import Analysis
 from ...results.estimate import Estimate
+from ..tables import PAGE, Cell, Ends, PValue, Quantity, Table
 from .driven import is_driven
 
-
-@dataclass(frozen=True)
-class Column:
-    """One column of the tables of joints.
-
-    Attributes:
-        title: Heading with its unit.
-        note: What it is, shown below the table.
-        cells: One estimate a joint, in the unit of the heading.
-        decimals: Digits after the point.
-    """
-
-    title: str
-    note: str
-    cells: tuple[Estimate, ...]
-    decimals: int
+_NOT_COMPUTED = Markup(
+    '<span class="null"><span aria-hidden="true">{}</span>'
+    '<span class="hidden">not computed</span></span>'
+).format(formats.MISSING)
 
 
 @dataclass(frozen=True)
@@ -46,64 +38,130 @@ class Fact:
     note: str = ""
 
 
-def response_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
-    """Command, gain and lag of every joint, angles in degrees.
+_CLASSES = {"number": ' class="n"', "sentence": ' class="say"', "word": "", "code": ""}
+
+
+def grid(table: Table[Any], marks: Sequence[Markup] = ()) -> Markup:
+    """Head and body of a table.
 
     Args:
-        joints: In chain order.
+        table: The table.
+        marks: What stands before the name of each row, if anything does.
 
     Returns:
-        Three columns; the frequency before them where joints have several.
+        The elements ``thead`` and ``tbody``.
     """
-    command = tuple(formats.degrees(Estimate(j.command_amplitude_rad)) for j in joints)
-    gain = tuple(j.gain for j in joints)
-    lag = tuple(formats.degrees(j.lag_rad) for j in joints)
-    return (
-        *_frequency_column(joints),
-        Column("command [°]", "amplitude of the command at the gait frequency", command, 2),
-        Column(
-            "gain [1]",
-            "amplitude of the response over that of the command",
-            gain,
-            formats.decimals_for(gain, most=4),
-        ),
-        Column(
-            "lag [°]",
-            "response behind command, positive is late",
-            lag,
-            formats.decimals_for(lag, most=3),
-        ),
-    )
+    columns = [column for column in table.columns if column.page is not None]
+    count = '<th scope="col" class="n i">#</th>' if table.numbered else ""
+    lines = [f"<thead><tr>{count}"]
+    for column in columns:
+        kind = _CLASSES[column.kind] if column.kind == "number" else ""
+        lines[0] += f'<th scope="col"{kind}>{escape(column.page)}</th>'
+    lines[0] += "</tr></thead>"
+    lines.append("<tbody>")
+    cells = zip(*(column.cells(table.rows, PAGE) for column in columns), strict=True)
+    for k, (row, values) in enumerate(zip(table.rows, cells, strict=True)):
+        line = '<tr class="sure">' if table.bold(row) else "<tr>"
+        line += f'<td class="n i">{k + 1}</td>' if table.numbered else ""
+        for column, value in zip(columns, values, strict=True):
+            head = column is columns[0]
+            shown = _shown(value)
+            if column.kind == "code":
+                shown = Markup("<code>{}</code>").format(shown)
+            if head and marks:
+                shown = marks[k] + shown
+            element = 'th scope="row"' if head else "td"
+            line += f"<{element}{_CLASSES[column.kind]}>{shown}</{element[:2]}>"
+        lines.append(f"{line}</tr>")
+    return Markup("\n".join([*lines, "</tbody>"]))  # noqa: S704  each cell is escaped
 
 
-def _frequency_column(joints: Sequence[JointResult]) -> list[Column]:
-    if len({joint.group for joint in joints} - {None}) < 2:
-        return []
-    cells = tuple(Estimate(joint.frequency_hz) for joint in joints)
-    return [Column("frequency [Hz]", "of the joint's group, for command, gain and lag", cells, 4)]
-
-
-def energy_columns(joints: Sequence[JointResult]) -> tuple[Column, ...]:
-    """The energies of every joint over the analysed windows, all with the same decimals.
+def joint_mark(color: str, plane: str | None, *, driven: bool = True) -> Markup:
+    """The mark of a joint, which stands before its name.
 
     Args:
-        joints: In chain order.
+        color: Of the joint.
+        plane: Of the joint.
+        driven: Whether it was given a command that moves.
 
     Returns:
-        Five columns.
+        An empty element.
     """
-    kinds: tuple[tuple[str, str, Callable[[JointResult], float | None]], ...] = (
-        ("E_net", "integral of torque times velocity", lambda j: j.energy_net_j),
-        ("E_plus", "its positive part only", lambda j: j.energy_plus_j),
-        ("E_abs", "its absolute value", lambda j: j.energy_abs_j),
-        ("E_el", "electrical, at the motor, signed", lambda j: j.energy_el_j),
-        ("E_el+", "its positive part only (no regeneration)", lambda j: j.energy_el_clipped_j),
+    kind = plane if plane in ("horizontal", "vertical") else "unknown"
+    return Markup('<span class="mark {}{}" style="--c: {}"></span>').format(
+        kind, "" if driven else " passive", color
     )
-    decimals = formats.decimals_for_values((of(j) for _, _, of in kinds for j in joints), 4)
-    return tuple(
-        Column(f"{name} [J]", note, tuple(Estimate(of(j)) for j in joints), decimals)
-        for name, note, of in kinds
-    )
+
+
+def _shown(cell: Cell) -> Markup:
+    match cell:
+        case Quantity(quantity, decimals, unit):
+            return estimate(quantity, decimals, unit)
+        case Ends(low, high):
+            return Markup("{} to {}").format(_shown(low), _shown(high))
+        case PValue():
+            return p_value(cell)
+        case _:
+            return known(cell)
+
+
+def number(value: float | None, decimals: int) -> Markup:
+    """A number that keeps its full precision in the page.
+
+    Args:
+        value: The number.
+        decimals: Digits after the point.
+
+    Returns:
+        The number, or a dash.
+    """
+    if value is None:
+        return _NOT_COMPUTED
+    return Markup('<data value="{}">{}</data>').format(value, formats.number(value, decimals))
+
+
+def estimate(quantity: Estimate, decimals: int, unit: str = "") -> Markup:
+    """A number with its interval.
+
+    Args:
+        quantity: In ``unit``.
+        decimals: Digits after the point.
+        unit: With its own space.
+
+    Returns:
+        The number, or a dash; its interval in smaller type.
+    """
+    shown = number(quantity.value, decimals) + ("" if quantity.value is None else unit)
+    if quantity.ci95 is None:
+        return shown
+    low, high = (number(end, decimals) for end in quantity.ci95)
+    return Markup('{} <span class="ci">[{}, {}]</span>').format(shown, low, high)
+
+
+def p_value(p: float | None) -> Markup:
+    """A p-value that keeps its full precision in the page.
+
+    Args:
+        p: 0 to 1, or None.
+
+    Returns:
+        The p-value, or a dash.
+    """
+    if p is None:
+        return _NOT_COMPUTED
+    return Markup('<data value="{}">{}</data>').format(p, formats.p_value(p))
+
+
+def known(value: object) -> Markup:
+    """A word, or a dash.
+
+    Args:
+        value: Anything that prints; None: not known.
+
+    Returns:
+        Its text, escaped.
+    """
+    return _NOT_COMPUTED if value is None else escape(plain(str(value)))
 
 
 def key_figures(analysis: Analysis) -> list[Fact]:

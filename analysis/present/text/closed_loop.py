@@ -10,7 +10,8 @@ from undulog.capture.common.console import UNLIMITED
 
 from ...results import formats
 from ...results.oscillators import ClosedLoop, LoopMode
-from .table import put, sheet
+from ..tables import Column, Table
+from .table import Sheet
 
 _PART = 0.5
 """Joints with this share of a pattern's largest are named."""
@@ -27,48 +28,44 @@ def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False
     Returns:
         Several lines, the last one ended.
     """
-    from rich.markup import escape
-    from rich.table import Table
-
-    text, prose, wide = sheet(width, color=color)
-    prose.print(formats.sentence(loop.answer), style="bold", markup=False)
+    sheet = Sheet(width, color=color)
+    sheet.print(formats.sentence(loop.answer), "bold")
     for line in loop.limits:
-        prose.print(formats.sentence(line), markup=False)
-    prose.print()
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("pattern", no_wrap=True)
-    for name in ("rate 1/s (95 %)", "time s", "turns rad/s"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("mostly in")
-    for k, mode in enumerate(loop.modes, start=1):
-        rate = mode.rate.value or 0.0
-        time = formats.number(1 / abs(rate), 1) if abs(rate) > 0 else formats.MISSING
-        table.add_row(
-            str(k),
-            formats.estimate(mode.rate, most=5),
-            f"{time}{' (grows)' if rate < 0 else ''}",
-            formats.number(mode.turning.value, 4),
-            escape(_mostly(mode, loop.joints)),
-        )
-    put(prose, wide, table, [("turns rad/s",), ("mostly in",)])
+        sheet.print(formats.sentence(line))
+    sheet.print()
+    sheet.table(_mode_table(loop))
     if loop.relaxation is not None:
         first, last = (np.array(loop.relaxation.phase_rad[k]) for k in (0, -1))
         left = np.linalg.norm(last - last.mean()) / np.linalg.norm(first - first.mean())
-        prose.print()
-        prose.print(
+        sheet.print()
+        sheet.print(
             f"Of the kick {100 * left:.0f} % of what tells the phases apart is left after "
-            f"{loop.relaxation.times_s[-1]:.1f} s; all phases over time with --json.",
-            markup=False,
+            f"{loop.relaxation.times_s[-1]:.1f} s; all phases over time with --json."
         )
-    prose.print(
+    sheet.print(
         "Method: d phi' = eps (diag(g cos D)(P - I) + diag(g sin D) R) d phi, nothing fitted; "
         f"g and D the gain and lag at {loop.frequency_hz:.3g} Hz"
         + (f", an age of {loop.age_s:g} s included" if loop.age_s > 0 else "")
         + "; intervals by drawing the errors of P, R, g and D anew.",
-        style="dim",
-        markup=False,
+        "dim",
     )
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+    return sheet.text()
+
+
+def _mode_table(loop: ClosedLoop) -> Table[tuple[int, LoopMode]]:
+    columns: list[Column[tuple[int, LoopMode]]] = [
+        Column("pattern", None, lambda row: str(row[0]), kind="word"),
+        Column("rate 1/s (95 %)", None, lambda row: formats.estimate(row[1].rate, most=5)),
+        Column("time s", None, lambda row: _time(row[1].rate.value or 0.0)),
+        Column("turns rad/s", None, lambda row: row[1].turning.value, (4, 4), spare=1),
+        Column("mostly in", None, lambda row: _mostly(row[1], loop.joints), kind="word", spare=2),
+    ]
+    return Table(columns, list(enumerate(loop.modes, start=1)))
+
+
+def _time(rate: float) -> str:
+    time = formats.number(1 / abs(rate), 1) if abs(rate) > 0 else formats.MISSING
+    return f"{time}{' (grows)' if rate < 0 else ''}"
 
 
 def _mostly(mode: LoopMode, joints: tuple[str, ...]) -> str:

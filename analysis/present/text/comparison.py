@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from undulog.capture.common.console import UNLIMITED, plain
 
-from ...compare.answer import WORDS, in_people_units, signed
+from ...compare.answer import WORDS
 from ...compare.decisions import SIGNIFICANT
 from ...results import formats
-from ...results.comparison import BODY, Change, Comparison, Difference, Equivalence
-from .table import put, sheet
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
+from ...results.comparison import Change, Comparison, Equivalence
+from ..tables import difference_table, waveform_table
+from .table import Sheet
 
 MOST_CHANGES = 12
 """Lines of what was changed; the rest is in the JSON."""
@@ -41,49 +37,27 @@ def render_comparison(
     Returns:
         Several lines, the last one ended.
     """
-    text, prose, wide = sheet(width, color=color)
-    prose.print(f"{comparison.answer}.", style="bold", markup=False)
+    sheet = Sheet(width, color=color)
+    sheet.print(f"{comparison.answer}.", "bold")
     for side, sessions in (("A", comparison.a), ("B", comparison.b)):
         names = ", ".join(plain(Path(one.path).name) for one in sessions)
-        prose.print(f"{side}: {names}", markup=False)
+        sheet.print(f"{side}: {names}")
     if comparison.partial is not None:
-        prose.print(f"Partial: {comparison.partial}", markup=False)
-    prose.print()
+        sheet.print(f"Partial: {comparison.partial}")
+    sheet.print()
     for line in _changed(comparison.changed):
-        prose.print(line, markup=False)
-    prose.print()
-    put(prose, wide, _table(comparison), [("in margins",), ("A", "B")])
+        sheet.print(line)
+    sheet.print()
+    sheet.table(difference_table(comparison))
     if comparison.waveforms:
-        prose.print()
-        put(prose, wide, _waveforms(comparison), [("at gait phase °",)])
-    prose.print()
-    prose.print(_equivalence(comparison), markup=False)
+        sheet.print()
+        sheet.table(waveform_table(comparison))
+    sheet.print()
+    sheet.print(_equivalence(comparison))
     for warning in comparison.warnings:
-        prose.print(f"Warning: {plain(warning)}", markup=False)
-    prose.print(f"Method: {method(comparison)}", style="dim", markup=False)
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
-
-
-def cells(one: Difference) -> tuple[str, str, str, str, str]:
-    """A difference as people read it.
-
-    Args:
-        one: The difference.
-
-    Returns:
-        A, B, B - A with its interval, Holm's p, size in margins.
-    """
-    factor = math.degrees(1) if one.unit == "rad" else 1.0
-    unit = {"rad": "°", "1": ""}.get(one.unit, f" {one.unit}")
-    digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
-    quantity, of = in_people_units(one)
-    return (
-        formats.number(one.a * factor, digits) + unit,
-        formats.number(one.b * factor, digits) + unit,
-        signed(quantity, of),
-        formats.p_value(one.p_holm),
-        f"{one.size:.2g}",
-    )
+        sheet.print(f"Warning: {plain(warning)}")
+    sheet.print(f"Method: {method(comparison)}", "dim")
+    return sheet.text()
 
 
 def _changed(changed: tuple[Change, ...]) -> list[str]:
@@ -97,41 +71,6 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
         lines.append(f"  {plain(one.name)}: {a} -> {b}")
     rest = len(changed) - MOST_CHANGES
     return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
-
-
-def _table(comparison: Comparison) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("joint", "quantity"):
-        table.add_column(name, no_wrap=True)
-    for name in ("A", "B", "B - A (95 %, all together)", "p (Holm)", "in margins"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for one in comparison.differences:
-        where = "the body" if one.place == BODY else one.place
-        style = "bold" if one.p_holm < SIGNIFICANT else ""
-        table.add_row(escape(plain(where)), WORDS[one.quantity], *cells(one), style=style)
-    return table
-
-
-def _waveforms(comparison: Comparison) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("mean cycle of", no_wrap=True)
-    for name in ("RMS of B - A °", "largest ° (95 %, by itself)", "at gait phase °"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for one in comparison.waveforms:
-        estimate = formats.degrees(one.largest)
-        table.add_row(
-            escape(plain(one.name)),
-            formats.number(math.degrees(one.rms_rad), 2),
-            signed(estimate, ""),
-            formats.number(math.degrees(one.largest_at_rad), 0),
-        )
-    return table
 
 
 def margin_told(one: Equivalence, value: float | None = None) -> str:

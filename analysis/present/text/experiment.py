@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from undulog.capture.common.console import UNLIMITED, plain
+from undulog.capture.common.console import UNLIMITED
 
 from ...experiment.answer import kick_detail, sweep_detail, sweep_method
 from ...experiment.reversal.modules import SIGNIFICANT
@@ -16,12 +15,9 @@ from ...results.coupling import LocalCoupling
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, FloorTilt, Headings, Reversal
 from ...results.sweep import LinearCoupling
+from ..tables import mirror_table, run_table
 from .oscillators import body_detail
-from .table import put, sheet
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
+from .table import Sheet
 
 _MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
 """How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
@@ -40,42 +36,38 @@ def render_experiment(
     Returns:
         Several lines, the last one ended.
     """
-    text, prose, wide = sheet(width, color=color)
+    sheet = Sheet(width, color=color)
     count = len(experiment.sessions)
-    prose.print(
-        f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.",
-        style="bold",
-        markup=False,
-    )
+    sheet.print(f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.", "bold")
     reversal = experiment.reversal
     if reversal is not None:
         for line in reversal_detail(reversal):
-            prose.print(line, markup=False)
-        prose.print()
-        put(prose, wide, _joint_table(reversal), [("its mirror",)])
+            sheet.print(line)
+        sheet.print()
+        sheet.table(mirror_table(reversal))
     if isinstance(experiment.coupling, LocalCoupling):
         for line in kick_detail(experiment.coupling):
-            prose.print(line, markup=False)
+            sheet.print(line)
     if experiment.oscillators is not None:
         for line in body_detail(experiment.oscillators):
-            prose.print(line, markup=False)
+            sheet.print(line)
     if isinstance(experiment.coupling, LinearCoupling):
         for line in sweep_detail(experiment.coupling):
-            prose.print(line, markup=False)
-    prose.print()
-    put(prose, wide, _run_table(experiment), [("wave",), ("Hz",)])
-    prose.print()
+            sheet.print(line)
+    sheet.print()
+    sheet.table(run_table(experiment))
+    sheet.print()
     own = [f"{warning} ({names})" for warning, names in by_warning(experiment)]
     for warning in (*experiment.warnings, *own):
-        prose.print(f"Warning: {warning}", markup=False)
+        sheet.print(f"Warning: {warning}")
     coupling = experiment.coupling
     if not coupling.identifiable:
         record = f" To identify it, record {coupling.record}." if coupling.record else ""
-        prose.print(f"Coupling: not identifiable: {coupling.why}.{record}", markup=False)
-    prose.print(f"Method: {method(experiment)}", style="dim", markup=False)
+        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    sheet.print(f"Method: {method(experiment)}", "dim")
     for note, names in by_note(experiment):
-        prose.print(f"Note: {note} ({names})", style="dim", markup=False)
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+        sheet.print(f"Note: {note} ({names})", "dim")
+    return sheet.text()
 
 
 def reversal_detail(reversal: Reversal) -> Iterable[str]:
@@ -134,46 +126,6 @@ def _gain(log_gain: Estimate) -> str:
 
 def _lag(lag_rad: Estimate) -> str:
     return formats.estimate(formats.degrees(lag_rad), "°", most=2)
-
-
-def _joint_table(reversal: Reversal) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("joint", "its mirror"):
-        table.add_column(name, no_wrap=True)
-    for name in ("gain % (95 %)", "lag° (95 %)", "p"):
-        table.add_column(name, justify="right", no_wrap=True)
-    gains = [formats.relative(one.log_gain_difference) for one in reversal.joints]
-    lags = [formats.degrees(one.lag_difference_rad) for one in reversal.joints]
-    digits = [formats.decimals_for(column, most=3) for column in (gains, lags)]
-    for one, *pair in zip(reversal.joints, gains, lags, strict=True):
-        cells = [
-            f"{formats.number(q.value, d)} {formats.interval(q.ci95, d)}".rstrip()
-            for q, d in zip(pair, digits, strict=True)
-        ]
-        table.add_row(escape(one.name), escape(one.mirror), *cells, formats.p_value(one.p))
-    return table
-
-
-def _run_table(experiment: Experiment) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("session", "wave"):
-        table.add_column(name, no_wrap=True)
-    table.add_column("Hz", justify="right", no_wrap=True)
-    table.add_column("role", no_wrap=True)
-    for run, session in zip(experiment.runs, experiment.sessions, strict=True):
-        table.add_row(
-            escape(plain(Path(run.path).name)),
-            run.wave or formats.MISSING,
-            formats.number(session.gait.frequency_hz.value, 3),
-            run.role or "left out",
-        )
-    return table
 
 
 def by_warning(experiment: Experiment) -> list[tuple[str, str]]:

@@ -1,0 +1,418 @@
+"""The tables of results, each described once: headings, values, digits, what is shown where.
+
+The terminal (:mod:`.text.table`) and the page (:mod:`.page.tables`) lay them out. JSON, pandas
+frames and Parquet hold every field of the same dataclasses in full and in SI units, so that their
+names and types follow from the fields (:mod:`.notebook.frames`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic, Literal, TypeVar
+
+from ..compare.answer import WORDS, in_people_units, signed
+from ..compare.decisions import SIGNIFICANT
+from ..results import formats
+from ..results.analysis import Analysis, BodyPoint, BodyResult, Index, JointResult
+from ..results.comparison import BODY, Comparison, Difference, NamedJoint, Waveform
+from ..results.estimate import Estimate
+from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
+from ..results.formats import degrees, scaled
+
+Row = TypeVar("Row")
+Digits = int | Callable[[Sequence[Estimate]], int]
+"""Digits after the point: fixed, or from all numbers of the column."""
+
+TERMINAL, PAGE = 0, 1
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number with its digits after the point and its unit, which has its own space."""
+
+    estimate: Estimate
+    decimals: int
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Ends:
+    """An interval in a cell of its own."""
+
+    low: Quantity
+    high: Quantity
+
+
+class PValue(float):
+    """A p-value."""
+
+
+Cell = str | int | Quantity | Ends | PValue | None
+"""What stands in a cell; None is printed as a dash."""
+
+
+@dataclass(frozen=True)
+class Column(Generic[Row]):
+    """A column of a table.
+
+    Attributes:
+        text: Heading on a terminal, with the unit; None: not shown there.
+        page: Heading on the page, with the unit; None: not shown there.
+        of: The cell of a row, or a number in the unit of the heading.
+        digits: Of numbers, on a terminal and on the page.
+        kind: Numbers are set to the right; sentences wrap on the page.
+        spare: A narrow terminal goes without the columns of the least number first; 0 stays.
+        note: What it is, shown above the table on the page.
+    """
+
+    text: str | None
+    page: str | None
+    of: Callable[[Row], Cell | Estimate | float]
+    digits: tuple[Digits, Digits] = (0, 0)
+    kind: Literal["number", "word", "sentence", "code"] = "number"
+    spare: int = 0
+    note: str = ""
+
+    def cells(self, rows: Sequence[Row], where: int) -> list[Cell]:
+        """The cells of the column.
+
+        Args:
+            rows: Of the table.
+            where: ``TERMINAL`` or ``PAGE``.
+
+        Returns:
+            One a row.
+        """
+        values = [_number(self.of(row)) for row in rows]
+        digits = self.digits[where]
+        if not isinstance(digits, int):
+            digits = digits([value for value in values if isinstance(value, Estimate)])
+        return [Quantity(one, digits) if isinstance(one, Estimate) else one for one in values]
+
+
+@dataclass(frozen=True)
+class Table(Generic[Row]):
+    """A table of a result.
+
+    Attributes:
+        columns: The columns; the first one on the page names the row.
+        rows: What each row is about.
+        bold: Whether a row is set in bold.
+        numbered: Whether rows are counted on the page.
+    """
+
+    columns: Sequence[Column[Row]]
+    rows: Sequence[Row]
+    bold: Callable[[Row], bool] = lambda _: False
+    numbered: bool = False
+
+    @property
+    def notes(self) -> str:
+        """The columns' notes, for the page."""
+        noted = [column for column in self.columns if column.note]
+        return "; ".join(f"{str(one.page).split(' [')[0]}: {one.note}" for one in noted)
+
+
+def _number(value: Cell | Estimate | float) -> Cell | Estimate:
+    """A value; a bare number as an estimate without interval."""
+    if isinstance(value, float) and not isinstance(value, PValue):
+        return Estimate(value)
+    return value
+
+
+def _p(p: float | None) -> PValue | None:
+    return None if p is None else PValue(p)
+
+
+def _typical(most: int) -> Callable[[Sequence[Estimate]], int]:
+    """Digits that the typical interval of the column deserves."""
+    return partial(formats.decimals_for, most=most)
+
+
+def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
+    """Digits that show so many of the column's largest value."""
+    return lambda column: formats.decimals_for_values((one.value for one in column), digits)
+
+
+_ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | None], ...] = (
+    ("E_net", "integral of torque times velocity", lambda j: j.energy_net_j, 3),
+    ("E_plus", "its positive part only", lambda j: j.energy_plus_j, None),
+    ("E_abs", "its absolute value", lambda j: j.energy_abs_j, 6),
+    ("E_el", "electrical, at the motor, signed", lambda j: j.energy_el_j, 4),
+    ("E_el+", "its positive part only (no regeneration)", lambda j: j.energy_el_clipped_j, None),
+)
+"""Name, note and value of each energy, and when a narrow terminal goes without; None: page only."""
+
+
+def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[JointResult]:
+    """The response of joints, on a terminal with their energies.
+
+    Args:
+        analysis: Whose joints.
+        joints: Those to show, in chain order.
+    """
+    frequency = Column[JointResult](
+        "Hz",
+        "frequency [Hz]",
+        lambda j: j.frequency_hz,
+        (3, 4),
+        note="of the joint's group, for command, gain and lag",
+    )
+    columns: list[Column[JointResult]] = [
+        Column("joint", "joint", lambda j: j.name, kind="word"),
+        Column("plane", "plane", lambda j: j.plane, kind="word", spare=1),
+        *([frequency] if len(analysis.gait.groups) > 1 else []),
+        Column(
+            "command°",
+            "command [°]",
+            lambda j: degrees(Estimate(j.command_amplitude_rad)),
+            (1, 2),
+            spare=5,
+            note="amplitude of the command at the gait frequency",
+        ),
+        Column(
+            "gain (95 %)",
+            "gain [1]",
+            lambda j: j.gain,
+            (_typical(4), _typical(4)),
+            note="amplitude of the response over that of the command",
+        ),
+        Column(
+            "lag° (95 %)",
+            "lag [°]",
+            lambda j: degrees(j.lag_rad),
+            (_typical(2), _typical(3)),
+            note="response behind command, positive is late",
+        ),
+        *(
+            Column[JointResult](f"{name} J", None, of, (_significant(3), 0), spare=spare)
+            for name, _, of, spare in _ENERGIES
+            if spare is not None and any(of(j) is not None for j in joints)
+        ),
+        Column("cover", None, lambda j: formats.coverage(j.coverage), spare=2),
+        Column(None, "coverage [%]", lambda j: 100 * j.coverage, (0, 1)),
+        Column(None, "samples", lambda j: j.samples),
+        Column("flags", None, lambda j: " ".join(j.flags), kind="word"),
+        Column(None, "flags", lambda j: ", ".join(j.flags), kind="word"),
+    ]
+    return Table(columns, joints, numbered=True)
+
+
+def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
+    """The energies of every joint over the analysed windows, all with the same digits.
+
+    Args:
+        joints: In chain order.
+    """
+    every = [Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints]
+    digits = _significant(4)(every)
+    columns: list[Column[JointResult]] = [Column(None, "joint", lambda j: j.name, kind="word")]
+    for name, note, of, _ in _ENERGIES:
+        columns.append(Column(None, f"{name} [J]", of, (0, digits), note=note))
+    return Table(columns, joints, numbered=True)
+
+
+def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
+    """Head, middle and tail, for a terminal: measured, and the nulls beside it.
+
+    Args:
+        body: The motion.
+    """
+    columns: list[Column[tuple[BodyPoint, ...]]] = [
+        Column(f"body, {body.plane}", None, lambda points: points[0].place, kind="word"),
+        Column("link", None, lambda points: points[0].link, kind="word"),
+    ]
+    names = [("seen mm (95 %)", "phase° (95 %)"), *((f"{n} null mm", "phase°") for n in body.null)]
+    for k, (amplitude, phase) in enumerate(names):
+        columns += [
+            Column(amplitude, None, partial(_amplitude_mm, k), (1, 1), spare=2 if k else 0),
+            Column(phase, None, partial(_phase_deg, k), (1, 1), spare=1 if k else 0),
+        ]
+    return Table(columns, list(zip(body.observed, *body.null.values(), strict=True)))
+
+
+def _amplitude_mm(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
+    return scaled(points[k].amplitude_m, 1000.0)
+
+
+def _phase_deg(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
+    return degrees(points[k].phase_rad)
+
+
+def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
+    """Head, middle and tail, for the page: measured, and the nulls below it.
+
+    Args:
+        body: The motion.
+    """
+    rows: list[tuple[str, BodyPoint]] = []
+    for point in body.observed:
+        rows.append(("measured", point))
+        for name, nulls in body.null.items():
+            rows += [(f"perfect tracking, {name}", n) for n in nulls if n.place == point.place]
+    columns: list[Column[tuple[str, BodyPoint]]] = [
+        Column(None, "place", lambda row: row[1].place, kind="word"),
+        Column(None, "link", lambda row: row[1].link, kind="word"),
+        Column(None, "of", lambda row: row[0], kind="word"),
+        Column(None, "amplitude [mm]", lambda row: scaled(row[1].amplitude_m, 1000.0), (1, 1)),
+        Column(None, "phase [°]", lambda row: degrees(row[1].phase_rad), (1, 1)),
+    ]
+    return Table(columns, rows)
+
+
+def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
+    """Heterogeneity indices.
+
+    Args:
+        indices: Name to index.
+    """
+
+    def value(index: Index) -> Estimate:
+        return scaled(Estimate(index.value, index.ci95), math.degrees(1) if rad(index) else 1.0)
+
+    def rad(index: Index) -> bool:
+        return index.unit == "rad"
+
+    def on_page(index: Index, number: float | None) -> Quantity:
+        unit = {"rad": "°", "1": ""}.get(index.unit, index.unit)
+        return Quantity(Estimate(number), formats.decimals_for([value(index)], least=0), unit)
+
+    def ends(index: Index) -> Ends | None:
+        ci95 = value(index).ci95
+        return None if ci95 is None else Ends(on_page(index, ci95[0]), on_page(index, ci95[1]))
+
+    columns: list[Column[tuple[str, Index]]] = [
+        Column("index", "index", lambda row: row[0], kind="code"),
+        Column(None, "what it measures", lambda row: row[1].label, kind="sentence"),
+        Column("value (95 %)", None, lambda row: value(row[1]), (4, 0)),
+        Column(None, "value", lambda row: on_page(row[1], value(row[1]).value)),
+        Column(None, "95 % interval", lambda row: ends(row[1])),
+        Column("unit", None, lambda row: "°" if rad(row[1]) else row[1].unit, spare=2),
+        Column("p", "p", lambda row: _p(row[1].p)),
+        Column("what", None, lambda row: row[1].label, kind="word", spare=1),
+    ]
+    return Table(columns, list(indices.items()))
+
+
+def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
+    """Each joint against its mirror joint.
+
+    Args:
+        reversal: The test.
+    """
+    relative, most = formats.relative, (_typical(3), _typical(5))
+    columns: list[Column[MirrorJoint]] = [
+        Column("joint", "joint", lambda one: one.name, kind="word"),
+        Column("its mirror", "its mirror", lambda one: one.mirror, kind="word", spare=1),
+        Column("gain % (95 %)", "gain [%]", lambda one: relative(one.log_gain_difference), most),
+        Column("lag° (95 %)", "lag [°]", lambda one: degrees(one.lag_difference_rad), most),
+        Column("p", "p", lambda one: _p(one.p)),
+    ]
+    return Table(columns, reversal.joints)
+
+
+def run_table(experiment: Experiment) -> Table[tuple[Run, Analysis]]:
+    """The sessions of an experiment.
+
+    Args:
+        experiment: The numbers.
+    """
+
+    def start(session: Analysis) -> str:
+        return formats.utc(session.session.start_ns).replace(" UTC", "")
+
+    columns: list[Column[tuple[Run, Analysis]]] = [
+        Column("session", "session", lambda row: formats.filename(row[0].path), kind="word"),
+        Column(None, "robot", lambda row: row[1].session.robot, kind="word"),
+        Column(None, "start [UTC]", lambda row: start(row[1]), kind="word"),
+        Column(None, "length [s]", lambda row: row[1].session.duration_s, (1, 1)),
+        Column("wave", "wave", lambda row: row[0].wave, kind="word", spare=1),
+        Column("Hz", "frequency [Hz]", lambda row: row[1].gait.frequency_hz.value, (3, 4), spare=2),
+        Column("role", "role", lambda row: row[0].role or "left out", kind="word"),
+        Column(None, "recorder", lambda row: row[1].session.verdict, kind="word"),
+        Column(None, "warnings", lambda row: len(row[1].warnings)),
+    ]
+    return Table(columns, list(zip(experiment.runs, experiment.sessions, strict=True)))
+
+
+def difference_table(comparison: Comparison) -> Table[Difference]:
+    """Every quantity of both sides.
+
+    Args:
+        comparison: The numbers.
+    """
+    columns: list[Column[Difference]] = [
+        Column("joint", "where", lambda one: _place(one.place), kind="word"),
+        Column("quantity", "quantity", lambda one: WORDS[one.quantity], kind="word"),
+        Column("A", "A", lambda one: _side(one, one.a), spare=2),
+        Column("B", "B", lambda one: _side(one, one.b), spare=2),
+        Column("B - A (95 %, all together)", None, lambda one: signed(*in_people_units(one))),
+        Column(None, "B minus A", _difference),
+        Column("p (Holm)", "p (Holm)", lambda one: _p(one.p_holm)),
+        Column("in margins", None, lambda one: f"{one.size:.2g}", spare=1),
+        Column(None, "size [margins]", lambda one: one.size, (0, 2)),
+    ]
+    rows = comparison.differences
+    return Table(columns, rows, bold=lambda one: one.p_holm < SIGNIFICANT)
+
+
+def _place(place: str) -> str:
+    return "the body" if place == BODY else place
+
+
+def _side(one: Difference, value: float) -> str:
+    """The value of a side, with the digits and the unit of both."""
+    factor = math.degrees(1) if one.unit == "rad" else 1.0
+    unit = {"rad": "°", "1": ""}.get(one.unit, f" {one.unit}")
+    digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
+    return formats.number(value * factor, digits) + unit
+
+
+def _difference(one: Difference) -> Quantity:
+    quantity, unit = in_people_units(one)
+    return Quantity(quantity, formats.decimals_for([quantity], most=2), unit)
+
+
+def named_table(comparison: Comparison) -> Table[NamedJoint]:
+    """The joints that differ, the largest difference first.
+
+    Args:
+        comparison: The numbers.
+    """
+    known = {(one.place, one.quantity): _difference(one) for one in comparison.differences}
+    columns: list[Column[NamedJoint]] = [
+        Column(None, "joint", lambda one: one.name, kind="word"),
+        Column(None, "gain, B over A", lambda one: known.get((one.name, "gain"))),
+        Column(None, "lag, B minus A", lambda one: known.get((one.name, "lag"))),
+        Column(None, "size [margins]", lambda one: one.size, (0, 1)),
+        Column(None, "p (Holm)", lambda one: _p(one.p_holm)),
+    ]
+    return Table(columns, comparison.named, numbered=True)
+
+
+def waveform_table(comparison: Comparison) -> Table[Waveform]:
+    """How far the mean cycles of each joint are apart.
+
+    Args:
+        comparison: The numbers.
+    """
+    most, rms = "largest ° (95 %, by itself)", "RMS of B - A °"
+    columns: list[Column[Waveform]] = [
+        Column("mean cycle of", "joint", lambda one: one.name, kind="word"),
+        Column(rms, "RMS [°]", lambda one: math.degrees(one.rms_rad), (2, 3)),
+        Column(most, None, lambda one: signed(degrees(one.largest), "")),
+        Column(None, "largest [°]", lambda one: degrees(one.largest), (2, 2)),
+        Column(
+            "at gait phase °",
+            "at gait phase [°]",
+            lambda one: math.degrees(one.largest_at_rad),
+            spare=1,
+        ),
+    ]
+    return Table(columns, comparison.waveforms)
+
+
+AnyTable = Table[Any]
