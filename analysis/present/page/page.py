@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -246,9 +247,15 @@ def _environment() -> Environment:
         "again": _commands_to_make_it_again,
     }
     environment.filters.update(filters)
-    environment.globals.update(
-        tables=tables, grid=grid, num=number, est=estimate, p=p_value, known=known
-    )
+    functions: dict[str, Any] = {
+        "tables": tables,
+        "grid": grid,
+        "num": number,
+        "est": estimate,
+        "p": p_value,
+        "known": known,
+    }
+    environment.globals.update(functions)
     return environment
 
 
