@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -14,10 +15,18 @@ from numpy.typing import NDArray
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, RobotFileError
+from undulog.capture.log.columns.layouts import (
+    LayoutSorter,
+    Matrix,
+    names_of,
+    stamps_of,
+    values_of,
+)
 from undulog.capture.log.messages.cdr import Layout, layout_of
 from undulog.capture.log.messages.rosmsg import MessageType, parse_message_type
 from undulog.capture.log.read.joint_reader import OFFSET_TOPICS
 from undulog.capture.log.read.joint_rows import JointRows, merge_rows
+from undulog.capture.log.read.own_times import clock_shift_ns, moved
 from undulog.capture.log.sinks.sink import Description
 from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
@@ -28,10 +37,7 @@ from ..draw.scene.motion import POSE, HeadPath, tracked_head
 from ..samples.sampling import ordered
 from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, without_filler
 
-_NS = 1_000_000_000
-_FAR_NS = 3600 * _NS
 _OFFSETS_KEPT = 64
-_LAYOUTS_KEPT = 64
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _RANGE = "sensor_msgs/msg/Range"
@@ -73,22 +79,12 @@ class _Group:
     """Messages of one layout, a row each."""
 
     layout: Layout
+    t_ns: IntArray
     log_ns: IntArray
-    matrix: NDArray[np.uint8]
+    matrix: Matrix
 
     def values(self, path: str) -> NDArray[Any]:
-        """All values of one field, shape (n, count); (n, 0) where the layout hasn't it."""
-        leaf = self.layout.leaves.get(path)
-        if leaf is None:
-            return np.empty((len(self.matrix), 0))
-        stop = leaf.offset + leaf.count * np.dtype(leaf.dtype).itemsize
-        return np.ascontiguousarray(self.matrix[:, leaf.offset : stop]).view(leaf.dtype)
-
-    @property
-    def stamps(self) -> IntArray:
-        """header.stamp [ns], shape (n,)."""
-        seconds = self.values("header.stamp.sec")[:, 0].astype(np.int64)
-        return seconds * _NS + self.values("header.stamp.nanosec")[:, 0].astype(np.int64)
+        return values_of(self.layout, path, self.matrix)
 
 
 @dataclass
@@ -98,7 +94,7 @@ class _Topic:
     channel: Channel
     schema: Schema
     kind: MessageType
-    known: list[Layout] = field(default_factory=list[Layout])
+    sorter: LayoutSorter
     decode: Callable[[bytes], Any] | None = None
 
 
@@ -190,7 +186,7 @@ class LiveLog:
         if schema is None or (known is not None and known.channel == channel):
             return
         kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
-        self._topics[channel.id] = _Topic(channel, schema, kind)
+        self._topics[channel.id] = _Topic(channel, schema, kind, _sorter(kind))
 
     def _read_robot(self) -> None:
         """Read the robot from the files that have come so far."""
@@ -215,12 +211,12 @@ class LiveLog:
             groups = self._groups(topic, messages)
             if groups:
                 poses = [np.concatenate([g.values(p) for p in POSE], axis=1) for g in groups]
-                t_ns = np.concatenate([self._stamps(group) for group in groups])
+                t_ns = np.concatenate([group.t_ns for group in groups])
                 batch.head = tracked_head(t_ns, np.concatenate(poses).astype(np.float64))
         elif type_name == _RANGE:
             groups = self._groups(topic, messages)
             if groups:
-                t_ns = np.concatenate([self._stamps(group) for group in groups])
+                t_ns = np.concatenate([group.t_ns for group in groups])
                 values = np.concatenate([group.values("range")[:, 0] for group in groups])
                 batch.ranges[name] = ordered(t_ns, values.astype(np.float64))
         elif type_name == _STRING and name == MODE:
@@ -233,11 +229,11 @@ class LiveLog:
         fields = ("position", "velocity", "effort") if name == "/joint_states" else ("position",)
         groups = self._groups(topic, messages)
         if name in OFFSETS:
-            self._keep_offsets(name, [self._joint_rows(group, "position") for group in groups])
+            self._keep_offsets(name, [_joint_rows(group, "position") for group in groups])
             return
         own: dict[tuple[str, int], IntArray] = {}  # the fields of a message share their times
         for one in fields:
-            rows = [self._joint_rows(group, one) for group in groups]
+            rows = [_joint_rows(group, one) for group in groups]
             tracks = self._tracks(name, one, [row for row in rows if row.values.size], own)
             if tracks:
                 batch.columns[name, one] = tracks
@@ -256,7 +252,7 @@ class LiveLog:
             if name in offsets:
                 key = name, t_ns.size
                 if key not in own:
-                    own[key] = _own_times(t_ns, *offsets[name])
+                    own[key] = moved(t_ns, *offsets[name])
                 t_ns = own[key]  # noqa: PLW2901
             track = without_filler(Track(name, *ordered(t_ns, column)))
             if np.isfinite(track.values).any():
@@ -276,22 +272,12 @@ class LiveLog:
             joined = ordered(np.concatenate([old_t, t_ns]), np.concatenate([old, column]))
             kept[name] = joined[0][-_OFFSETS_KEPT:], joined[1][-_OFFSETS_KEPT:]
 
-    def _joint_rows(self, group: _Group, one: str) -> JointRows:
-        strings = group.layout.strings
-        names = tuple(text for path, text in strings.items() if path.startswith("name["))
-        values = group.values(one).astype(np.float64)
-        return JointRows(names, self._stamps(group), group.log_ns, values)
-
-    def _stamps(self, group: _Group) -> IntArray:
-        return self._shifted(group.stamps, group.log_ns)
-
-    def _shifted(self, stamp_ns: IntArray, log_ns: IntArray) -> IntArray:
+    def _on_log_clock(self, stamp_ns: IntArray | None, log_ns: IntArray) -> IntArray:
         """Stamps on the log's clock; see :mod:`.capture.log.read.own_times`."""
-        if not stamp_ns.any():
+        if stamp_ns is None or not stamp_ns.any():
             return log_ns
         if self._shift_ns is None:
-            apart = int(log_ns[0] - stamp_ns[0])
-            self._shift_ns = round(apart / _NS) * _NS if abs(apart) > _FAR_NS else 0
+            self._shift_ns = clock_shift_ns(int(stamp_ns[0]), int(log_ns[0]))
         return stamp_ns + self._shift_ns
 
     def _groups(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[_Group]:
@@ -304,19 +290,15 @@ class LiveLog:
             data = np.frombuffer(b"".join(one.payload for one in rest), dtype=np.uint8)
             matrix = data.reshape(len(rest), length)
             log_ns = np.array([one.log_time_ns for one in rest], dtype=np.int64)
-            known = [layout for layout in topic.known if layout.length == length]
-            while len(matrix):
-                try:
-                    layout = known.pop(0) if known else _learn(topic, matrix[0].tobytes())
-                except DataError:
+            for rows, layout, *_ in topic.sorter.sort(matrix):
+                if isinstance(layout, DataError):
                     self.unread += 1
-                    matrix, log_ns = matrix[1:], log_ns[1:]
-                    continue
-                example = np.frombuffer(layout.example, dtype=np.uint8)[layout.static]
-                fits = (matrix[:, layout.static] == example).all(axis=1)
-                if fits.any():
-                    found.append(_Group(layout, log_ns[fits], matrix[fits]))
-                matrix, log_ns = matrix[~fits], log_ns[~fits]
+                else:
+                    own, own_log_ns = matrix[rows], log_ns[rows]
+                    t_ns = self._on_log_clock(stamps_of(layout, own), own_log_ns)
+                    found.append(_Group(layout, t_ns, own_log_ns, own))
+        if topic.sorter.is_full:
+            topic.sorter = _sorter(topic.kind)
         return found
 
     def _general(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[tuple[int, Any]]:
@@ -334,18 +316,13 @@ class LiveLog:
         return found
 
 
-def _learn(topic: _Topic, example: bytes) -> Layout:
-    layout = layout_of(topic.kind, example)
-    topic.known.append(layout)
-    del topic.known[:-_LAYOUTS_KEPT]
-    return layout
+def _joint_rows(group: _Group, one: str) -> JointRows:
+    values = group.values(one).astype(np.float64)
+    return JointRows(names_of(group.layout), group.t_ns, group.log_ns, values)
 
 
-def _own_times(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
-    """Stamps plus the offset that was logged with each, or last before it [ns], shape (n,)."""
-    last = np.maximum(np.searchsorted(stamp_ns, t_ns, side="right") - 1, 0)
-    offset = np.nan_to_num(offset_s[last], nan=0.0, posinf=0.0, neginf=0.0)
-    return t_ns + np.rint(offset * _NS).astype(np.int64)
+def _sorter(kind: MessageType) -> LayoutSorter:
+    return LayoutSorter(partial(layout_of, kind), in_all=True)
 
 
 def _say_nothing(_sentence: str) -> None:

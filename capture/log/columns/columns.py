@@ -24,11 +24,11 @@ from ..messages.cdr import Layout, layout_of
 from ..messages.rosmsg import MessageType
 from ..messages.schemas import JOINT_STATE
 from .batches import Records, Window, blocks_in, record_batches
-from .groups import MOST_JOINT_LISTS, Group, Matrix, Stamping, fits_layout
+from .groups import Group, Stamping
+from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, LayoutSorter
 from .stores import TimeStore
 
 _LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
-_MAX_LAYOUTS = 64
 _MAX_SHARED = 8
 _HELD = 8
 """Batches after which what was read is let go of, where columns lie in files."""
@@ -68,6 +68,20 @@ class Request:
     message_type: MessageType
     paths: Sequence[str] | None = None
     layouts: dict[int, Layout] = field(default_factory=dict[int, Layout])
+
+    def layout(self, message: bytes) -> Layout:
+        """Return the layout of a message, found anew unless it is that of an earlier reading.
+
+        Raises:
+            DataError: If it has none.
+        """
+        known = self.layouts.get(len(message))
+        if known is not None and known.fits(message):
+            return known
+        found = layout_of(self.message_type, message)
+        if known is not None or len(self.layouts) < MOST_LAYOUTS:
+            self.layouts[len(message)] = found
+        return found
 
 
 @dataclass
@@ -190,13 +204,13 @@ class _GroupReader:
         stamping: Stamping,
         pages: FilePages | None,
     ) -> None:
-        self._topic, self._type = request.topic, request.message_type
-        self._most = MOST_JOINT_LISTS if self._type.name == JOINT_STATE else None
+        self._topic = request.topic
+        self._most = MOST_JOINT_LISTS if request.message_type.name == JOINT_STATE else None
         self._paths = None if request.paths is None else frozenset(request.paths)
-        self._layouts = request.layouts
         self._expected, self._reserve = expected, reserve
         self._shared, self._stamping, self._pages = shared, stamping, pages
-        self._by_length: dict[int, list[Group]] = {}
+        self._sorter = LayoutSorter(request.layout)
+        self._usual: dict[int, Group] = {}  # the first of each length
         self._count = 0
         self.groups: list[Group] = []
         self.unread: list[Unread] = []
@@ -216,9 +230,9 @@ class _GroupReader:
         first = self._count
         self._count += len(places)
         if length is not None:
-            known = self._by_length.get(length)
-            if known and known[0].holds(places):  # the usual case
-                known[0].take(places, log_ns, range(first, self._count))
+            usual = self._usual.get(length)
+            if usual is not None and usual.holds(places):
+                usual.take(places, log_ns, range(first, self._count))
             else:
                 self._sort_in(length, places, log_ns, np.arange(first, self._count))
             return
@@ -230,56 +244,25 @@ class _GroupReader:
 
     def _sort_in(self, length: int, places: Places, log_ns: IntArray, order: IntArray) -> None:
         """Take messages of one length, whatever their layouts."""
-        matrix = _matrix(places, length)
-        known = self._by_length.setdefault(length, [])
-        for group in known:
-            fits = fits_layout(matrix, group.layout)
-            if fits.any():
-                group.take(places.take(fits), log_ns[fits], order[fits])
-                rest = ~fits
-                matrix, places = matrix[rest], places.take(rest)
-                log_ns, order = log_ns[rest], order[rest]
-            if not len(places):
-                return
-        while len(places):
-            example = matrix[0].tobytes()
-            try:
-                layout = self._layout(example)
-            except DataError as error:
-                self.unread.append(Unread(int(log_ns[0]), example, str(error)))
-                matrix, places = matrix[1:], places.take(slice(1, None))
-                log_ns, order = log_ns[1:], order[1:]
+        matrix = places.rows(np.dtype(np.uint8), length, 0)
+        for rows, layout, number, _ in self._sorter.sort(matrix):
+            if isinstance(layout, DataError):
+                (row,) = rows.tolist()
+                self.unread.append(Unread(int(log_ns[row]), matrix[row].tobytes(), str(layout)))
                 continue
-            if self._most is not None and len(self.groups) >= self._most:
-                raise DataError(
-                    f"{self._topic} has more than {self._most} different lists of joints or frame "
-                    "ids; give each robot a topic of its own"
-                )
-            if len(known) < _MAX_LAYOUTS:
-                fits = fits_layout(matrix, layout)
-                group = self._group(layout, self._capacity(length, int(fits.sum())))
-                known.append(group)
-                rest = ~fits
-            else:  # text has a layout a message: don't hold every later message against each
-                group = self._new_group(layout, 1)
-                fits, rest = slice(0, 1), slice(1, None)
-            self.groups.append(group)
-            group.take(places.take(fits), log_ns[fits], order[fits])
-            matrix, places = matrix[rest], places.take(rest)
-            log_ns, order = log_ns[rest], order[rest]
-
-    def _layout(self, message: bytes) -> Layout:
-        """The layout of a message, found anew unless it is that of an earlier reading."""
-        known = self._layouts.get(len(message))
-        if known is not None and known.fits(message):
-            return known
-        found = layout_of(self._type, message)
-        if known is not None or len(self._layouts) < _MAX_LAYOUTS:
-            self._layouts[len(message)] = found
-        return found
+            if number == len(self.groups):
+                group = self._group(layout, self._capacity(length, len(rows)))
+                self._usual.setdefault(length, group)
+                self.groups.append(group)
+            self.groups[number].take(places.take(rows), log_ns[rows], order[rows])
 
     def _group(self, layout: Layout, capacity: int) -> Group:
-        """A group; the first of a topic may have the times of another topic's first."""
+        """A new group; the first of a topic may have the times of another topic's first."""
+        if self._most is not None and len(self.groups) >= self._most:
+            raise DataError(
+                f"{self._topic} has more than {self._most} different lists of joints or frame "
+                "ids; give each robot a topic of its own"
+            )
         if self.groups:
             return self._new_group(layout, capacity)
         group = self._new_group(layout, capacity, tuple(self._shared))
@@ -299,8 +282,3 @@ class _GroupReader:
         if self.groups:
             return 2 * seen
         return max(seen, min(self._expected, self._reserve // max(length, 1)))
-
-
-def _matrix(places: Places, length: int) -> Matrix:
-    """Messages of one length as rows of bytes."""
-    return places.rows(np.dtype(np.uint8), length, 0)

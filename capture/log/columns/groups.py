@@ -12,19 +12,11 @@ from ...common.arrays import IntArray
 from ..file.pages import FilePages
 from ..mcap.message_heads import Places
 from ..messages.cdr import Layout, Leaf
+from .layouts import TIME, stamp_leaves, time_ns
 from .stores import ColumnStore, Times, TimeStore
 
-_STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
-_NS = 1_000_000_000
 _COMPARED = 1 << 17
 """Bytes of constant parts that are compared at once: few enough to stay in the cache."""
-
-MOST_JOINT_LISTS = 256
-"""Lists of joints (with frame id) of one topic: each takes the time of many usual messages."""
-
-_STAMP_KIND = np.dtype([("seconds", "<i4"), ("rest", "<u4")])
-
-Matrix = NDArray[np.uint8]
 
 
 class Stamping:
@@ -53,7 +45,8 @@ class Stamping:
         seconds, rest = stamp
         pair = (seconds.dtype, rest.dtype, rest.offset - seconds.offset)
         if pair != ("<i4", "<u4", 4):
-            return Times.of(log_ns, _stamp_ns(places, seconds, rest))
+            parts = (places.field(leaf.dtype, leaf.offset) for leaf in stamp)
+            return Times.of(log_ns, time_ns(*parts))
         raw = np.ascontiguousarray(places.field("V8", seconds.offset)).view("<i8")
         known = self._times
         if (
@@ -62,11 +55,9 @@ class Stamping:
             and np.array_equal(log_ns, known.log_ns)
         ):
             return known
-        halves = raw.view(_STAMP_KIND)
-        stamp_ns = halves["seconds"].astype(np.int64)
-        stamp_ns *= _NS
-        stamp_ns += halves["rest"]
-        self._raw, self._times = raw, Times.of(log_ns, stamp_ns)
+        parts = raw.view(TIME)
+        self._raw = raw
+        self._times = Times.of(log_ns, time_ns(parts["sec"], parts["nanosec"]))
         return self._times
 
 
@@ -103,9 +94,8 @@ class Group:
         self.layout = layout
         self._stamping = stamping or Stamping()
         leaves = layout.leaves
-        stamps = [pair for pair in _STAMPS if all(path in leaves for path in pair)]
-        self._stamp = (leaves[stamps[0][0]], leaves[stamps[0][1]]) if stamps else None
-        self.is_stamped = bool(stamps)
+        self._stamp = stamp_leaves(layout)
+        self.is_stamped = self._stamp is not None
         self.strings = {
             path: text for path, text in layout.strings.items() if paths is None or path in paths
         }
@@ -192,35 +182,3 @@ class Group:
             self.kept_times.append(Times(log_ns))
         for kind, count, start, store in self._parts:
             store.append(places.rows(kind, count, start))
-
-
-def _stamp_ns(places: Places, seconds: Leaf, rest: Leaf) -> IntArray:
-    """Stamps of messages [ns], shape (n,)."""
-    stamps = places.field(seconds.dtype, seconds.offset).astype(np.int64)
-    stamps *= _NS
-    stamps += places.field(rest.dtype, rest.offset).astype(np.int64)
-    return stamps
-
-
-def fits_layout(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
-    """Which messages have a layout's strings and sequence lengths.
-
-    Args:
-        matrix: Messages of the layout's length, shape (n, length).
-        layout: The layout.
-
-    Returns:
-        Shape (n,).
-    """
-    example = np.frombuffer(layout.example, dtype=np.uint8)
-    equal = [matrix[:, start:stop] == example[start:stop] for start, stop in layout.hull]
-    fits = np.ones(len(matrix), dtype=bool)
-    if all(part.all() for part in equal):  # the usual case, and a much faster reduction
-        return fits
-    for part in equal:
-        fits &= part.all(axis=1)
-    doubtful = np.flatnonzero(~fits)
-    if doubtful.size:  # the difference may lie in padding alone
-        static = layout.static
-        fits[doubtful] = (matrix[np.ix_(doubtful, static)] == example[static]).all(axis=1)
-    return fits

@@ -31,6 +31,7 @@ from mcap.records import Schema
 from ...common.console import progress
 from ...common.errors import DataError, UsageError
 from ...common.interruption import StopRequest
+from ..columns.layouts import names_of
 from ..columns.topics import Topics
 from ..messages.cdr import layout_of
 from ..messages.rosmsg import parse_message_type
@@ -357,8 +358,7 @@ def _joint_names(source: RawLog) -> set[str]:
         if channel.type_name == JOINT_STATE and channel.is_ros2 and channel.count:
             with suppress(DataError):  # damage has no names; whoever reads the topic is told
                 first = topics.first(topic)
-                strings = {} if first is None else layout_of(first[2], first[1]).strings
-                found |= {name for path, name in strings.items() if path.startswith("name[")}
+                found.update(() if first is None else names_of(layout_of(first[2], first[1])))
     return found
 
 

@@ -6,14 +6,25 @@ of a look is shared, and memory holds one batch a channel however long the sessi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError
-from ..columns.groups import MOST_JOINT_LISTS, fits_layout
+from ..columns.layouts import (
+    MOST_JOINT_LISTS,
+    MOST_LAYOUTS,
+    TIME,
+    LayoutSorter,
+    Matrix,
+    names_of,
+    time_ns,
+    values_of,
+)
 from ..mcap.chunk import LAST_NS, Buffer
 from ..mcap.message_heads import BODY_AT, FIXED_SIZE, gather
 from ..messages.cdr import Layout, layout_of
@@ -30,18 +41,16 @@ from ..messages.rosmsg import MessageType
 from .bus_tally import BusTally
 from .freeze import RangeTally
 from .health import LIMIT_RAD
-from .tallies import NS, SequenceTally, TimingTally
+from .tallies import SequenceTally, TimingTally
 
 _STAMP_AT = 4  # a leading Header or Time follows the encapsulation header at once
 _BATCH_ROWS = 4096
 _BATCH_BYTES = 1 << 21
-_MAX_LAYOUTS = 64
 _FIELDS = ("position", "velocity", "effort")
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 Limits = dict[str, tuple[float, float]]
-Matrix = NDArray[np.uint8]
 
 
 @dataclass
@@ -133,9 +142,7 @@ class ChannelScan:
         self._limits = limits
         self._stamped = kind is not None and _is_stamped(kind)
         self._horizon_s = horizon_s
-        self._text = kind is not None and not joints and not kind.has_floats
-        self._layouts: dict[int, list[Layout]] = {}
-        self._layout_count = 0
+        self._sorter = None if kind is None else _sorter(kind, joints=joints)
         self._log: list[NDArray[np.uint64]] = []
         self._sequence: list[NDArray[np.uint32]] = []
         self._pending: list[tuple[IntArray, Matrix]] = []  # rows of the batch, their messages
@@ -206,22 +213,21 @@ class ChannelScan:
             else (np.concatenate([r for r, _ in parts]), np.concatenate([m for _, m in parts]))
             for parts in by_length.values()
         ]
-        kind = self.kind
         if self._keeps_ends:
             self._keep_ends(whole)
         stamps = log_ns.copy()
         if self._stamped:
             for rows, matrix in whole:
                 _stamp(stamps, rows, matrix)
-        if kind is not None and self._joints:
-            self._add_joints(kind, whole, stamps, log_ns)
+        if self._joints:
+            self._add_joints(whole, stamps, log_ns)
             return
         series = self._add_times((), stamps, log_ns)
-        if kind is not None and self.bus is not None:
-            self._add_frames(self.bus, kind, whole, len(log_ns))
-        elif kind is not None:
-            for rows, matrix in whole:
-                for _, _, layout, part in self._split(kind, rows, matrix):
+        if self.kind is not None and self.bus is not None:
+            self._add_frames(self.bus, self.kind, whole, len(log_ns))
+        else:
+            for _, matrix in whole:
+                for layout, _, part in self._by_layout(matrix):
                     _count_nan(series, layout, part)
 
     def _series_of(self, names: tuple[str, ...]) -> Series:
@@ -247,15 +253,12 @@ class ChannelScan:
         return series
 
     def _add_joints(
-        self,
-        kind: MessageType,
-        whole: list[tuple[IntArray, Matrix]],
-        stamps: IntArray,
-        log_ns: IntArray,
+        self, whole: list[tuple[IntArray, Matrix]], stamps: IntArray, log_ns: IntArray
     ) -> None:
         places: dict[tuple[str, ...], list[IntArray]] = {}
         for rows, matrix in whole:
-            for names, chosen, layout, part in self._split(kind, rows, matrix):
+            for layout, own, part in self._by_layout(matrix):
+                names, chosen = names_of(layout), rows[own]
                 places.setdefault(names, []).append(chosen)
                 series = self._series_of(names)
                 _count_nan(series, layout, part)
@@ -265,13 +268,13 @@ class ChannelScan:
             self._add_times(names, stamps[ordered], log_ns[ordered])
 
     def _add_values(self, series: Series, layout: Layout, part: Matrix, stamps: IntArray) -> None:
-        fields = [_values(layout, name, part) for name in _FIELDS]
+        fields = [_numbers(layout, name, part) for name in _FIELDS]
         fields = [values for values in fields if values.shape[1] == len(series.names) > 0]
         if not fields:
             return
         series.rows += len(part)
         series.joint_nan += np.any([np.isnan(values) for values in fields], axis=0).sum(axis=0)
-        angles = _values(layout, "position", part)
+        angles = _numbers(layout, "position", part)
         if self._limits is None or angles.shape[1] != len(series.names):
             return
         series.ranges.add(stamps, angles)
@@ -307,40 +310,24 @@ class ChannelScan:
             frames[starts[rows][:, None] + np.arange(records.shape[1])] = records
         bus.add(frames)
 
-    def _split(
-        self, kind: MessageType, rows: IntArray, matrix: Matrix
-    ) -> list[tuple[tuple[str, ...], IntArray, Layout, Matrix]]:
-        """Messages of one length by layout: names, rows, layout, messages."""
-        known = self._layouts.setdefault(matrix.shape[1], [])
-        parts: list[tuple[tuple[str, ...], IntArray, Layout, Matrix]] = []
-        for layout in known:
-            fits = fits_layout(matrix, layout)
-            if fits.all():  # the usual case: nothing to pick
-                parts.append((_names(layout), rows, layout, matrix))
-                return parts
-            if fits.any():
-                parts.append((_names(layout), rows[fits], layout, matrix[fits]))
-                rows, matrix = rows[~fits], matrix[~fits]
-        while len(rows):
-            try:
-                layout = layout_of(kind, matrix[0].tobytes())
-            except DataError:
+    def _by_layout(self, matrix: Matrix) -> Iterator[tuple[Layout, IntArray, Matrix]]:
+        """Sort messages of one length; of each layout, the rows and the messages."""
+        left = len(matrix)
+        for rows, layout, _, is_kept in () if self._sorter is None else self._sorter.sort(matrix):
+            if isinstance(layout, DataError):
                 self.unread += 1
-                rows, matrix = rows[1:], matrix[1:]
-                continue
-            if self._joints and self._layout_count >= MOST_JOINT_LISTS:
-                self.unread += len(rows)
-                return parts
-            room = _MAX_LAYOUTS - (self._layout_count if self._text else len(known))
-            if room > 0 or self._joints:
-                known.append(layout)
-                self._layout_count += 1
+            elif is_kept:
+                yield layout, rows, matrix if len(rows) == len(matrix) else matrix[rows]
             else:  # a layout a message, and no numbers worth a look
-                return parts
-            fits = fits_layout(matrix, layout)
-            parts.append((_names(layout), rows[fits], layout, matrix[fits]))
-            rows, matrix = rows[~fits], matrix[~fits]
-        return parts
+                self.unread += left if self._joints else 0
+                return
+            left -= len(rows)
+
+
+def _sorter(kind: MessageType, *, joints: bool) -> LayoutSorter:
+    most = MOST_JOINT_LISTS if joints else MOST_LAYOUTS
+    text = not kind.has_floats
+    return LayoutSorter(partial(layout_of, kind), most=most, in_all=joints or text)
 
 
 def _records_in(
@@ -359,35 +346,25 @@ def _records_in(
     return leaf.offset, leaf.count // dtype.itemsize
 
 
-def _names(layout: Layout) -> tuple[str, ...]:
-    return tuple(text for path, text in layout.strings.items() if path.startswith("name["))
-
-
-def _values(layout: Layout, path: str, part: Matrix) -> FloatArray:
-    leaf = layout.leaves.get(path)
-    if leaf is None:
-        return np.empty((len(part), 0))
-    width = leaf.count * np.dtype(leaf.dtype).itemsize
-    cut = np.ascontiguousarray(part[:, leaf.offset : leaf.offset + width])
-    return cut.view(leaf.dtype).astype(np.float64, copy=False)
+def _numbers(layout: Layout, path: str, part: Matrix) -> FloatArray:
+    return values_of(layout, path, part).astype(np.float64, copy=False)
 
 
 def _count_nan(series: Series, layout: Layout, part: Matrix) -> None:
     for path, leaf in layout.leaves.items():
         if leaf.dtype in ("<f4", "<f8"):
             series.numbers += len(part) * leaf.count
-            count = int(np.isnan(_values(layout, path, part)).sum())
+            count = int(np.isnan(values_of(layout, path, part)).sum())
             before, of = series.nan_of.get(path, (0, 0))
             series.nan_of[path] = before + count, of + len(part) * leaf.count
 
 
 def _stamp(stamps: IntArray, rows: IntArray, matrix: Matrix) -> None:
     """Put header stamps in place of log times, where a message has one that is not zero."""
-    if matrix.shape[1] < _STAMP_AT + 8:
+    if matrix.shape[1] < _STAMP_AT + TIME.itemsize:
         return
-    parts = np.ascontiguousarray(matrix[:, _STAMP_AT : _STAMP_AT + 8])
-    seconds = parts[:, :4].copy().view("<i4")[:, 0].astype(np.int64)
-    stamp_ns = seconds * NS + parts[:, 4:].copy().view("<u4")[:, 0]
+    times = np.ascontiguousarray(matrix[:, _STAMP_AT : _STAMP_AT + TIME.itemsize]).view(TIME)[:, 0]
+    stamp_ns = time_ns(times["sec"], times["nanosec"])
     usable = (matrix[:, 1] == 1) & (stamp_ns != 0)  # little-endian
     stamps[rows[usable]] = stamp_ns[usable]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...common.arrays import FloatArray, IntArray
 from ..columns.groups import Group
+from ..columns.layouts import names_of
 
 _EARLY_OR_LATE = 0.1
 """A joint that is missing for more than this part of the topic's span is worth a warning."""
@@ -45,15 +46,13 @@ def rows_of(group: Group, field: str) -> JointRows:
     Returns:
         Names, times and values.
     """
-    strings = group.layout.strings
-    names = tuple(text for path, text in strings.items() if path.startswith("name["))
     log_ns = group.times()
     stamp_ns = group.stamps() if group.is_stamped else np.zeros_like(log_ns)
     values = group.values(field).astype(np.float64, copy=False)
     if (np.diff(log_ns) < 0).any():  # a file need not be in log order, a reader must be
         logged = np.argsort(log_ns, kind="stable")
         stamp_ns, log_ns, values = stamp_ns[logged], log_ns[logged], values[logged]
-    return JointRows(names, stamp_ns, log_ns, values)
+    return JointRows(names_of(group.layout), stamp_ns, log_ns, values)
 
 
 def merge_rows(

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError
+from ..columns.layouts import stamps_of
 from ..columns.topics import Topics
 from ..messages.cdr import layout_of
 
@@ -24,8 +25,6 @@ _FAR_STAMP_NS = 3600 * _NS
 
 _NEVER_NS = 2**62
 """No log time lies beyond this [Unix ns], the year 2116: such a one is damage."""
-
-_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
 class StampClock:
@@ -66,26 +65,28 @@ class StampClock:
             return None
         log_ns, message, kind = first
         try:
-            leaves = layout_of(kind, message).leaves
+            layout = layout_of(kind, message)
         except DataError:
             return None
-        if not all(path in leaves for path in _STAMP):
+        stamps = stamps_of(layout, np.frombuffer(message, np.uint8)[None])
+        if stamps is None or "header.stamp.sec" not in layout.leaves:
             return None
-        sec, nanosec = (
-            int(np.frombuffer(message, leaves[path].dtype, 1, leaves[path].offset)[0])
-            for path in _STAMP
-        )
-        stamp_ns = sec * _NS + nanosec
+        stamp_ns = int(stamps[0])
         if not stamp_ns or not 0 <= log_ns < _NEVER_NS:
             return None
-        if abs(log_ns - stamp_ns) <= _FAR_STAMP_NS:
-            return 0
-        shift_s = round((log_ns - stamp_ns) / _NS)
-        self._warn(
-            f"header stamps lie {-shift_s} s from the log times (another clock, such as simulated "
-            "time); they are shifted by that"
-        )
-        return shift_s * _NS
+        shift_ns = clock_shift_ns(stamp_ns, log_ns)
+        if shift_ns:
+            self._warn(
+                f"header stamps lie {-shift_ns // _NS} s from the log times (another clock, such "
+                "as simulated time); they are shifted by that"
+            )
+        return shift_ns
+
+
+def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
+    """Return what must be added to a stamp [ns], in whole seconds, if it is on another clock."""
+    apart_ns = log_ns - stamp_ns
+    return round(apart_ns / _NS) * _NS if abs(apart_ns) > _FAR_STAMP_NS else 0
 
 
 _FAR_NS = 2.0**60
@@ -146,9 +147,23 @@ def _each_own(series: Series, offsets: Series) -> list[IntArray]:
         if j is None or not len(offsets.t_ns[j]):
             own.append(t_ns)
             continue
-        last = np.searchsorted(offsets.t_ns[j], t_ns, side="right") - 1
-        own.append(t_ns + _steps(offsets.values[j][np.maximum(last, 0)]))
+        own.append(moved(t_ns, offsets.t_ns[j], offsets.values[j]))
     return own
+
+
+def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
+    """Return times plus the offset that was logged with each, or last before it.
+
+    Args:
+        t_ns: Times [ns], shape (n,).
+        stamp_ns: When the offsets were logged [ns], not decreasing, shape (k,), at least one.
+        offset_s: The offsets [s], shape (k,).
+
+    Returns:
+        Shape (n,) [ns]; before the first offset, it is used.
+    """
+    last = np.searchsorted(stamp_ns, t_ns, side="right") - 1
+    return t_ns + _steps(offset_s[np.maximum(last, 0)])
 
 
 def _steps(offset_s: FloatArray) -> IntArray:
