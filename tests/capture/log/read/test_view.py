@@ -1,17 +1,12 @@
 """Views of a session, against the session itself."""
 
-import runpy
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from support.written_sessions import write_session
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import MissingChannelError
 
-write_session = runpy.run_path(str(Path(__file__).with_name("written_sessions.py")))[
-    "write_session"
-]
 START_S, STOP_S = 1.0, 2.5
 POSE_X = "pose.pose.position.x"
 
