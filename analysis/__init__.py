@@ -28,19 +28,18 @@ if TYPE_CHECKING:
     from .experiment.analyse import analyse_experiment
     from .present.notebook.files import load
     from .present.notebook.pictures import Picture
-    from .present.text.table import render
+    from .present.text import render
     from .results.analysis import Analysis, Index, JointResult
     from .results.comparison import Comparison
-    from .results.coupling import LocalCoupling
+    from .results.coupling import LinearCoupling, LocalCoupling
     from .results.estimate import Estimate
     from .results.experiment import Experiment, Reversal
-    from .results.sweep import LinearCoupling
     from .session.analyse import analyse_session
     from .signals.stretch import Options
 
 
 def _presentation() -> Presentation:
-    from .present.notebook.presentation import Presenter
+    from .present.notebook.text import Presenter
 
     return Presenter()
 
@@ -57,7 +56,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "Experiment": "results.experiment",
         "Index": "results.analysis",
         "JointResult": "results.analysis",
-        "LinearCoupling": "results.sweep",
+        "LinearCoupling": "results.coupling",
         "LocalCoupling": "results.coupling",
         "Margins": "compare.decisions",
         "Options": "signals.stretch",
@@ -67,6 +66,6 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "analyse_session": "session.analyse",
         "compare_sessions": "compare.compare",
         "load": "present.notebook.files",
-        "render": "present.text.table",
+        "render": "present.text",
     },
 )

@@ -18,7 +18,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000

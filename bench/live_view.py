@@ -28,7 +28,7 @@ from mcap.records import Channel, Metadata, Schema
 
 from undulog.capture import load_robot
 from undulog.capture.log.messages.cdr import encode, layout_of
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, schema_text
 from undulog.capture.recorder.live_feed import LiveFeed
 from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 

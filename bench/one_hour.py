@@ -37,8 +37,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture import Session
 from undulog.capture.common.console import progress
-from undulog.capture.common.threads import threads_or_default
-from undulog.capture.log.read.joint_reader import OFFSET_TOPICS
+from undulog.capture.common.process import threads_or_default
+from undulog.capture.log.read.joint_states import OFFSET_TOPICS
 from undulog.capture.log.read.signals import JointSignals
 
 Loaded = tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]

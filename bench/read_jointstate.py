@@ -23,7 +23,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.common.threads import threads_or_default
+from undulog.capture.common.process import threads_or_default
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{i:02d}" for i in range(1, 26)]

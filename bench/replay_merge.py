@@ -27,9 +27,8 @@ from rerun.chunk import Chunk, LazyChunkStream
 
 from undulog.capture import Session
 from undulog.replay.overlay.alignment import Align, align
-from undulog.replay.overlay.merge import chunks_of, send
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.write import Converted, write_beside
+from undulog.replay.overlay.write import Converted, chunks_of, send, write_beside
 from undulog.replay.viewer.viewer import viewer_binary
 
 BAR_S = 3.0

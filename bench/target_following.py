@@ -26,9 +26,9 @@ import numpy as np
 from scipy.stats import binom
 
 from undulog.sim import load_scenario
+from undulog.sim.gait.contract import CONTROL_RATE_HZ
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.scenario.engines import Kernels
-from undulog.sim.scenario.scenario import CONTROL_RATE_HZ
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.twin import Twin
 
 FOLLOW, WALK = "target-following", "random-walk"

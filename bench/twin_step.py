@@ -23,10 +23,9 @@ from collections.abc import Callable
 import pybullet
 
 from undulog.capture.robot.model import Plane, Robot
-from undulog.sim.gait.contract import Readings
-from undulog.sim.gait.serpentine import SerpentineGait
-from undulog.sim.scenario.engines import EngineKind, Kernels
-from undulog.sim.scenario.scenario import CONTROL_RATE_HZ, Scenario
+from undulog.sim.gait.contract import CONTROL_RATE_HZ, Readings
+from undulog.sim.gait.wave import SerpentineGait
+from undulog.sim.scenario.scenario import EngineKind, Kernels, Scenario
 from undulog.sim.scenario.scenario_file import load_scenario
 from undulog.sim.twin.twin import Twin
 

@@ -21,7 +21,7 @@ from accepting import EPOCH_NS, Accept, mcap_writer, measure, new_file
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.writer import WriteAheadLog
 
 SIZES = (100, 1000)
 HEAD = struct.Struct("<IHIQQ")

@@ -21,9 +21,8 @@ from .common.lazy import attach
 
 if TYPE_CHECKING:
     from .log.columns.topics import Channel
-    from .log.read.session import Session
+    from .log.read.session import Session, SessionView
     from .log.read.signals import JointSignals, Signal
-    from .log.read.view import SessionView
     from .log.write.writer import SessionWriter
     from .robot.description import load_robot, robot_names
     from .robot.model import Robot
@@ -35,7 +34,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "JointSignals": "log.read.signals",
         "Robot": "robot.model",
         "Session": "log.read.session",
-        "SessionView": "log.read.view",
+        "SessionView": "log.read.session",
         "SessionWriter": "log.write.writer",
         "Signal": "log.read.signals",
         "load_robot": "robot.description",

@@ -10,9 +10,8 @@ import sys
 import numpy as np
 from scipy.signal import lfilter
 
-from undulog.analysis.estimators.contrasts import contrast_variance, lag_contrast_variance
 from undulog.analysis.estimators.harmonic import fit_at
-from undulog.analysis.estimators.intervals import t_factor
+from undulog.analysis.estimators.intervals import contrast_variance, lag_contrast_variance, t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import Noise, residual_spectrum
 from undulog.analysis.response.response import respond

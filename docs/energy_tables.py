@@ -11,13 +11,13 @@ import dataclasses
 import tempfile
 from pathlib import Path
 
-from undulog.analysis.energy.ledger import TERMS, booked_energies, whole_robot
+from undulog.analysis.energy import TERMS, booked_energies, whole_robot
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.joints import joint_energies
-from undulog.analysis.signals.reading import RESPONSE_TOPIC, read_columns
+from undulog.analysis.signals.columns import RESPONSE_TOPIC, read_columns
 from undulog.capture import Session
 from undulog.sim import load_scenario, scenario_names
-from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record
 
 BAR = 0.005

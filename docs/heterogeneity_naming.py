@@ -26,8 +26,7 @@ from undulog.analysis.experiment.reversal.mirror import mirror_test
 from undulog.analysis.experiment.reversal.modules import ordered_pairs
 from undulog.capture import Session
 from undulog.sim import Wave, load_scenario, parse_scenario
-from undulog.sim.scenario.engines import Kernels
-from undulog.sim.scenario.modules import Modules
+from undulog.sim.scenario.scenario import Kernels, Modules
 from undulog.sim.twin.recording import record
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

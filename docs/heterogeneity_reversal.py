@@ -24,11 +24,10 @@ import numpy as np
 
 from undulog.analysis import analyse_session
 from undulog.analysis.experiment.reversal.mirror import mirror_test
-from undulog.analysis.experiment.reversal.modules import SIGNIFICANT, ordered_pairs
-from undulog.analysis.experiment.reversal.tilt import tilt_check
+from undulog.analysis.experiment.reversal.modules import SIGNIFICANT, ordered_pairs, tilt_check
 from undulog.capture import Session
 from undulog.sim import load_scenario
-from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record
 
 TILTS_DEG = (0.3, 1.0, 2.0)

@@ -26,7 +26,7 @@ from undulog.analysis.experiment.reversal.mirror import (
 from undulog.analysis.experiment.reversal.modules import ordered_pairs
 from undulog.capture import Session
 from undulog.sim import load_scenario
-from undulog.sim.scenario.modules import Modules
+from undulog.sim.scenario.scenario import Modules
 from undulog.sim.twin.recording import record
 
 LEVEL = 0.05

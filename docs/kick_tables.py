@@ -14,8 +14,7 @@ import sys
 
 import numpy as np
 
-from undulog.analysis.experiment.kicks.local import Answers, nonlinearity
-from undulog.analysis.experiment.kicks.matrices import local_matrices
+from undulog.analysis.experiment.kicks.local import Answers, local_matrices, nonlinearity
 from undulog.analysis.experiment.kicks.runs import Kick, Kind
 
 NOISE = np.radians(0.01)

@@ -4,7 +4,7 @@
 
     from pathlib import Path
     from undulog.capture import Session
-    from .record.rrd import write_recording
+    from .feed.recording import write_recording
 
     with Session.open("run.mcap") as session:
         recording = write_recording(session, Path("run.rrd"))
@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING
 from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
-    from .content.content import Content
-    from .record.rrd import Recording, write_recording
+    from .feed.recording import Recording, write_recording
+    from .samples.content import Content
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
-        "Content": "content.content",
-        "Recording": "record.rrd",
-        "write_recording": "record.rrd",
+        "Content": "samples.content",
+        "Recording": "feed.recording",
+        "write_recording": "feed.recording",
     },
 )

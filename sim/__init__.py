@@ -13,10 +13,8 @@ from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
     from .gait.contract import Gait, GaitTick, Readings
-    from .gait.serpentine import Serpentine, SerpentineGait
-    from .gait.wave import PlaneGait, Wave
-    from .scenario.field import RandomField
-    from .scenario.obstacles import Box, Cylinder, ObstacleMaterial, Target, Wall
+    from .gait.wave import PlaneGait, Serpentine, SerpentineGait, Wave
+    from .scenario.obstacles import Box, Cylinder, ObstacleMaterial, RandomField, Target, Wall
     from .scenario.scenario import Scenario
     from .scenario.scenario_file import load_scenario, parse_scenario, scenario_names
     from .scenario.sensors import (
@@ -47,12 +45,12 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "Noise": "scenario.sensors",
         "ObstacleMaterial": "scenario.obstacles",
         "PlaneGait": "gait.wave",
-        "RandomField": "scenario.field",
+        "RandomField": "scenario.obstacles",
         "Readings": "gait.contract",
         "Scenario": "scenario.scenario",
         "SensorModels": "scenario.sensors",
-        "Serpentine": "gait.serpentine",
-        "SerpentineGait": "gait.serpentine",
+        "Serpentine": "gait.wave",
+        "SerpentineGait": "gait.wave",
         "ServoPolling": "scenario.sensors",
         "SonarModel": "scenario.sensors",
         "Target": "scenario.obstacles",

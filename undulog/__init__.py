@@ -74,7 +74,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "undulog.replay.commands.fit:fit",
         "Fit the twin's servo and friction to a session.",
     ),
-    "sim null": ("undulog.sim.commands.null:null", "Model identical modules, for analyse --null."),
+    "sim null": ("undulog.sim.commands.run:null", "Model identical modules, for analyse --null."),
     "sim serve": ("undulog.sim.commands.serve:serve", "Be a robot on a bus, in real time."),
     "drive": ("undulog.sim.commands.drive:drive", "Drive a gait, a plan or recorded commands."),
     "analyse": (
@@ -90,11 +90,11 @@ VERBS: dict[str, tuple[str, str]] = {
         "What differs between two sessions or groups.",
     ),
     "plan lag-sweep": (
-        "undulog.analysis.commands.plan_sweep:lag_sweep",
+        "undulog.analysis.commands.plan:lag_sweep",
         "Commands that tell the coupling without contact.",
     ),
     "plan multisine": (
-        "undulog.analysis.commands.plan_sweep:multisine",
+        "undulog.analysis.commands.plan:multisine",
         "The same at several frequencies at once.",
     ),
     "plan phase-kicks": (

@@ -17,13 +17,13 @@ import numpy as np
 
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.common.threads import in_threads
+from undulog.capture.common.process import in_threads
 from undulog.capture.log.read.signals import Signal
 
 from ..estimators.series import LARGEST, Series, clean_together
-from ..response.gait import DRIVEN_SHARE
+from ..response.rhythm import DRIVEN_SHARE
 from ..results.artefact import FALSIFYING, Artefact, Span
-from ..signals.reading import QUANTITIES, Columns
+from ..signals.columns import QUANTITIES, Columns
 from .holds import clipped, frozen, stale
 from .limits import AT_LIMIT, AT_LIMIT_RAD, Limits, limits_of, saturated, stalled
 from .scales import (
@@ -32,10 +32,11 @@ from .scales import (
     against_command,
     against_witness,
     compare,
+    inside,
     integral,
+    spans_of,
     turns,
 )
-from .spans import inside, spans_of
 
 ABOVE_NEIGHBOURS = 8.0
 """A step this many times those beside it stands alone."""

@@ -14,8 +14,7 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import Series
 from ..results.artefact import Span
-from .scales import turns
-from .spans import runs, spans_of
+from .scales import runs, spans_of, turns
 
 FROZEN_TRAVEL = 0.29
 """Travel of the command during a hold, as a share of its range: what it has in a quarter of a

@@ -12,8 +12,7 @@ from undulog.capture.robot.model import Joint
 
 from ..estimators.series import Series
 from ..results.artefact import Span
-from .scales import turns
-from .spans import spans_of
+from .scales import spans_of, turns
 
 AT_LIMIT_RAD = 1e-4
 """A position this close to its limit, or beyond it, is at the limit."""

@@ -20,7 +20,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.robot.model import Plane, Robot
 
-from ..signals.reading import DRAG_RATIO
+from ..signals.columns import DRAG_RATIO
 
 
 @dataclass(frozen=True)

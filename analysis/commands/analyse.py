@@ -67,13 +67,13 @@ def analyse(
     if json:
         emit_json(result.to_dict())
         return
-    from ..present.text.table import render
+    from ..present.text import render
     from ..results.analysis import Analysis
 
     def text(width: int, color: bool) -> str:
         if isinstance(result, Analysis):
             return render(result, width=width, color=color)
-        from ..present.text.experiment import render_experiment
+        from ..present.text_experiment import render_experiment
 
         return render_experiment(result, width=width, color=color)
 
@@ -90,7 +90,7 @@ def _one(file: Path, options: Options, null: Path | None) -> Analysis:
         with Session.open(file) as session:
             if null is None:
                 return analyse_session(session, options)
-            from ..experiment.null_model.check import analyse_with_null
+            from ..experiment.null_model import analyse_with_null
 
             return analyse_with_null(session, null, options)
 

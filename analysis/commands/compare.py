@@ -71,7 +71,7 @@ def compare(
         check_output(output, (".json", *PAGES), why, force=force)
     from ..compare.compare import Choices, compare_sessions
     from ..compare.decisions import Margins
-    from ..present.text.comparison import render_comparison
+    from ..present.text_experiment import render_comparison
 
     choices = Choices(
         paired=paired,

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, say
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
+
+    from undulog.capture import SessionView
 
     from ..plan.designs import PlannedRun
     from ..plan.gait_base import BaseGait
@@ -122,8 +127,8 @@ def _plan(
         raise UsageError("--runs is at least 1, --settle at least 0, --measure more than 0")
     from undulog.capture import Session
 
+    from ..plan.designs import write_plan
     from ..plan.gait_base import base_gait
-    from ..plan.write import write_plan
 
     with Session.open(like) as session:
         base = base_gait(session)
@@ -157,3 +162,210 @@ def announce(
         "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
         f"--start {settle_s:g} of all recordings"
     )
+
+
+_AMPLITUDE = 0.02
+_LEAST_SETTLE_S = 10.0
+
+
+def lag_sweep(
+    *,
+    like: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    amplitude: float = _AMPLITUDE,
+    runs: int = 1,
+    settle: float | None = None,
+    measure: float = 10.0,
+    json: bool = False,
+) -> None:
+    """Write the commands of a lag sweep, which tells the coupling of a chain without contact.
+
+    As many gaits as joints are driven, of small amplitude and of the lags 2 pi k/m. For a robot
+    that touches nothing (hung up, floating, or a twin with surface = "none"): on the ground every
+    gait is its own operating point, and phase-kicks are the plan.
+
+    Example: `undulog plan lag-sweep --like run.mcap -o sweep`
+
+    Args:
+        like: A session of a gait: its joints, offsets and frequency.
+        output: Folder for the sessions.
+        amplitude: Of every command [rad].
+        runs: How often each of them is run.
+        settle: Time before what is measured [s]; 5 time constants of the slowest body mode, at
+            least 10 s, if not given.
+        measure: Length of what is measured [s].
+        json: Print one JSON object.
+    """
+
+    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+        from ..plan.designs import lag_sweep as sweep
+
+        return sweep(len(base.driven), amplitude, runs)
+
+    numbers = amplitude, runs, settle
+    _plan_tones("lag-sweep", like, output, design, lambda _: measure, numbers=numbers, as_json=json)
+
+
+def multisine(
+    *,
+    like: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    amplitude: float = _AMPLITUDE,
+    tones: int = 3,
+    runs: int = 1,
+    settle: float | None = None,
+    measure: float = 20.0,
+    json: bool = False,
+) -> None:
+    """Write the commands of a multisine: coupling without contact at several frequencies at once.
+
+    As many runs as joints are driven; in each all joints move at all tones, with the phases of a
+    DFT over the runs. The first tone is the gait's frequency, and none is another plus a whole
+    number of the gait's, so that what a nonlinearity mixes shows beside the tones.
+
+    Example: `undulog plan multisine --like run.mcap -o tones`
+
+    Args:
+        like: A session of a gait: its joints, offsets and frequency.
+        output: Folder for the sessions.
+        amplitude: Of the first tone of every command [rad]; the others fall with the square of
+            the frequency, so that all of them need about the same torque.
+        tones: How many.
+        runs: How often each of them is run.
+        settle: Time before what is measured [s]; 5 time constants of the slowest body mode, at
+            least 10 s, if not given.
+        measure: Length of what is measured [s], rounded up to whole periods.
+        json: Print one JSON object.
+    """
+    if tones < 2:
+        raise UsageError("--tones is at least 2; for one frequency there is plan lag-sweep")
+
+    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+        from ..plan.designs import multisine as sines
+        from ..plan.designs import tones as choose
+
+        return sines(len(base.driven), amplitude, choose(base.omega, tones), runs)
+
+    def whole_periods(base: BaseGait) -> float:
+        from ..plan.designs import period_s
+
+        period = period_s(base.omega, tones)
+        return math.ceil(measure / period - 1e-6) * period
+
+    numbers = amplitude, runs, settle
+    _plan_tones("multisine", like, output, design, whole_periods, numbers=numbers, as_json=json)
+
+
+def _plan_tones(
+    plan: str,
+    like: Path,
+    folder: Path,
+    design: Callable[[BaseGait], tuple[PlannedRun, ...]],
+    measure_s_of: Callable[[BaseGait], float],
+    *,
+    numbers: tuple[float, int, float | None],
+    as_json: bool,
+) -> None:
+    amplitude, runs, settle_s = numbers
+    if amplitude <= 0 or runs < 1:
+        raise UsageError("--amplitude is more than 0, --runs at least 1")
+    from undulog.capture import Session
+
+    from ..plan.designs import write_plan
+    from ..plan.gait_base import base_gait
+
+    with Session.open(like) as session:
+        base = base_gait(session)
+        if len(base.driven) < 3:
+            raise UsageError(
+                f"{like}: it drives {len(base.driven)} joints; a sweep needs at least 3"
+            )
+        planned = design(base)
+        check_servos(base, planned, session)
+        needed_s, facts = settling(base, session)
+        settle_s = needed_s if settle_s is None else settle_s
+        measure_s = measure_s_of(base)
+        if settle_s < 0 or measure_s <= 0:
+            raise UsageError("--settle is at least 0, --measure more than 0")
+        files = write_plan(
+            plan,
+            base,
+            planned,
+            session,
+            folder,
+            settle_s=settle_s,
+            measure_s=measure_s,
+            facts={"amplitude_rad": f"{amplitude:g}", **facts},
+        )
+    announce(plan, folder, files, (settle_s, measure_s), as_json=as_json)
+    if as_json:
+        return
+    if facts:
+        say(
+            f"The slowest body mode without contact has {facts['mode_hz']} Hz and dies away with "
+            f"{facts['mode_tau_s']} s"
+        )
+    if settle_s < needed_s:
+        say(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
+
+
+def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str]]:
+    """How long a chain without contact takes to settle.
+
+    Args:
+        base: The gait.
+        session: Of that robot.
+
+    Returns:
+        The time [s], the commands' ramp included, and the slowest mode for the metadata; without
+        a robot description the least time, and nothing.
+    """
+    from ..plan.designs import RAMP_S
+    from ..plan.gait_base import TIME_CONSTANTS, slowest_mode
+
+    robot = session.robot_as_run
+    if robot is None:
+        return _LEAST_SETTLE_S, {}
+    mode = slowest_mode(robot, [base.names[k] for k in base.driven])
+    needed_s = RAMP_S + math.ceil(TIME_CONSTANTS * mode.time_constant_s)
+    facts = {
+        "mode_hz": f"{mode.frequency_hz:.4g}",
+        "mode_damping": f"{mode.damping:.4g}",
+        "mode_tau_s": f"{mode.time_constant_s:.4g}",
+    }
+    return max(_LEAST_SETTLE_S, needed_s), facts
+
+
+def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionView) -> None:
+    """Refuse commands that leave the servos' linear range.
+
+    Args:
+        base: The gait.
+        runs: The runs.
+        session: Of that robot; without a description nothing is checked.
+
+    Raises:
+        UsageError: If a command is faster than its joint, or an error as large as the command
+            saturates its servo (duty Kp (q_ref - q) beyond 1).
+    """
+    if session.robot is None:
+        return
+    joints = {joint.name: joint for joint in session.robot.joints}
+    tones = runs[0].tones(base.omega)
+    size = np.sum([np.abs(tone.amplitude) for tone in tones], axis=0)
+    speed = np.sum([tone.omega * np.abs(tone.amplitude) for tone in tones], axis=0)
+    for row, k in enumerate(base.driven):
+        joint = joints.get(base.names[k])
+        if joint is None:
+            continue
+        if speed[row] > joint.max_velocity:
+            raise UsageError(
+                f"{joint.name} would be commanded up to {speed[row]:.3g} rad/s, its limit is "
+                f"{joint.max_velocity:g} rad/s; lower --amplitude"
+            )
+        if joint.servo.proportional_gain * size[row] > 1:
+            raise UsageError(
+                f"the servo of {joint.name} would saturate: its gain times {size[row]:.3g} rad is "
+                f"{joint.servo.proportional_gain * size[row]:.2f}, 1 is full duty; lower "
+                "--amplitude"
+            )

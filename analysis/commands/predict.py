@@ -65,7 +65,7 @@ def predict(
     from undulog.capture.common.files import write_text
 
     from ..experiment.kicks.prediction import closed_loop
-    from ..present.text.closed_loop import render_loop
+    from ..present.text import render_loop
     from .analyse import experiment_of
 
     first, *others = files

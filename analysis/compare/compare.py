@@ -21,12 +21,9 @@ from ..results.estimate import Estimate, Provenance
 from ..segments.answer import deviation_in_words, fault_in_words
 from ..segments.examine import OFFSET_RAD
 from ..signals.stretch import Options
-from .alignment import Alignment, align
-from .answer import answer_of
-from .changes import changes
-from .decisions import Margins, decide, differ, estimates_of, family
-from .differences import Quantities, independent
-from .side import Seen, phases_rad, see, turned
+from .alignment import Alignment, align, changes
+from .decisions import Margins, answer_of, decide, differ, estimates_of, family
+from .side import Quantities, Seen, independent, phases_rad, see, turned
 
 
 def broken_joints(a: Sequence[Seen], b: Sequence[Seen]) -> tuple[BrokenJoint, ...]:

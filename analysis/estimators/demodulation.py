@@ -25,7 +25,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from .cycle_sums import cycle_sums, starts_of
-from .harmonic_moments import cos_sin
+from .harmonic import cos_sin
 from .series import Series
 
 MIN_SAMPLES = 12

@@ -18,8 +18,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
-from .harmonic import HarmonicFit
-from .harmonic_moments import basis, chunks, time_scale
+from .harmonic import HarmonicFit, basis, chunks, time_scale
 from .series import Series
 
 DRAWS = 48

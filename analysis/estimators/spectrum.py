@@ -17,10 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from undulog.capture.common.threads import in_threads
+from undulog.capture.common.process import in_threads
 
-from .harmonic import HarmonicFit
-from .harmonic_moments import RELATIVE_FLOOR, HarmonicModel, basis, chunks, time_scale
+from .harmonic import RELATIVE_FLOOR, HarmonicFit, HarmonicModel, basis, chunks, time_scale
 from .quantisation import (
     DRAWS,
     draws,

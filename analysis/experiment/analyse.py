@@ -17,35 +17,34 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Robot
 
 from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
-from ..oscillators.body import body_oscillators
+from ..oscillators.predictions import body_oscillators
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
 from ..session.analyse import Examined, examine_session
-from ..session.coupling_of_one_gait import one_gait_coupling
-from ..session.posture import Posture, posture
 from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
     GaitRun,
+    Posture,
     Role,
     gait_run,
     mirror_fault,
+    one_gait_coupling,
+    posture,
     responses,
     sort_runs,
 )
 from ..signals.stretch import Options
 from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
-from .indices import experiment_indices
 from .kicks.coupling import kick_coupling
-from .kicks.matrices import ROW_TOLERANCE
+from .kicks.local import ROW_TOLERANCE
 from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
-from .pooling import PooledResponse, pool_runs, pooled_answer
+from .pooling import PooledResponse, experiment_indices, pool_runs, pooled_answer
 from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
-from .reversal.modules import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, reversal_of
-from .reversal.tilt import floor_lean
+from .reversal.modules import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, floor_lean, reversal_of
 from .sweep.coupling import NONLINEAR, sweep_coupling
 from .sweep.runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
 

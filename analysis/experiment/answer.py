@@ -11,10 +11,17 @@ import numpy as np
 from ..results import formats
 from ..results.analysis import Analysis
 from ..results.answer import Answer, NotFollowing
-from ..results.coupling import Coupling, LocalCoupling, RowCheck, RunScatter
+from ..results.coupling import (
+    Coupling,
+    LinearCoupling,
+    LocalCoupling,
+    Route,
+    RowCheck,
+    RunScatter,
+    ToneCoupling,
+)
 from ..results.estimate import Estimate, leaves_out_zero
 from ..results.experiment import OrderedPair, Reversal
-from ..results.sweep import LinearCoupling, Route, ToneCoupling
 from ..segments.answer import NAMED, fault_in_words
 from ..session.runs import Role
 from .pooling import PooledResponse

@@ -12,11 +12,10 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
-from ..results.deciding import beyond, percent
+from ..results.answer import beyond, percent
 from ..results.estimate import Estimate
 from ..results.oscillators import ChainCoupling, Link, Rate
-from .phase_log import read_phases
-from .weak_form import OscillatorFit, Piece, fit_oscillator, window_length
+from .weak_form import OscillatorFit, Piece, fit_oscillator, read_phases, window_length
 
 LEAST_KICK = 0.1
 """A phase that jumps by less between two samples, against those beside them, isn't kicked [rad]."""

@@ -1,18 +1,127 @@
-"""The gait that a plan is made around: the sines that a recorded session commanded."""
+"""The gait that a plan is made around: the sines that a recorded session commanded.
+
+How long a straight chain rings without contact: its slowest mode, in closed form.
+
+At small angles a straight chain moves across itself by y_0 + theta_0 x + the joints' bends, so its
+mass matrix is constant; with the servos linear (no Coulomb friction, no play, no saturation) the
+modes are the eigenvalues of
+
+    M_eff q'' = k_g (th - q) + c_g (om - q')
+    Jm om'    = -kappa q - (b + Kt^2/R) om - k_g (th - q) - c_g (om - q'),   kappa = Kt V Kp / R
+
+with M_eff = M_qq - M_qb M_bb^-1 M_bq, the free body b eliminated. Ground and Coulomb friction only
+add damping. What is measured before these modes have died away is wrong.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Joint, Plane, Robot
 
-from ..results.deciding import percent
+from ..results.answer import percent
 from ..session.analyse import examine_session
-from ..signals.reading import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
+from ..signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
+
+TIME_CONSTANTS = 5.0
+"""So many of the slowest mode's time constants are waited for: 0.7 % of it is left."""
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A decaying mode.
+
+    Attributes:
+        frequency_hz: Its natural frequency, |s| / 2 pi.
+        damping: Damping ratio, -Re s / |s|.
+        time_constant_s: -1 / Re s.
+    """
+
+    frequency_hz: float
+    damping: float
+    time_constant_s: float
+
+
+def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
+    """The mode that takes longest to die away, of the planes that are driven.
+
+    Args:
+        robot: Its links and servos.
+        driven: Names of the driven joints, at least one.
+
+    Returns:
+        The mode.
+    """
+    poles = np.concatenate(
+        [
+            _poles(robot, plane)
+            for plane in Plane
+            if any(joint.plane is plane and joint.name in driven for joint in robot.joints)
+        ]
+    )
+    slowest = complex(poles[int(np.argmax(poles.real))])
+    size = abs(slowest)
+    return Mode(size / (2 * np.pi), -slowest.real / size, -1 / slowest.real)
+
+
+def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
+    """Mass matrix of the free straight chain bending in one plane.
+
+    Args:
+        robot: Its links.
+        plane: The plane; joints of the other one are rigid.
+
+    Returns:
+        Of the joints of that plane once the free body is eliminated, shape (m, m) [kg m^2].
+    """
+    length = np.array([link.length for link in robot.links])
+    mass = np.array([link.mass for link in robot.links])
+    axis = 2 if plane is Plane.HORIZONTAL else 1
+    inertia = np.array([link.inertia[axis] for link in robot.links])
+    back = np.cumsum(length)  # from the head's front; only differences count
+    centre = back - length / 2
+    joints: IntArray = robot.joint_indices(plane)
+    behind = (np.arange(len(length))[:, None] > joints[None, :]).astype(np.float64)
+    # Columns: shift, turn about the front, bends; each link's centre across, and its angle.
+    shift = np.column_stack(
+        [np.ones_like(centre), centre, behind * (centre[:, None] - back[joints])]
+    )
+    turn = np.column_stack([np.zeros_like(centre), np.ones_like(centre), behind])
+    whole = shift.T @ (mass[:, None] * shift) + turn.T @ (inertia[:, None] * turn)
+    free = np.linalg.solve(whole[:2, :2], whole[:2, 2:])
+    return whole[2:, 2:] - whole[2:, :2] @ free
+
+
+def _poles(robot: Robot, plane: Plane) -> ComplexArray:
+    """Eigenvalues of (q, q', th, om), of the joints of one plane."""
+    joints: list[Joint] = [joint for joint in robot.joints if joint.plane is plane]
+    servos = [joint.servo for joint in joints]
+    winding = np.array([one.torque_constant / one.resistance_ohm for one in servos])
+    kappa = np.diag(winding * [one.supply_v * one.proportional_gain for one in servos])
+    drag = np.diag(
+        winding * [one.torque_constant for one in servos] + [one.viscous_friction for one in servos]
+    )
+    k = np.diag([one.gear_stiffness for one in servos])
+    c = np.diag([one.gear_damping for one in servos])
+    body = np.linalg.inv(transverse_mass(robot, plane))
+    rotor = np.diag([1 / one.rotor_inertia for one in servos])
+    none, unit = np.zeros_like(k), np.eye(len(k))
+    matrix = np.block(
+        [
+            [none, unit, none, none],
+            [-body @ k, -body @ c, body @ k, body @ c],
+            [none, none, none, unit],
+            [rotor @ (k - kappa), rotor @ c, -rotor @ k, -rotor @ (drag + c)],
+        ]
+    )
+    return np.linalg.eigvals(matrix).astype(np.complex128)
+
 
 PURE = 0.01
 """Harmonics of a command above this share of its fundamental are no sine any more."""

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
-from ..compare.answer import WORDS, in_people_units, signed
-from ..compare.decisions import SIGNIFICANT
+from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
 from ..results import formats
 from ..results.analysis import Analysis, BodyPoint, BodyResult, Index, JointResult
 from ..results.comparison import BODY, Comparison, Difference, NamedJoint, Waveform
@@ -356,7 +355,7 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
         Column(None, "size [margins]", lambda one: one.size, (0, 2)),
     ]
     rows = comparison.differences
-    return Table(columns, rows, bold=lambda one: one.p_holm < SIGNIFICANT)
+    return Table(columns, rows, bold=lambda one: one.p_holm < SIGNIFICANT_DIFFERENCE)
 
 
 def _place(place: str) -> str:

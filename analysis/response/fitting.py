@@ -9,13 +9,15 @@ import numpy as np
 
 from undulog.capture.common.console import Warn
 
+from ..estimators.cycle_sums import worst_drift
 from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
-from ..estimators.settling import worst_drift
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
-from ..results.deciding import distinct, percent
-from ..results.remarks import Lacking, Note
-from .gait import (
+from ..results.answer import Lacking, Note, distinct, percent
+from .groups import Groups, find_groups
+from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
+from .response import Response, respond
+from .rhythm import (
     HARMONICS,
     MIN_CYCLES,
     MIN_EXPLAINED,
@@ -26,9 +28,6 @@ from .gait import (
     driven,
     find_rhythm,
 )
-from .groups import Groups, find_groups
-from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
-from .response import Response, respond
 
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""

@@ -18,8 +18,8 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from ..estimators.harmonic import HarmonicFit, fit_at
 from ..estimators.series import Series
-from .gait import DRIVEN_SHARE, MIN_EXPLAINED, Rhythm, find_rhythm, refine
 from .mixing import COINCIDENT, RESOLUTION, group_model
+from .rhythm import DRIVEN_SHARE, MIN_EXPLAINED, Rhythm, find_rhythm, refine
 
 _CLEAR = 0.98
 """A command explained to less than this may have a frequency of its own: a tenth of a cycle over

@@ -18,11 +18,10 @@ from scipy.special import gammainccinv
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..estimators.harmonic import HarmonicFit, fit_at
-from ..estimators.harmonic_moments import HarmonicModel, chunks
+from ..estimators.harmonic import HarmonicFit, HarmonicModel, chunks, fit_at
 from ..estimators.series import Series, shared_times
 from ..estimators.spectrum import residual_noise
-from .gait import HARMONICS, NYQUIST_SHARE, allowed_model
+from .rhythm import HARMONICS, NYQUIST_SHARE, allowed_model
 
 RESOLUTION = 1.5
 """Frequencies closer than this many cycles over the record are not resolved."""

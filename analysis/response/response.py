@@ -14,8 +14,13 @@ import numpy as np
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from ..estimators.contrasts import ResponseErrors, response_errors
-from ..estimators.intervals import around, t_factor, welch_satterthwaite
+from ..estimators.intervals import (
+    ResponseErrors,
+    around,
+    response_errors,
+    t_factor,
+    welch_satterthwaite,
+)
 from ..estimators.spectrum import Noise, ResidualBins
 from ..results.estimate import Estimate
 

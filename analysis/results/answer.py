@@ -1,9 +1,125 @@
-"""The answer of a session: which joints do not follow, which stand out, and the rest's shape."""
+"""The answer of a session: which joints do not follow, which stand out, and the rest's shape.
+
+What is missing or doubtful in a result, by what it changes for the reader.
+
+Whoever computes something takes a function of one sentence (:data:`.Warn`). A
+plain sentence is a warning. A :class:`Lacking` is a warning that stands first; a :class:`Note`
+changes nothing that a reader does: an optional topic that was not recorded, a figure that does not
+apply.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+
+_MOST = 12
+"""Digits after which two numbers are taken for equal."""
+
+
+def percent(share: float, limit: float) -> str:
+    """Print a share so that it reads as on the side of a limit that it is on.
+
+    Args:
+        share: Any share.
+        limit: What it was compared with.
+
+    Returns:
+        In percent with no digits more than needed, e.g. ``79.97 %`` for a limit of 0.8.
+    """
+    for decimals in range(_MOST):
+        text = f"{100 * share:.{decimals}f}"
+        if _same_side(float(text) / 100, share, limit):
+            return f"{text} %"
+    return f"{100 * share!r} %"
+
+
+def beyond(value: float, limit: float, digits: int = 2) -> str:
+    """Print a value so that it reads as on the side of a limit that it is on.
+
+    Args:
+        value: Any value.
+        limit: What it was compared with.
+        digits: Significant digits, at least.
+
+    Returns:
+        The value, e.g. ``101`` for a limit of 100, where two digits would be 1e+02.
+    """
+    for count in range(digits, _MOST):
+        text = f"{value:.{count}g}"
+        if _same_side(float(text), value, limit):
+            return text
+    return repr(value)
+
+
+def _same_side(printed: float, value: float, limit: float) -> bool:
+    return value == limit or (printed != limit and (printed > limit) == (value > limit))
+
+
+def distinct(first: float, second: float, digits: int = 4) -> tuple[str, str]:
+    """Print two numbers so that they read as different if they are.
+
+    Args:
+        first: A number.
+        second: Another.
+        digits: Significant digits, at least.
+
+    Returns:
+        Both with the same number of significant digits.
+    """
+    for count in range(digits, _MOST):
+        texts = f"{first:.{count}g}", f"{second:.{count}g}"
+        if texts[0] != texts[1] or first == second:
+            return texts
+    return repr(first), repr(second)
+
+
+class Lacking(str):
+    """What the session was recorded for is null: there is no gait, no command, no response."""
+
+    __slots__ = ()
+
+
+class Note(str):
+    """A fact; nothing that the result states is doubtful for it."""
+
+    __slots__ = ()
+
+
+class Remarks:
+    """Collects sentences, each once."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._sentences: dict[str, str] = {}
+
+    def __call__(self, sentence: str) -> None:
+        """Take a sentence.
+
+        Args:
+            sentence: Plain, a :class:`Lacking` or a :class:`Note`.
+        """
+        self._sentences.setdefault(sentence, sentence)
+
+    def warnings(self, of_the_file: Iterable[str] = ()) -> tuple[str, ...]:
+        """Return the warnings, worst first.
+
+        Args:
+            of_the_file: What the session's file lacks: it comes after what is null.
+
+        Returns:
+            One sentence each.
+        """
+        every = self._sentences.values()
+        lacking = [one for one in every if isinstance(one, Lacking)]
+        others = [one for one in every if not isinstance(one, (Lacking, Note))]
+        return tuple(map(str, dict.fromkeys([*lacking, *of_the_file, *others])))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The notes, in the order in which they came."""
+        return tuple(str(one) for one in self._sentences.values() if isinstance(one, Note))
 
 
 class Verdict(StrEnum):

@@ -218,7 +218,7 @@ class Experiment(Shown):
         reversal: None where it can't be tested; a warning says why.
         coupling: Identifiable or not; from kicks around one gait a
             :class:`.analysis.results.coupling.LocalCoupling`, from a sweep without contact a
-            :class:`.analysis.results.sweep.LinearCoupling`.
+            :class:`.analysis.results.coupling.LinearCoupling`.
         warnings: One sentence each.
         provenance: How it was made.
         oscillators: From kicks around one gait: how oscillators that feel their servos would

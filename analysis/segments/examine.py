@@ -13,9 +13,18 @@ from undulog.capture.common.arrays import FloatArray
 from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, equivalence_p
 from ..response.response import Response
 from ..results.answer import Shape, StandOut
-from .family import LEVEL, Scatter, critical_value, scatter_of
 from .outliers import Deviation, standing_out
-from .profile import MIN_JOINTS, Contrast, Profile, contrasts, family_of
+from .profile import (
+    LEVEL,
+    MIN_JOINTS,
+    Contrast,
+    Profile,
+    Scatter,
+    contrasts,
+    critical_value,
+    family_of,
+    scatter_of,
+)
 
 _MARGINS = {"gain": EQUIVALENT_GAIN, "lag": EQUIVALENT_LAG_RAD}
 OFFSET_RAD = EQUIVALENT_LAG_RAD

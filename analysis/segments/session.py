@@ -11,17 +11,16 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.following.fault import Fault
 from undulog.capture.following.find import joints_not_following
-from undulog.capture.following.motion import BLOCKS, JointMotion, Samples
+from undulog.capture.following.motion import BLOCKS, COHERENT, JointMotion, Samples
 from undulog.capture.following.session import motions_of
-from undulog.capture.following.windows import COHERENT
 from undulog.capture.robot.model import Robot
 
 from ..response.fitting import GaitFit
-from ..response.gait import DRIVEN_SHARE
+from ..response.rhythm import DRIVEN_SHARE
 from ..results.analysis import JointResult
 from ..results.answer import NotFollowing
 from ..results.artefact import Artefact
-from ..signals.reading import QUANTITIES, Columns, by_plane
+from ..signals.columns import QUANTITIES, Columns, by_plane
 from ..signals.windows import Stretch
 from .examine import Chain, Findings, examine
 

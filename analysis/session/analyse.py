@@ -19,20 +19,17 @@ from undulog.capture.log.read.signals import Signal
 from ..artefacts.find import find_artefacts
 from ..body.motion import body_motion
 from ..dead_band.find import dead_bands
-from ..energy.joint import Energies, energy_result
-from ..energy.ledger import check_ledger
-from ..energy.transport import transport
+from ..energy import Energies, check_ledger, energy_result, transport
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
-from ..response.gait import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
+from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import Analysis, GaitFacts, JointResult, SessionFacts, Window
-from ..results.artefact import KINDS, Artefact, flags_by_joint
-from ..results.dead_band import DeadBand
+from ..results.answer import Note, Remarks
+from ..results.artefact import KINDS, Artefact, DeadBand, flags_by_joint
 from ..results.estimate import Estimate, Provenance
-from ..results.remarks import Note, Remarks
 from ..segments.answer import Facts, compose
 from ..segments.session import (
     commanded_joints,
@@ -42,13 +39,13 @@ from ..segments.session import (
     stopped,
     unrefuted,
 )
-from ..signals.reading import drag_ratio, read_columns, settle_time_s
+from ..signals.columns import drag_ratio, read_columns, settle_time_s
 from ..signals.stretch import Options, choose_stretch, recorded, without_breaks
 from ..signals.windows import Span, Stretch, whole_cycles
-from .coupling_of_one_gait import one_gait_coupling
-from .demodulation_session import response_over_time
 from .heterogeneity import heterogeneity_indices
 from .joints import group_facts, joint_energies, joint_results
+from .over_time import response_over_time
+from .runs import one_gait_coupling
 
 _NS = 1e9
 

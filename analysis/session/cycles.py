@@ -18,7 +18,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
 
 from ..estimators.cycle_sums import cycle_sums, weigh
-from ..estimators.harmonic_moments import cos_sin
+from ..estimators.harmonic import cos_sin
 from ..estimators.series import Series
 from .analyse import Measured
 

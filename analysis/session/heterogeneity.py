@@ -20,7 +20,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.robot.model import Robot
 
-from ..energy.joint import Energies
+from ..energy import Energies
 from ..estimators.intervals import (
     CONFIDENCE,
     EQUIVALENT_GAIN,
@@ -32,9 +32,9 @@ from ..estimators.intervals import (
 from ..response.fitting import GaitFit
 from ..response.response import Response
 from ..results.analysis import Index, JointResult
+from ..results.answer import Note
 from ..results.estimate import Interval
-from ..results.remarks import Note
-from ..signals.reading import by_plane
+from ..signals.columns import by_plane
 
 ENDS = 2
 MIDDLE = 5

@@ -9,21 +9,20 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
-from undulog.capture.common.threads import in_threads
-from undulog.capture.log.messages.topics import PowerTopic
+from undulog.capture.common.process import in_threads
+from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.robot.model import Robot
 
-from ..energy.joint import Energies, Energy, add_up, integrate, power_of
+from ..energy import Energies, Energy, add_up, integrate, power_of
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series, clean, coverage
 from ..response.fitting import GaitFit
-from ..response.gait import phase_step, wave_name
 from ..response.response import gain_estimate, lag_estimate
+from ..response.rhythm import phase_step, wave_name
 from ..results.analysis import GroupFacts, JointResult, Window
-from ..results.artefact import Artefact
-from ..results.dead_band import DeadBand
+from ..results.artefact import Artefact, DeadBand
 from ..results.estimate import Estimate
-from ..signals.reading import Columns, by_plane, planes_of
+from ..signals.columns import Columns, by_plane, planes_of
 from ..signals.windows import Span, Stretch, whole_cycles
 
 _NS = 1e9

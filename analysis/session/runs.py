@@ -7,6 +7,7 @@ c read from tail to head is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -14,17 +15,137 @@ from itertools import zip_longest
 
 import numpy as np
 
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
-from undulog.capture.robot.model import Robot
+from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
 from ..response.fitting import GaitFit
-from ..response.gait import phase_step, wave_name
 from ..response.response import Response
+from ..response.rhythm import phase_step, wave_name
 from ..results import formats
-from ..results.analysis import Analysis
-from ..results.deciding import distinct
-from ..signals.reading import by_plane
-from .posture import UNKNOWN_POSTURE, Posture
+from ..results.analysis import Analysis, Window
+from ..results.answer import distinct
+from ..results.coupling import Coupling
+from ..signals.columns import by_plane
+
+
+def one_gait_coupling(joints: int) -> Coupling:
+    """What one steady gait says about the coupling: nothing, and what would.
+
+    Args:
+        joints: Joints with a known response, m.
+
+    Returns:
+        Not identifiable, with the reason and the plan to record.
+    """
+    if joints == 0:
+        return Coupling(
+            identifiable=False,
+            why="no joint's response to a gait is known",
+            record="a session with a steady gait, commands and responses",
+        )
+    if joints == 1:
+        return Coupling(
+            identifiable=False,
+            why="one joint has no neighbour whose response is known",
+            record="a session with a chain of driven joints",
+        )
+    return Coupling(
+        identifiable=False,
+        why=f"one gait gives {joints} complex numbers for {joints * joints} unknown couplings",
+        record=f"phase-kicks around this gait ({4 * joints} runs: each joint's command kicked up "
+        f"and down, in phase and in amplitude), or without contact a lag-sweep of {joints} gaits",
+    )
+
+
+HEADING = "heading_rad"
+"""Key of the metadata records ``undulog.plan`` and ``undulog`` with the heading [rad]."""
+
+
+@dataclass(frozen=True)
+class Posture:
+    """How the robot lay.
+
+    Attributes:
+        heading_rad: Direction of its head, counter-clockwise from a direction that is the same in
+            all runs [rad]; NaN where it is unknown.
+        lean_rad: Fall of the body along itself by recorded gravity, downhill towards the head
+            positive [rad]; NaN where none is recorded.
+    """
+
+    heading_rad: float = math.nan
+    lean_rad: float = math.nan
+
+
+UNKNOWN_POSTURE = Posture()
+
+
+def posture(session: SessionView, windows: Sequence[Window]) -> Posture:
+    """Read how the robot lay in a session.
+
+    Args:
+        session: An open session.
+        windows: Whole gait cycles, over which the motion's own acceleration nearly vanishes.
+
+    Returns:
+        The heading of its plan's record, else of its own metadata, else of its twin's start;
+        and the lean of its accelerometers, the mean of several.
+    """
+    return Posture(_heading(session), _lean(session, windows))
+
+
+def _heading(session: SessionView) -> float:
+    for record in ("undulog.plan", "undulog"):
+        text = session.metadata.get(record, {}).get(HEADING)
+        if text is not None:
+            return _number(text)
+    return math.nan if session.run is None else session.run.start_heading_rad
+
+
+def _number(text: object) -> float:
+    try:
+        value = float(str(text))
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+def _lean(session: SessionView, windows: Sequence[Window]) -> float:
+    robot = session.robot
+    if robot is None or not windows:
+        return math.nan
+    leans = [
+        lean
+        for sensor in robot.sensors
+        if sensor.kind is SensorKind.ACCELEROMETER
+        and set("xyz") <= set(sensor.axes)
+        and sensor.topic in session.channels
+        and math.isfinite(lean := _lean_of(session, sensor, windows))
+    ]
+    return float(np.mean(leans)) if leans else math.nan
+
+
+def _lean_of(session: SessionView, sensor: Sensor, windows: Sequence[Window]) -> float:
+    """Lean of the link that carries one accelerometer; its specific force is gravity's opposite."""
+    table = session.table(sensor.topic)
+    t_s = (table.index.to_numpy() - session.start_ns) * 1e-9
+    inside = np.zeros(len(t_s), dtype=np.bool_)
+    for window in windows:
+        inside |= (t_s >= window.start_s) & (t_s < window.stop_s)
+    columns = [f"linear_acceleration.{axis}" for axis in "xyz"]
+    if not inside.any() or not set(columns) <= set(table.columns):
+        return math.nan
+    mean = table[columns].to_numpy(dtype=np.float64)[inside].mean(axis=0)
+    if not np.isfinite(mean).all():
+        return math.nan
+    # First and third row of Rz(yaw) Ry(pitch) Rx(roll): the link's x and z.
+    roll, pitch, yaw = sensor.rpy
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    x = float(mean @ [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr])
+    z = float(mean @ [-sp, cp * sr, cp * cr])
+    return math.atan2(-x, z)
+
 
 SAME_COMMAND = 0.01
 """Largest deviation of a command, over its amplitude, that is the same gait still."""

@@ -12,12 +12,12 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError, UsageError
+from undulog.capture.log.read.sample_times import longest_unbroken
 from undulog.capture.log.read.signals import Signal
-from undulog.capture.log.read.unbroken import longest_unbroken
 
 from ..estimators.series import clean
-from ..response.gait import MIN_CYCLES
-from .reading import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns, settle_time_s
+from ..response.rhythm import MIN_CYCLES
+from .columns import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns, settle_time_s
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
 GAIT_TOPIC = "/gait"

@@ -25,10 +25,10 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.cycle_sums import starts_of
-from ..estimators.harmonic_moments import cos_sin
+from ..estimators.harmonic import cos_sin
 from ..estimators.series import Series
-from ..response.gait import MIN_CYCLES, Rhythm
 from ..response.groups import find_groups
+from ..response.rhythm import MIN_CYCLES, Rhythm
 
 STEADY = 0.03
 """Cycles whose amplitude is within this share of the commonest one are steady."""

@@ -21,10 +21,9 @@ import numpy as np
 
 from ..common.arrays import FloatArray, IntArray
 from ..log.write.channels import JointStateChannel
-from ..log.write.sensor_channels import open_sensor
-from ..log.write.writer import SessionWriter
+from ..log.write.writer import SessionWriter, open_sensor
+from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import BusSignal, Quantity, Robot, Sensor, SensorKind
-from ..robot.units import SESSION_UNIT
 from .cycles import RoundGatherer, Rounds
 from .decoding import BusDecoder, DecodedSignals
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import BoolArray, FloatArray, IntArray
-from ..log.health.undecoded import counts_text
+from ..log.health.bus_tally import counts_text
 from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,
@@ -26,8 +26,8 @@ from ..log.messages.frames import (
     FrameArray,
     identifier_text,
 )
+from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import BusSignal, Direction, Quantity, Robot
-from ..robot.units import SESSION_UNIT
 from .map_entry import MapEntry, bus_messages, compile_entry, frame_id
 
 _WAY = {Direction.RX: DIR_RX, Direction.TX: DIR_TX}

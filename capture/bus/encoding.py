@@ -16,8 +16,15 @@ import numpy as np
 from ..common.errors import DataError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_frames
 from ..robot.model import BusSignal, Direction, Quantity, Robot
-from .bit_field import BitField
-from .map_entry import Conditions, MapEntry, bus_messages, compile_entry, conditions_of, frame_id
+from .map_entry import (
+    BitField,
+    Conditions,
+    MapEntry,
+    bus_messages,
+    compile_entry,
+    conditions_of,
+    frame_id,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Message

@@ -12,7 +12,7 @@ from ..common.errors import ImportFormatError, UsageError
 from ..common.files import is_file
 
 if TYPE_CHECKING:
-    from ..exchange.column_map import ColumnMap
+    from ..exchange.csv_import import ColumnMap
     from ..exchange.import_output import ImportReport
     from ..robot.model import Robot
 
@@ -52,7 +52,7 @@ def import_log(
         json: Report as one JSON object.
     """
     from ..common.console import refuse_existing
-    from ..common.interruption import interruptible
+    from ..common.process import interruptible
     from ..exchange.can_import import import_can
     from ..exchange.csv_import import import_csv
     from ..robot.description import load_robot
@@ -109,10 +109,10 @@ def export_log(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from ..common.interruption import interruptible
-    from ..exchange.column_export import TABLE_FORMATS, export_columns
+    from ..common.process import interruptible
+    from ..exchange.export import TABLE_FORMATS, export_columns
+    from ..exchange.export import export_log as export_frames
     from ..exchange.frame_formats import FRAME_FORMATS
-    from ..exchange.log_export import export_log as export_frames
 
     suffix = output.suffix.lower()
     if suffix not in FRAME_FORMATS and suffix not in TABLE_FORMATS:
@@ -155,7 +155,7 @@ def _column_map(
         if columns is not None or options:
             raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
         return None
-    from ..exchange.column_map import column_map_from_options, read_column_map
+    from ..exchange.csv_import import column_map_from_options, read_column_map
 
     if (columns is None) == (not options):
         given = "not both" if options else "to say what its columns mean"

@@ -13,7 +13,7 @@ from ..log.messages.frames import FD_TOPIC_PREFIX
 if TYPE_CHECKING:
     from ..log.health.measures import BusHealth, SeriesHealth
     from ..log.health.session_check import SessionHealth
-    from ..log.health.source_health import SourceHealth
+    from ..log.health.sources import SourceHealth
 
 
 def log_check(file: Path, /, *, json: bool = False) -> int:

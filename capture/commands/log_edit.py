@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from ..common.console import emit_json, say
-from ..common.interruption import interruptible
+from ..common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..log.edit.edit import EditReport
+    from ..log.edit.edited_log import EditReport
     from ..log.edit.recover import RecoverReport
 
 

@@ -15,10 +15,10 @@ from ..common.console import complain, emit_json, say
 from ..common.errors import UndulogError
 
 if TYPE_CHECKING:
-    from ..common.interruption import StopRequest
-    from ..recorder.report import RecordReport
+    from ..common.process import StopRequest
+    from ..recorder.recording import RecordReport
     from ..recorder.settings import RecordSettings
-    from ..recorder.statuses import RecorderSnapshot
+    from ..recorder.status import RecorderSnapshot
 
 
 _Words = Annotated[tuple[str, ...], Parameter(show_default=False)]
@@ -85,7 +85,7 @@ def record(
         quiet: Nothing on the terminal.
         json: Report as one JSON object at the end.
     """
-    from ..common.interruption import interruptible
+    from ..common.process import interruptible
     from ..recorder.settings import resolve
 
     resolved = resolve(
@@ -123,9 +123,9 @@ def record(
 
 
 def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
-    from ..recorder.record import Recording
-    from ..recorder.terminal import Terminal
-    from ..recorder.unit import Notifier
+    from ..recorder.recording import Recording
+    from ..recorder.screen import Terminal
+    from ..recorder.systemd import Notifier
 
     terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:
@@ -149,7 +149,7 @@ def _nothing() -> str:
 
 def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
     """Start the live view; returns what tells, once, why it has ended by itself."""
-    from ..recorder.live_spawn import spawn_relay
+    from ..recorder.live_feed import spawn_relay
 
     complaints: list[str] = []
     try:

@@ -132,7 +132,7 @@ def unit() -> None:
 
     Example: `undulog record unit | sudo tee /etc/systemd/system/undulog-record@.service`
     """
-    from ..recorder.unit import hidden_folder, installed_program, unit_text
+    from ..recorder.systemd import hidden_folder, installed_program, unit_text
 
     program = installed_program()
     say(*unit_text(program).splitlines())
@@ -144,7 +144,7 @@ def unit() -> None:
 
 
 def _running() -> list[Path]:
-    from ..recorder.control_socket import find_sockets
+    from ..recorder.control_client import find_sockets
 
     paths = find_sockets(os.environ)
     if not paths:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .console import refuse_existing
 from .errors import Fault, FaultyFileError, InputFileError, LogWriteError, UndulogError, UsageError
-from .interruption import StopRequest
+from .process import StopRequest
 from .strict_table import listed
 
 

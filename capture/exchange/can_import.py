@@ -13,8 +13,8 @@ from ..bus.decoding import BusDecoder, DecodedSignals, FrameTally
 from ..common.arrays import IntArray
 from ..common.console import progress
 from ..common.errors import ImportFormatError
-from ..common.interruption import StopRequest
-from ..log.health.undecoded import undecoded
+from ..common.process import StopRequest
+from ..log.health.bus_tally import undecoded
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
 from ..log.write.channels import FrameChannel
 from ..log.write.writer import SessionWriter

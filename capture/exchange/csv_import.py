@@ -1,31 +1,231 @@
-"""CSV logs into sessions, by a column map."""
+"""CSV logs into sessions, by a column map.
+
+What the columns of a CSV log mean.
+
+A map is a TOML file::
+
+    [time]
+    column = "time"
+    unit = "s"
+
+    [[columns]]
+    column = "s_pos"
+    joint = "joint01"
+    quantity = "position"
+    unit = "rad"
+    wrap = 12.566370614359172           # the cell jumps by this period, in `unit`; undone first
+    scale = 0.045454545454545456        # then value = scale * cell + offset, in `unit`
+    offset = 0.0
+
+or the same as options, ``time=time:s`` and
+``s_pos=joint01.position:rad,wrap=12.566370614359172,scale=0.045454545454545456``.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
 import math
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import TextIO
+from typing import Annotated, Any, TextIO
 
 import numpy as np
 
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
+from ..common.config import Positive, read_field
 from ..common.console import progress
-from ..common.errors import ImportFormatError
-from ..common.interruption import StopRequest
-from ..common.strict_table import listed
+from ..common.errors import Fault, FaultyFileError, ImportFormatError, UsageError
+from ..common.files import read_input
+from ..common.process import StopRequest
+from ..common.strict_table import NONZERO, Faults, Table, listed, read_toml
 from ..log.write.writer import SessionWriter
+from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, unit_for, valid_units
 from ..robot.model import Quantity, Robot
-from ..robot.units import SESSION_UNIT, TIME_UNITS, unit_for
 from .can_logs import CSV_HEADER
-from .column_map import Column, ColumnMap
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
 from .import_output import ImportReport, imported_session
+
+_DELIMITERS = (",", ";", "\t", " ")
+_OPTION_FORM = (
+    "COLUMN=time:UNIT or COLUMN=JOINT.QUANTITY:UNIT[,wrap=PERIOD][,scale=FACTOR][,offset=VALUE]"
+)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column that is read.
+
+    Attributes:
+        column: Its name in the header.
+        joint: The joint it belongs to.
+        quantity: What it is of that joint.
+        unit: Its unit.
+        wrap: Period of its jumps, in ``unit``; 0 if it doesn't wrap around.
+        scale: Applied to the unwrapped cell.
+        offset: Added after ``scale``, in ``unit``.
+    """
+
+    column: str
+    joint: str
+    quantity: Quantity
+    unit: str
+    wrap: Positive = 0.0
+    scale: Annotated[float, NONZERO] = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """The columns of a CSV log.
+
+    Attributes:
+        time_column: Name of the column of times.
+        time_unit: ``s``, ``ms``, ``us`` or ``ns``.
+        columns: The others; columns that are not named are not read.
+        delimiter: What stands between the cells.
+    """
+
+    time_column: str
+    time_unit: str
+    columns: tuple[Column, ...]
+    delimiter: str = ","
+
+    def toml(self) -> str:
+        """The map as a TOML file, for the session's attachments."""
+        lines = [f"delimiter = {json.dumps(self.delimiter)}", "", "[time]"]
+        lines += [f"column = {json.dumps(self.time_column)}", f'unit = "{self.time_unit}"']
+        for column in self.columns:
+            lines += ["", "[[columns]]", f"column = {json.dumps(column.column)}"]
+            lines += [f'joint = "{column.joint}"', f'quantity = "{column.quantity}"']
+            lines += [f'unit = "{column.unit}"', f"scale = {column.scale!r}"]
+            lines += [f"offset = {column.offset!r}"]
+            lines += [f"wrap = {column.wrap!r}"] if column.wrap else []
+        return "\n".join(lines) + "\n"
+
+
+def read_column_map(path: Path, robot: Robot) -> ColumnMap:
+    """Read a map from its TOML file.
+
+    Args:
+        path: The file.
+        robot: The robot whose joints it names.
+
+    Returns:
+        The map.
+
+    Raises:
+        InputFileError: If the file isn't there or can't be read.
+        FaultyFileError: If it has faults; lists all of them.
+    """
+    try:
+        values = read_toml(read_input(path).decode("utf-8"))
+    except ValueError as error:
+        raise FaultyFileError(path, [Fault("syntax", str(error), "TOML 1.0")]) from error
+    column_map, faults = _parse(values, robot)
+    if faults:
+        raise FaultyFileError(path, faults)
+    return column_map
+
+
+def column_map_from_options(options: Sequence[str], robot: Robot) -> ColumnMap:
+    """Read a map from command line options.
+
+    Args:
+        options: One a column, as the module describes.
+        robot: The robot whose joints they name.
+
+    Returns:
+        The map.
+
+    Raises:
+        UsageError: If they have faults; lists all of them.
+    """
+    values: dict[str, Any] = {"columns": []}
+    for option in options:
+        column, equals, meaning = option.rpartition("=") if "," not in option else _cut(option)
+        head, *extras = meaning.split(",")
+        target, colon, unit = head.partition(":")
+        joint, dot, quantity = target.partition(".")
+        if not (equals and colon and column) or (target != "time" and not dot):
+            raise UsageError(f"--map {option!r} is not of the form {_OPTION_FORM}")
+        if target == "time":
+            values["time"] = {"column": column, "unit": unit}
+            continue
+        entry: dict[str, Any] = {"column": column, "joint": joint, "quantity": quantity}
+        entry["unit"] = unit
+        for extra in extras:
+            key, _, number = extra.partition("=")
+            try:
+                entry[key.strip()] = float(number)
+            except ValueError as error:
+                raise UsageError(f"--map {option!r}: {extra!r} is not KEY=NUMBER") from error
+        values["columns"].append(entry)
+    column_map, faults = _parse(values, robot)
+    if faults:
+        raise UsageError("\n  ".join(["--map has faults:", *map(str, faults)]))
+    return column_map
+
+
+def _cut(option: str) -> tuple[str, str, str]:
+    """Split at the last equals sign before the first comma: a column's name may have others."""
+    head, comma, extras = option.partition(",")
+    column, equals, meaning = head.rpartition("=")
+    return column, equals, meaning + comma + extras
+
+
+def _parse(values: dict[str, Any], robot: Robot) -> tuple[ColumnMap, tuple[Fault, ...]]:
+    faults = Faults()
+    top = Table(values, "", faults)
+    delimiter = top.text("delimiter", ",")
+    if delimiter not in _DELIMITERS:
+        top.fault("delimiter", " ".join(json.dumps(each) for each in _DELIMITERS))
+    time = top.table("time")
+    time_column, time_unit = time.text("column"), time.text("unit")
+    if time_unit not in TIME_UNITS:
+        time.fault("unit", listed(TIME_UNITS, time_unit))
+    time.close()
+    entries = top.tables("columns")
+    if not entries:
+        top.fault("columns", "at least one column")
+    columns = tuple(_column(entry, robot.joint_names) for entry in entries)
+    top.close()
+    _note_repeated(faults, columns)
+    return ColumnMap(time_column, time_unit, columns, delimiter), faults.all()
+
+
+def _column(table: Table, joints: Iterable[str]) -> Column:
+    name, joint = table.text("column"), table.text("joint")
+    if joint and joint not in joints:
+        table.fault("joint", listed(joints, joint))
+    quantity, unit = table.choice("quantity", JOINT_QUANTITIES), table.text("unit")
+    if quantity is not None:
+        try:
+            unit_for(unit, quantity)
+        except UsageError:
+            table.fault("unit", f"for {quantity}: {listed(valid_units(quantity), unit)}")
+    column = Column(
+        column=name,
+        joint=joint,
+        quantity=quantity or Quantity.POSITION,
+        unit=unit,
+        wrap=read_field(table, Column, "wrap"),
+        scale=read_field(table, Column, "scale"),
+        offset=read_field(table, Column, "offset"),
+    )
+    table.close()
+    return column
+
+
+def _note_repeated(faults: Faults, columns: Sequence[Column]) -> None:
+    targets = [f"{column.joint}.{column.quantity}" for column in columns]
+    for target in sorted({target for target in targets if targets.count(target) > 1}):
+        faults.add("columns", f"{targets.count(target)} columns for {target}", "one at most")
+
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
 _ROWS_PER_UPDATE = 4096

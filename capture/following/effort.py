@@ -12,20 +12,18 @@ from .fault import Symptom
 from .motion import (
     BLOCKS,
     FEW_SAMPLES,
-    JointMotion,
-    Response,
-    record_span,
-    windowed_response,
-    within,
-)
-from .windows import (
     MIN_SHARE,
     MIN_WINDOWS,
+    JointMotion,
     Judged,
+    Response,
     complex_median,
     marked_spans,
     neighbours,
+    record_span,
     whole_or,
+    windowed_response,
+    within,
 )
 
 POWERLESS = 0.2

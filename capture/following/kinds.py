@@ -17,7 +17,7 @@ from .fault import Fault, Span, Symptom
 from .motion import JointMotion, Samples, record_span, within
 
 if TYPE_CHECKING:
-    from .windows import Judged
+    from .motion import Judged
 
 MOVING = 0.5
 """Correlation of a velocity or second sensor with the command that shows motion."""

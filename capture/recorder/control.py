@@ -20,7 +20,7 @@ from time import perf_counter_ns
 from typing import Any, Final, cast
 
 from ..common.errors import ControlError, UndulogError
-from .control_socket import listen, release
+from .control_client import listen, release
 
 Reply = Mapping[str, Any]
 

@@ -1,7 +1,7 @@
 """A device's clock against the session's: when a sample was taken, rather than when it came.
 
-Method: the line below all delays, :mod:`.capture.recorder.envelope`. What no arrival times can tell
-is the least delay itself: mapped times are late by it, the same for all samples of a source.
+Method: the line below all delays, :mod:`.capture.recorder.clock_envelope`. Arrival times can't show
+the least delay itself: mapped times are late by it, the same for all samples of a source.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.arrays import BoolArray, IntArray
 from ..sources.contract import DEVICE_TIMES_END_NS
-from .envelope import BUCKET_NS, PRIOR, SAME_DEVICE, Envelope
+from .clock_envelope import BUCKET_NS, PRIOR, SAME_DEVICE, Envelope
 
 JUMP_NS = 100_000_000
 """A device time that goes back by more than this, or comes this much before it can have been, was

@@ -36,9 +36,19 @@ from ..common.errors import Fault, RobotFileError
 from ..common.files import Shelf
 from ..common.strict_table import Faults, Table, listed, read_toml
 from .bus_map import read_bus
-from .mesh import MESH_TYPES, is_mesh, read_meshes
-from .model import ClockDomain, Joint, Link, Plane, Robot, Sensor, SensorKind, Servo
-from .safety import JOINT_LIMITS, Safety
+from .kinematics import MESH_TYPES, is_mesh, read_meshes
+from .model import (
+    JOINT_LIMITS,
+    ClockDomain,
+    Joint,
+    Link,
+    Plane,
+    Robot,
+    Safety,
+    Sensor,
+    SensorKind,
+    Servo,
+)
 
 
 def note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:

@@ -5,7 +5,7 @@
 128
 
 A process in another language does the same with 20 lines: connect an ``AF_UNIX`` socket of type
-``SOCK_SEQPACKET`` and send packets as :mod:`.capture.sources.records` describes them.
+``SOCK_SEQPACKET`` and send packets as :mod:`.capture.sources.contract` describes them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 from ..common.errors import DataError
 from ..log.messages.frames import FRAME_DTYPE, FrameArray
+from .contract import HEAD, MOST_RECORDS
 from .receive_many import SO_SNDBUFFORCE, enlarge_buffer
-from .records import HEAD, MOST_RECORDS
 
 _BUFFER_BYTES = 4 << 20
 _PAUSE_S = 0.1

@@ -20,9 +20,9 @@ from ..common.errors import SourceError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
 from ..robot.model import ClockDomain
 from .contract import SourceAddress
-from .drained_link import DrainedLink
 from .events import Tally
 from .link import LinkedSource
+from .reader_thread import DrainedLink
 from .receive_many import (
     SO_RCVBUFFORCE,
     SO_RXQ_OVFL,

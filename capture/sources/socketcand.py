@@ -1,25 +1,183 @@
 """CAN buses served over TCP by socketcand, its raw mode read in bulk.
 
 The server's own times of the frames are kept, to the microsecond, as the device's clock.
+
+The raw mode of socketcand.
+
+A frame is ``< frame 123 1700000000.123456 1122AABB >``: an identifier of three digits (11 bit) or
+eight (29 bit), the server's time, the data, with some servers with blanks between the bytes. One
+expression finds them all. What is rare is read one by one: remote requests
+``< rtr 123 TIME LENGTH >``, error frames ``< error CLASSES TIME >``, times with another number of
+decimals or out of range, and whatever is broken.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import re
 import socket
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
+
+import numpy as np
 
 from ..common.errors import UsageError
-from ..log.messages.frames import FrameArray
+from ..log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
 from ..robot.model import ClockDomain
 from .address import number, only
-from .contract import SourceAddress
-from .events import Tally
+from .contract import SourceAddress, pack_record, records
+from .events import ODD_TIME, Tally
 from .link import LinkedSource
+from .reader_thread import ReceiveThread
 from .receive_many import ArrivalClock
-from .receive_thread import ReceiveThread
-from .socketcand_text import SocketcandText
+
+_FRAMES = re.compile(
+    r"< frame ([0-9A-Fa-f]{1,8}) (\d{1,10})\.(\d{6}) ((?:[0-9A-Fa-f]{2} ?){0,8}) ?>", re.ASCII
+)
+_MESSAGE = re.compile(r"<[^<>]*>")
+_ANY = re.compile(
+    r"< *(frame|rtr|error) +([0-9A-Fa-f]{1,8})"
+    r" +(-?\d+(?:\.\d*)?(?:[Ee][-+]?\d+)?|-?(?:[Nn][Aa][Nn]|[Ii][Nn][Ff]))"
+    r"(?: +([0-9A-Fa-f ]*?))? *>",
+    re.ASCII,
+)
+_TIME = re.compile(r"(\d{1,10})(?:\.(\d{1,9}))?", re.ASCII)
+_WORD = re.compile(r"< *(hi|ok|echo) *>")
+_TOLD = re.compile(r"< *(error\b[^>]*?) *>")
+_LONGEST = 400  # a CAN FD frame with 64 bytes and blanks has about 220
+_HIGHEST_STANDARD = 0x7FF
+_HIGHEST_EXTENDED = 0x1FFF_FFFF
+
+
+class SocketcandText:
+    """Turns what a server sends into frames; keeps a message's beginning until its end comes."""
+
+    def __init__(self) -> None:
+        """Start between two messages."""
+        self._rest = b""
+
+    def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> FrameArray:
+        """Take what was read at once.
+
+        Args:
+            chunk: The bytes.
+            t_ns: When they were read [Unix ns].
+            tally: Where to count what is malformed.
+
+        Returns:
+            The frames whose messages have ended.
+        """
+        return self.feed_pieces((chunk,), (t_ns,), tally)
+
+    def feed_pieces(
+        self, pieces: Sequence[bytes], times_ns: Sequence[int], tally: Tally
+    ) -> FrameArray:
+        """Take what came in pieces.
+
+        Args:
+            pieces: The bytes.
+            times_ns: When each piece came [Unix ns].
+            tally: Where to count what is malformed.
+
+        Returns:
+            The frames whose messages have ended, with the time of the piece that ended them.
+        """
+        whole = b"".join((self._rest, *pieces))
+        begun = len(self._rest)
+        end = whole.rfind(b">") + 1
+        self._rest = whole[end:]
+        if len(self._rest) > _LONGEST:
+            self._rest = b"<"  # noise: its end, when it comes, is one malformed message
+        text = whole[:end].decode("latin-1")  # any byte is some character
+        found: list[tuple[str, str, str, str]] = _FRAMES.findall(text)
+        packed = None
+        if len(found) == text.count("<") == text.count(">"):
+            packed = _together(found)
+        if packed is not None:
+            frames = records(packed)
+            counts = [piece.count(b">") for piece in pieces]
+            frames["t_host_ns"] = np.repeat(np.array(times_ns, dtype=np.uint64), counts)
+            return frames
+        stops = list(accumulate(map(len, pieces), initial=begun))[1:]
+        return records(_one_by_one(text, stops, times_ns, tally))
+
+
+def _together(found: list[tuple[str, str, str, str]]) -> list[bytes] | None:
+    """Records from their fields; None if an identifier is too high for its number of digits."""
+    packed: list[bytes] = []
+    for digits, seconds, micros, field in found:
+        flags = int(digits, 16)
+        if len(digits) > 3:
+            if flags > _HIGHEST_EXTENDED:
+                return None
+            flags |= EXTENDED_FLAG
+        elif flags > _HIGHEST_STANDARD:
+            return None
+        data = bytes.fromhex(field)
+        packed.append(pack_record(int(seconds + micros) * 1000, 0, flags, len(data), 0, data))
+    return packed
+
+
+def _one_by_one(
+    text: str, stops: Sequence[int], times_ns: Sequence[int], tally: Tally
+) -> list[bytes]:
+    """Records of all messages; ``stops`` are the ends of the pieces that they came in."""
+    messages = list(_MESSAGE.finditer(text))
+    broken = text.count("<") + text.count(">") - 2 * len(messages)
+    tally.malformed("malformed message", broken)
+    return [
+        record
+        for message in messages
+        if (record := _record(message[0], times_ns[bisect_left(stops, message.end())], tally))
+    ]
+
+
+def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
+    """Read one message; None if it is no frame."""
+    found = _ANY.fullmatch(message)
+    if found is None:
+        told = _TOLD.fullmatch(message)
+        if told is not None:
+            tally.events.say("warn", f"the server says: {told[1]!r}")
+        elif not _WORD.fullmatch(message):
+            tally.malformed("malformed message", 1)
+        return None
+    kind, digits, stamp, rest = found.groups(default="")
+    identifier = int(digits, 16)
+    if kind == "error":  # the server keeps the details to itself
+        flags = identifier & ID_MASK | ERROR_FLAG
+        return pack_record(_time_ns(stamp, t_host_ns, tally), t_host_ns, flags, 0, 0, b"")
+    extended = len(digits) > 3
+    flags = extended * EXTENDED_FLAG
+    rest = rest.replace(" ", "")
+    if kind == "rtr":
+        flags |= REMOTE_FLAG
+        length, data = int(rest) if rest.isdigit() else -1, b""
+    else:
+        data = bytes.fromhex(rest) if len(rest) % 2 == 0 else None
+        length = -1 if data is None else len(data)
+    if length > 8 and kind == "frame":
+        tally.events.say("warn", "CAN FD frame left out")
+        return None
+    highest = _HIGHEST_EXTENDED if extended else _HIGHEST_STANDARD
+    if data is None or not 0 <= length <= 8 or identifier > highest:
+        tally.malformed("malformed message", 1)
+        return None
+    t_ns = _time_ns(stamp, t_host_ns, tally)
+    return pack_record(t_ns, t_host_ns, identifier | flags, length, 0, data)
+
+
+def _time_ns(stamp: str, t_host_ns: int, tally: Tally) -> int:
+    """A frame's time; that of its arrival where the server's is negative, infinite or too long."""
+    found = _TIME.fullmatch(stamp)
+    if found is None:
+        tally.malformed(ODD_TIME, 1)
+        return t_host_ns
+    seconds, fraction = found.groups(default="")
+    return int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))
+
 
 PORT = 29536
 """Where socketcand listens unless told otherwise."""

@@ -1,7 +1,7 @@
 """Sources with the scheme ``unix``: frames from other processes of this computer.
 
 The recorder listens at a path; whoever may write there connects and sends packets as
-:mod:`.capture.sources.records` describes them. It is the fast way in: up to 256 frames a packet,
+:mod:`.capture.sources.contract` describes them. It is the fast way in: up to 256 frames a packet,
 and the kernel stamps each packet's arrival.
 """
 
@@ -22,15 +22,24 @@ from pathlib import Path
 import numpy as np
 
 from ..common.errors import SourceError, UsageError
-from ..common.priority import share_priority
+from ..common.process import share_priority
 from ..log.messages.frames import FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
 from .address import flag, only
-from .contract import Polled, Source, SourceAddress, SourceContext, SourceCounts
+from .contract import (
+    HEAD,
+    LONGEST,
+    MOST_RECORDS,
+    RECORD_SIZE,
+    Polled,
+    Source,
+    SourceAddress,
+    SourceContext,
+    SourceCounts,
+)
 from .events import BusWatch, Tally
+from .reader_thread import ReceiveThread
 from .receive_many import ArrivalClock, Batch
-from .receive_thread import ReceiveThread
-from .records import HEAD, LONGEST, MOST_RECORDS, RECORD_SIZE
 
 _MOST_PACKETS = 8192  # in one poll, of one sender: others want to be heard too
 _BACKLOG = 64

@@ -21,15 +21,20 @@ from undulog.analysis.session.analyse import examine_session
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError
-from undulog.sim.scenario.engines import Kernels
-from undulog.sim.scenario.scenario import Scenario
+from undulog.sim.scenario.scenario import Kernels, Scenario
 
-from ..reproduce.run import find_repetition
-from .alternatives import Alternative, alternatives
-from .answers import Answers, read_measured
-from .determined import Ridge, half_widths, ridges, what_would_tell
+from ..reproduce import find_repetition
+from .identifiability import Alternative, Ridge, alternatives, half_widths, ridges, what_would_tell
 from .lack_of_fit import LackOfFit, Misfit, halves, lack_of_fit, misfit
-from .parameters import DELAY, Unknown, module_unknown, unknowns, with_values
+from .parameters import (
+    DELAY,
+    Answers,
+    Unknown,
+    module_unknown,
+    read_measured,
+    unknowns,
+    with_values,
+)
 from .solve import Solution, derivatives, solve
 
 SIGNIFICANT = 0.05

@@ -36,9 +36,9 @@ from scipy.special import chdtrc, fdtrc
 
 from undulog.capture.common.arrays import FloatArray
 
-from .alternatives import Alternative
-from .answers import Measured
-from .noise import deviations, score_covariance
+from .identifiability import Alternative
+from .parameters import Measured
+from .solve import deviations, score_covariance
 
 _STILL = 1e-3
 """A joint that moves less has no gain [rad, RMS]."""
@@ -177,7 +177,7 @@ def lack_of_fit(
         residuals: [rad], shapes (n_j,).
         omega: Of the gait [rad/s]; None where there is none.
         unfitted: From :func:`halves`.
-        others: From :func:`.replay.calibrate.alternatives.alternatives`.
+        others: From :func:`.replay.calibrate.identifiability.alternatives`.
 
     Returns:
         The tests.

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from undulog.capture.common.console import emit_json, progress, refuse_existing, say
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_stop
-from undulog.capture.common.interruption import interruptible
+from undulog.capture.common.process import interruptible
 
 
 def fit(
@@ -66,11 +66,10 @@ def fit(
     for path in (output, scenario):
         if path is not None:
             refuse_existing(path, force=force)
-    from undulog.sim.scenario.engines import Kernels
+    from undulog.sim.scenario.scenario import Kernels
 
     from ..calibrate.fit import Wanted, calibrate
-    from ..calibrate.output import write_calibration
-    from ..calibrate.told import reported, told
+    from ..calibrate.report import reported, told, write_calibration
 
     compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
     wanted = Wanted(tuple(only or ()), module, modules, delay, spread, within, settle)

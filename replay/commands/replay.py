@@ -11,13 +11,12 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, refuse_existing, say
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.interruption import interruptible
+from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
     from undulog.analysis.results.comparison import Comparison
 
-    from ..reproduce.run import Again
-    from ..reproduce.sameness import Sameness
+    from ..reproduce import Again, Sameness
 
 
 _TWIN = "twin"
@@ -73,7 +72,7 @@ def replay(
         refuse_existing(output, force=force)
     scheme, colon, world = on.partition(":")
     if scheme != _TWIN:
-        from ..reproduce.over_bus import replay_on_bus
+        from ..reproduce import replay_on_bus
 
         if change:
             raise UsageError("--set changes the twin's world: on a bus the world is as it is")
@@ -97,7 +96,7 @@ def replay(
         raise UsageError("a run of the twin is recorded: name the session with -o, e.g. -o b.mcap")
     from undulog.sim.scenario.scenario_file import read_changes
 
-    from ..reproduce.run import find_repetition, replay_in_twin, what_next
+    from ..reproduce import find_repetition, replay_in_twin, what_next
 
     changes = read_changes(change or [])
     repetition = find_repetition(file, world or None, changes, duration)
@@ -127,7 +126,7 @@ def replay(
 def _show(comparison: Comparison) -> None:
     """Print a comparison below what was said."""
     from undulog.analysis.commands.options import show
-    from undulog.analysis.present.text.comparison import render_comparison
+    from undulog.analysis.present.text_experiment import render_comparison
 
     say("")
     show(lambda width, color: render_comparison(comparison, width=width, color=color), None)

@@ -18,7 +18,7 @@ from .view_overlay import BesideOptions
 from .view_single import SingleOptions
 
 if TYPE_CHECKING:
-    from ..record.rrd import Recording
+    from ..feed.recording import Recording
 
 
 def view(
@@ -82,7 +82,7 @@ def view(
             raise UsageError(f"{save}: a Rerun recording; end its name in .rrd")
         refuse_existing(save, force=force)
     if live is not None:
-        from .view_live import view_live
+        from .view_viewer import view_live
 
         view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1:
@@ -127,7 +127,7 @@ def _view_file(
         _report(recording, duration_s, json=json)
         return
 
-    from .view_stream import view_session
+    from .view_viewer import view_session
 
     view_session(file, single, web=web)
 
@@ -136,7 +136,7 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     from undulog.analysis.signals.stretch import Options
     from undulog.capture import Session
 
-    from ..record.results import computed, saved
+    from ..feed.numbers import computed, saved
 
     command, response = single.topics
     options = Options(command_topic=command, response_topic=response)
@@ -152,8 +152,8 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
         session.forget()
         bar.update(1, note="recording")
         # Here, not above: Rerun takes memory that the analysis can use before.
-        from ..layout.blueprint import build_blueprint
-        from ..record.rrd import write_recording
+        from ..feed.recording import write_recording
+        from ..layout import build_blueprint
 
         recording = write_recording(
             single.view(session),

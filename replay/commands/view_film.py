@@ -12,11 +12,11 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, refuse_existing, say
 from undulog.capture.common.errors import MissingExtraError, UsageError
-from undulog.capture.common.interruption import interruptible
+from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..film.film import Shot
-    from ..record.rrd import Recording
+    from ..feed.film import Shot
+    from ..feed.recording import Recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,14 +63,13 @@ def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json
         UndulogError: If the work fails.
     """
     try:
-        from ..film.files import check_film
-        from ..film.film import film, scene_only
+        from ..feed.film import check_film, film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
     from undulog.capture import Session
 
     from ..draw.scene.body import body_title
-    from ..record.rrd import write_recording
+    from ..feed.recording import write_recording
 
     refuse_existing(clip, force=force)
     with (
@@ -95,7 +94,7 @@ def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json
 
 
 def _shot(options: ClipOptions, duration_s: float, file: Path) -> Shot:
-    from ..film.film import Shot
+    from ..feed.film import Shot
 
     end_s = duration_s if options.end is None else options.end
     if end_s > duration_s:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, say
-from undulog.capture.common.interruption import interruptible
+from undulog.capture.common.process import interruptible
 
 from ..viewer import viewer
 
@@ -67,8 +67,8 @@ def view_beside(
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
     from ..overlay.alignment import Align
+    from ..overlay.combine import bring_together, steps
     from ..overlay.side import names_of
-    from ..overlay.together import bring_together, steps
     from ..overlay.write import Place
 
     names = names_of(files, None if options.names is None else options.names.split(","))
@@ -105,7 +105,7 @@ def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool
     if json:
         emit_json(_facts(beside, how, place, size))
         return
-    from ..overlay import words
+    from ..overlay import layout as words
 
     first, *others = [one.side for one in beside.shown]
     for other in others:
@@ -129,7 +129,7 @@ def _facts(beside: Beside, how: Align, place: Place, size: int) -> dict[str, Any
 
 
 def _session(beside: Beside, place: int) -> dict[str, Any]:
-    from ..overlay import words
+    from ..overlay import layout as words
 
     one, first = beside.shown[place], beside.shown[0].side
     side = one.side

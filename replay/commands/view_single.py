@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..content.content import Tab
+from ..samples.content import Tab
 
 if TYPE_CHECKING:
     from undulog.capture import SessionView

@@ -17,22 +17,18 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.capture.robot.model import Robot
 
-from ..content import entities
-from ..content.content import Content, Signal, Start, signal_title
-from ..content.layer import Layer, Named
+from ..samples import content as entities
+from ..samples.content import Content, Layer, Named, Signal, Start, signal_title
 from ..samples.quantities import SIGNALS, topic_entity
-from ..samples.stretches import Span, Stretch
 from ..samples.survey import GAIT, Survey, survey
-from ..samples.timeline import Clock
+from ..samples.timeline import Clock, Span, Stretch
 from ..samples.tracks import Track, drawn_topics, read_columns
 from . import facts
 from .cycles.heat_maps import heat_maps, log_maps
 from .cycles.mean_cycle import Look, averaged_ns, log_mean_cycle, read_channels
-from .cycles.response import charts, log_charts, log_current
-from .cycles.steps import cycle_tables, log_cycles
+from .cycles.steps import charts, cycle_tables, log_charts, log_current, log_cycles
 from .plots import gait, joints
-from .plots.other_topics import log_others, log_words
-from .plots.write import Plots
+from .plots.write import Plots, log_others, log_words
 from .scene.body import body_title
 from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
 from .scene.stage import Scene

@@ -12,8 +12,7 @@ from undulog.analysis.results.formats import utc
 from undulog.capture import SessionView
 from undulog.capture.common.console import plain
 
-from ..content.content import Content
-from ..content.layer import Named
+from ..samples.content import Content, Named
 from ..samples.timeline import ENSEMBLE_CYCLE
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from undulog.analysis.estimators.cycle_sums import weigh
 from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
 from undulog.analysis.estimators.series import Series, clean
 from undulog.analysis.session.cycles import LEAST_COVERED
-from undulog.analysis.session.demodulation_session import LoggedGait
-from undulog.analysis.signals.reading import planes_of
+from undulog.analysis.session.over_time import LoggedGait
+from undulog.analysis.signals.columns import planes_of
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
@@ -25,7 +25,7 @@ from ..samples.quantities import products
 from ..samples.survey import GAIT
 from ..samples.tracks import Track
 from .decode import Batch
-from .window import PATIENCE_NS
+from .inbox import PATIENCE_NS
 
 KEPT_S = 60.0
 """A cycle and its surroundings that last longer than this are not computed [s]."""

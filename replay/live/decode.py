@@ -15,19 +15,12 @@ from numpy.typing import NDArray
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, RobotFileError
-from undulog.capture.log.columns.layouts import (
-    LayoutSorter,
-    Matrix,
-    names_of,
-    stamps_of,
-    values_of,
-)
+from undulog.capture.log.columns.layouts import LayoutSorter, Matrix, names_of, stamps_of, values_of
 from undulog.capture.log.messages.cdr import Layout, layout_of
-from undulog.capture.log.messages.rosmsg import MessageType, parse_message_type
-from undulog.capture.log.read.joint_reader import OFFSET_TOPICS
-from undulog.capture.log.read.joint_rows import JointRows, merge_rows
-from undulog.capture.log.read.own_times import clock_shift_ns, moved
-from undulog.capture.log.sinks.sink import Description
+from undulog.capture.log.messages.definitions import MessageType, parse_message_type
+from undulog.capture.log.read.joint_states import OFFSET_TOPICS, JointRows, merge_rows
+from undulog.capture.log.read.sample_times import clock_shift_ns, moved
+from undulog.capture.log.sinks.mcap_sink import Description
 from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
@@ -273,7 +266,7 @@ class LiveLog:
             kept[name] = joined[0][-_OFFSETS_KEPT:], joined[1][-_OFFSETS_KEPT:]
 
     def _on_log_clock(self, stamp_ns: IntArray | None, log_ns: IntArray) -> IntArray:
-        """Stamps on the log's clock; see :mod:`.capture.log.read.own_times`."""
+        """Stamps on the log's clock; see :mod:`.capture.log.read.sample_times`."""
         if stamp_ns is None or not stamp_ns.any():
             return log_ns
         if self._shift_ns is None:

@@ -22,15 +22,59 @@ import rerun as rr
 
 from undulog.capture.common.errors import DataError, LogWriteError
 from undulog.capture.common.files import part_file
-from undulog.capture.common.interruption import StopRequest, interruptible
+from undulog.capture.common.process import StopRequest, interruptible
 from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
-from ..record.rrd import APPLICATION, recording_id, require_whole
+from ..feed.recording import APPLICATION, recording_id, require_whole
+from ..viewer import viewer
 from ..viewer.viewer import Viewer
 from .decode import LiveLog
 from .inbox import Datagram, Inbox
 from .plot import LiveStream
 from .scene import LiveScene
+
+_WINDOW = "--memory-limit=1GB"
+_SERVER = "--server-memory-limit=256MB"
+
+
+def open_window() -> Viewer:
+    """Open the native viewer, empty.
+
+    Returns:
+        The viewer.
+
+    Raises:
+        UndulogError: If it doesn't start.
+    """
+    return _ready(viewer.open_window(_WINDOW))
+
+
+def open_server(tell: Callable[[str], None]) -> Viewer:
+    """Serve the viewer to browsers on this machine.
+
+    Args:
+        tell: Called with the address to open, once it is served.
+
+    Returns:
+        The server.
+
+    Raises:
+        UndulogError: If it doesn't start.
+    """
+    server, page = viewer.open_server(_SERVER)
+    _ready(server)
+    tell(page)
+    return server
+
+
+def _ready(started: Viewer) -> Viewer:
+    try:
+        started.wait_until_it_listens()
+    except BaseException:
+        started.close()
+        raise
+    return started
+
 
 BATCH_S = 0.03
 """How often what has come is drawn [s]."""

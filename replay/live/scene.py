@@ -16,27 +16,28 @@ import rerun as rr
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 
-from ..content import entities
-from ..content.content import Content, Signal, Start, signal_title
 from ..draw.drawing import palette_of, start_of
 from ..draw.facts import code, escaped, log_facts
 from ..draw.plots import gait, joints
 from ..draw.plots import joints as power
-from ..draw.scene import body, markers, ranges
-from ..draw.scene import surroundings as trail
+from ..draw.scene import body
+from ..draw.scene import body as markers
+from ..draw.scene import stage as ranges
+from ..draw.scene import stage as trail
 from ..draw.scene.body import body_title
 from ..draw.scene.motion import BODY_RATE_HZ, SPARSE_RATE_HZ, HeadPath, Motion, assemble, still_head
-from ..layout.blueprint import build_blueprint
+from ..layout import build_blueprint
+from ..samples import content as entities
 from ..samples import quantities
+from ..samples.content import Content, Signal, Start, signal_title
 from ..samples.quantities import DRAWN, SIGNALS, power_limit, topic_entity
 from ..samples.sampling import hold
 from ..samples.timeline import Clock
 from ..samples.tracks import Track
-from .bars import CycleBars
 from .cycles import CycleMeter
 from .decode import Batch, LiveLog
-from .plot import LivePlot
-from .window import Fresh, Window
+from .inbox import Fresh, Window
+from .plot import CycleBars, LivePlot
 
 _LAYOUT_EVERY_S = 1.0
 _FACTS_EVERY_S = 2.0

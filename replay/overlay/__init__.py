@@ -3,7 +3,7 @@
 ::
 
     from pathlib import Path
-    from .together import bring_together
+    from .combine import bring_together
 
     both = bring_together([Path("robot.mcap"), Path("twin.mcap")], Path("both.rrd"))
     print(both.found["twin"].comparison, both.placements["twin"])

@@ -4,10 +4,19 @@
 ``gait_cycle`` is moved by whole cycles only, so that equal places are equal phases; every session
 is in its first cycle between 0 and 1 there. The other way round, a sample of one session finds its
 counterpart in another one at the same time, or at the same phase.
+
+Bodies of several sessions in one world.
+
+Where a robot's world has its origin is the choice of whoever tracked it, so by default the other
+bodies are laid on the first one: turned about the vertical and moved on the ground, so that at the
+first moment that both sessions share the heads are at one point and the bodies point one way. A
+body's direction is the mean of its links' over one cycle of its gait, in which what swings to the
+left swings to the right too; without a gait it is that of the moment.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -16,9 +25,11 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 
 from ..samples.sampling import gaps, interpolate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm
+from ..samples.tracks import resampled
 from .side import Side
 
 
@@ -162,3 +173,156 @@ def _ruler(side: Side, how: Align) -> Ruler:
 
 def _runs_back(rhythm: Rhythm) -> bool:
     return bool(rhythm.cycles[-1] < rhythm.cycles[0])
+
+
+_LOOK_AT = 1000
+"""Samples of the head among which a first moment is looked for."""
+
+_ROTATION = 0.99
+"""A quaternion shorter than this is none."""
+
+_INSTANTS = 48
+"""Of a cycle, at which a body's direction is taken."""
+
+_SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A turn about the vertical through the origin, then a step on the ground.
+
+    Attributes:
+        turn: Angle [rad].
+        x: Step [m].
+        y: Step [m].
+    """
+
+    turn: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Move points.
+
+        Args:
+            points: [m], shape (..., 3).
+
+        Returns:
+            [m], shape (..., 3).
+        """
+        cos, sin = math.cos(self.turn), math.sin(self.turn)
+        x, y, z = np.moveaxis(points, -1, 0)
+        return np.stack([cos * x - sin * y + self.x, sin * x + cos * y + self.y, z], axis=-1)
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The turn as x, y, z, w."""
+        return (0.0, 0.0, math.sin(self.turn / 2), math.cos(self.turn / 2))
+
+
+def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
+    """How one body is laid on another.
+
+    Args:
+        a: The session whose world stays.
+        b: The one that is moved.
+        how: What happens at once.
+
+    Returns:
+        The placement, or None where either has no body at any shared moment.
+    """
+    one, other = a.side.head, b.side.head
+    if one is None or other is None:
+        return None
+    at_ns, known = counterparts(a, b, how, one.t_ns)
+    known &= np.isfinite(one.position).all(axis=1)
+    rows = np.flatnonzero(known & (at_ns >= other.t_ns[0]) & (at_ns <= other.t_ns[-1]))[:_LOOK_AT]
+    there = interpolate(other.t_ns, other.position, at_ns[rows])
+    found = np.flatnonzero(np.isfinite(there).all(axis=1))
+    if not found.size:
+        return None
+    first = rows[found[0]]
+    heading, own = _heading(a, int(one.t_ns[first])), _heading(b, int(at_ns[first]))
+    if heading is None or own is None:
+        return None
+    turn = math.remainder(heading - own, 2 * math.pi)
+    step = one.position[first] - Placement(turn)(there[found[0]])
+    return Placement(turn, float(step[0]), float(step[1]))
+
+
+def told_placed(placed: Placement, name: str, first: str) -> str:
+    """A placement in words.
+
+    Args:
+        placed: The placement.
+        name: The session that is moved.
+        first: The one it is laid on.
+
+    Returns:
+        One sentence without its full stop.
+    """
+    step = math.hypot(placed.x, placed.y)
+    if step < _SAME_M and abs(placed.turn) < _SAME_RAD:
+        return f"{name} starts where {first} does"
+    return (
+        f"{name} is drawn where {first} starts: turned by {math.degrees(placed.turn):.1f}° about "
+        f"its origin and moved by ({placed.x:.3f}, {placed.y:.3f}) m"
+    )
+
+
+def head_distance(
+    a: Aligned, b: Aligned, how: Align, placed: Placement, t_ns: IntArray
+) -> FloatArray:
+    """How far the heads are from each other as they are drawn.
+
+    Args:
+        a: One session, with a head.
+        b: The other, with a head.
+        how: What happens at once.
+        placed: How ``b`` is moved.
+        t_ns: Times in ``a`` [Unix ns], shape (n,).
+
+    Returns:
+        Distance on the ground [m], shape (n,); NaN where either isn't known.
+    """
+    one, other = a.side.head, b.side.head
+    assert one is not None  # noqa: S101 - the caller drew both
+    assert other is not None  # noqa: S101
+    at_ns, known = counterparts(a, b, how, t_ns)
+    there = np.full((t_ns.size, 3), np.nan)
+    there[known] = placed(interpolate(other.t_ns, other.position, at_ns[known]))
+    apart = there - interpolate(one.t_ns, one.position, t_ns)
+    return np.asarray(np.hypot(apart[:, 0], apart[:, 1]), dtype=np.float64)
+
+
+def _heading(one: Aligned, t_ns: int) -> float | None:
+    """Which way a body points in the cycle after a time [rad]; None where it isn't known."""
+    times, rhythm = np.array([t_ns], dtype=np.int64), one.clock.rhythm
+    if rhythm is not None:
+        cycle = interpolate(rhythm.t_ns, rhythm.cycles, times)
+        ends, known = times_of(rhythm, cycle + 1.0)
+        if known[0]:
+            times = t_ns + np.arange(_INSTANTS) * (int(ends[0]) - t_ns) // _INSTANTS
+    forward = _directions(one.side, times)
+    forward = forward[np.isfinite(forward).all(axis=1)]
+    if not forward.size:
+        return None
+    x, y = forward.sum(axis=0)
+    return math.atan2(y, x)
+
+
+def _directions(side: Side, t_ns: IntArray) -> FloatArray:
+    """Sum of the links' forward axes on the ground, shape (n, 2); NaN where a pose isn't known."""
+    robot, head = side.robot, side.head
+    assert robot is not None  # noqa: S101 - the caller saw a head
+    assert head is not None  # noqa: S101
+    position = interpolate(head.t_ns, head.position, t_ns)
+    quaternion = interpolate(head.t_ns, head.quaternion, t_ns)
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    # Between q and -q, which are the same pose, the straight line leaves the rotations.
+    quaternion = np.where(norm > _ROTATION, quaternion / norm, np.nan)
+    names, known = robot.joint_names, {track.name for track in side.measured}
+    angles = resampled(side.measured, names, t_ns, interpolate)
+    angles[:, [name not in known for name in names]] = 0.0  # as good a guess as any
+    _, rotation = link_poses(robot, position, rotation_from_quaternion(quaternion), angles)
+    return rotation[..., :2, 0].sum(axis=1)

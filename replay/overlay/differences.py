@@ -26,12 +26,12 @@ from undulog.analysis.results.comparison import BODY, Comparison
 from undulog.analysis.results.estimate import Estimate
 from undulog.capture.common.arrays import FloatArray, IntArray
 
-from ..content.entities import GREY, TOTAL, Places
 from ..draw.plots.joints import log_look, log_rows
+from ..samples.content import GREY, TOTAL, Places
 from ..samples.sampling import mark_gaps, typical_step_ns
 from .alignment import Aligned
-from .dress import tint
 from .side import COMPARED, Side
+from .style import tint
 
 LINES = f"{COMPARED}/places"
 POWER = f"{TOTAL}/mechanical"

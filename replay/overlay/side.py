@@ -8,18 +8,18 @@ from pathlib import Path
 
 import rerun as rr
 
-from undulog.analysis.compare.changes import facts_of
+from undulog.analysis.compare.alignment import facts_of
 from undulog.analysis.compare.side import Seen, see
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionView
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.robot.model import Robot
 
-from ..content.entities import Color
 from ..draw.drawing import palette_of
 from ..draw.plots.gait import rhythm_of
 from ..draw.scene.motion import HeadPath, read_head
-from ..record.rrd import Recording, write_recording
+from ..feed.recording import Recording, write_recording
+from ..samples.content import Color
 from ..samples.timeline import Rhythm
 from ..samples.tracks import Track, read_columns, wanted_fields
 

@@ -9,7 +9,7 @@ import rerun as rr
 
 from undulog.capture.common.arrays import FloatArray
 
-from ..content.entities import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
+from .content import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
 from .sampling import hold, interpolate
 from .tracks import Columns, Track
 

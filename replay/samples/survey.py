@@ -19,19 +19,11 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.robot.model import Robot
 
-from ..content.entities import MEASURED, MECHANICAL
+from .content import MEASURED, MECHANICAL
 from .quantities import power_limit, quantities, segment_power
 from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
-from .stretches import STRETCH_NS, stretches
-from .tracks import (
-    OFFSETS,
-    Columns,
-    Track,
-    in_turn,
-    read_columns,
-    resampled,
-    wanted_fields,
-)
+from .timeline import STRETCH_NS, stretches
+from .tracks import OFFSETS, Columns, Track, in_turn, read_columns, resampled, wanted_fields
 
 GAIT = "/gait"
 

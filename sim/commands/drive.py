@@ -10,10 +10,10 @@ from cyclopts import Parameter
 
 from undulog.capture.common.console import emit_json, progress, refuse_existing, say
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.interruption import interruptible
+from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..drive.driven import Driven
+    from ..drive.motion import Driven
     from ..scenario.scenario import Scenario
     from ..twin.recording import Recording
 
@@ -58,7 +58,7 @@ def drive(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
-    from ..drive.driven import find_driven
+    from ..drive.motion import find_driven
     from ..scenario.scenario_file import load_scenario
 
     if output is not None:

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
     from ..scenario.bus_faults import BusFault
     from ..scenario.scenario import Scenario
-    from ..serve.bus import VirtualBus
     from ..serve.robot import Served
-    from ..serve.socketcand_server import SocketcandServer
+    from ..serve.socketcand_server import SocketcandServer, VirtualBus
 
 
 _DEFAULT_HOST = "127.0.0.1"
@@ -120,14 +119,13 @@ class _Plan:
 
 
 def _run(plan: _Plan, report: _Report) -> int:
-    from undulog.capture.common.interruption import interruptible
+    from undulog.capture.common.process import interruptible
     from undulog.capture.sources.events import EventLog
     from undulog.capture.sources.sender import FrameSender
 
-    from ..serve.bus import VirtualBus
     from ..serve.pacing import Pacer
     from ..serve.robot import PERIOD_NS, VirtualRobot
-    from ..serve.socketcand_server import SocketcandServer
+    from ..serve.socketcand_server import SocketcandServer, VirtualBus
 
     events = EventLog(time.monotonic_ns)
     sender = None if plan.unix is None else FrameSender(plan.unix)

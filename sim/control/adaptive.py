@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from undulog.capture.robot.model import Plane, Robot
 
-from ..gait.contract import WALK, GaitTick, Generator, Modulation, Readings
-from ..scenario.controllers import Controller
-from ..scenario.sensor_layout import layout
-from .course import Course
-from .lookout import Distances, Lookout
-from .moment import Moment
-from .phase_history import BodyWave
+from ..gait.contract import WALK, Gait, GaitTick, Generator, Modulation, Readings
+from ..scenario.controllers import Controller, RandomTurns, TargetHeading
+from ..scenario.gaits import generator
+from ..scenario.sensors import layout
+from .dead_reckoning import Reckoning, turned
+from .filters import BodyWave
+from .heading import Course, RandomCourse, StraightOn, TargetCourse
+from .obstacle_monitor import Distances, Lookout, Moment
 from .reactions import Haste, Shrinking, Steering
-from .reckoning import Reckoning
+
+if TYPE_CHECKING:
+    from ..scenario.scenario import Scenario
+
 
 AVOID, HASTEN, SHRINK, TURN = "avoid", "hasten", "shrink", "turn"
 _MODE_HOLD_S = 0.5
@@ -123,3 +129,34 @@ class AdaptiveGait:
         if wanted != self._mode and time_s - self._mode_since_s >= _MODE_HOLD_S:
             self._mode, self._mode_since_s = wanted, time_s
         return self._mode
+
+
+def build_gait(scenario: Scenario) -> Gait:
+    """The gait that a scenario asks for, on the twin or on a bus.
+
+    Args:
+        scenario: Gait, controller and robot; of its world and its sensors only what the robot is
+            told beforehand: where the target lies from its start, and which way north is there.
+
+    Returns:
+        The gait, at time zero.
+    """
+    robot, controller = scenario.robot, scenario.controller
+    if controller is None:
+        return generator(scenario.gait, robot)
+    # A controller bends and shrinks joint by joint, and the log is to hold what each was given.
+    wave = generator(scenario.gait, robot, per_joint=True)
+    return AdaptiveGait(wave, controller, _course(scenario), robot)
+
+
+def _course(scenario: Scenario) -> Course:
+    controller, target = scenario.controller, scenario.world.target
+    course = controller.course if controller is not None else None
+    if isinstance(course, RandomTurns):
+        return RandomCourse(course, scenario.seed)
+    if controller is not None and isinstance(course, TargetHeading) and target is not None:
+        north = scenario.sensing.compass.north
+        x, y = turned(np.array(target.position), -north).tolist()
+        radius_m = controller.calibration.turn_radius_m
+        return TargetCourse(course, (x, y), target.radius, radius_m, scenario.robot)
+    return StraightOn()

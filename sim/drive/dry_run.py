@@ -19,25 +19,22 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.write.writer import SessionWriter
-from undulog.capture.robot.model import Robot
-from undulog.capture.robot.safety import Safety
+from undulog.capture.robot.model import Robot, Safety
 
+from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.gate import POSE_S, Gate
-from ..gate.limits import GateLimits, gate_limits, missing_limits
-from ..gate.outcome import GateFault, How
-from ..gate.ramp import Ramp
-from ..gate.tick import Remark
-from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from ..gate.limits import GateLimits, Ramp, gate_limits, missing_limits
+from ..gate.outcome import GateFault, How, Remark
+from ..scenario.scenario import LONGEST_S, Scenario
 from ..scenario.scenario_file import parse_scenario
 from ..twin.recording import Driver, open_session
 from ..twin.session_log import SessionLog
 from ..twin.stability import warnings
 from ..twin.twin import Sample, Twin
-from .driven import Driven
-from .dry_run_gait import GatedGait
-from .dry_run_tally import Demand, JointDemand
+from .dry_run_gait import Demand, GatedGait, JointDemand
+from .motion import Driven
 
 _NOMINAL = """
 description = "Flat ground, and servos as the description of the robot has them."

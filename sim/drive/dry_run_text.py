@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from undulog.capture.common.text_table import Column, table
+from undulog.capture.common.console import Column, table
 
 from ..gate.limits import safety_example
 from .dry_run import DryRun, Verdict
-from .dry_run_tally import JointDemand
+from .dry_run_gait import JointDemand
 
 if TYPE_CHECKING:
-    from .dry_run_tally import Demand
+    from .dry_run_gait import Demand
 
 
 _NOTHING = "-"

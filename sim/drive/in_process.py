@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import Gait, GaitTick, Readings
-from ..gait.rhythm import smoothstep
+from ..gait.wave import smoothstep
 from ..scenario.scenario import Scenario
 from ..twin.recording import Driver, Recording, record
 from ..twin.twin import Sample
-from .driven import Driven
+from .motion import Driven
 
 FADE_S = 1.0
 """A gait that is to stop comes to rest within this time [s]."""
@@ -107,7 +107,7 @@ def drive_twin(
 
     Args:
         driven: What to drive.
-        scenario: Where; from :meth:`.sim.drive.driven.Driven.scenario`.
+        scenario: Where; from :meth:`.sim.drive.motion.Driven.scenario`.
         path: The file to create.
         force: Replace an existing file.
         stop: Looked at between samples.

@@ -2,31 +2,163 @@
 
 from __future__ import annotations
 
+import os
+import select
 import signal
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from undulog.capture.bus.encoding import BusEncoder, BusValue, poll_frames
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SourceError, UndulogError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.robot.model import Direction, Quantity, Robot
 
-from ..gate.clamp import Spacing
+from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.confirmation import Confirmation
+from ..gate.feedback import Presence
 from ..gate.gate import Gate
-from ..gate.outcome import FaultKind, GateFault
-from ..gate.presence import Presence
-from ..gate.tick import GateStep, Heard, Phase
-from ..scenario.scenario import CONTROL_RATE_HZ
-from .console_watch import ConsoleWatch
-from .link import Link
-from .pace import Pace
-from .readings_from_bus import BusReadings
+from ..gate.limits import Spacing
+from ..gate.outcome import FaultKind, GateFault, GateStep, Heard, Phase
+from .links import BusReadings, Link, VirtualRobotLink
+
+_STREAMS = (0, 1, 2)
+
+
+class ConsoleWatch:
+    """Notices that a terminal hung up; one that never was is not missed."""
+
+    def __init__(self) -> None:
+        """Look which of the standard streams are terminals."""
+        self._terminals = [stream for stream in _STREAMS if os.isatty(stream)]
+        self._poll = select.poll()
+        for stream in self._terminals:
+            self._poll.register(stream, 0)  # a hang-up is told in any case
+
+    def gone(self) -> bool:
+        """Whether the terminal is gone; once it is, nothing is written to it any more."""
+        if not self._terminals:
+            return False
+        if not self._poll.poll(0):
+            return False
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in self._terminals:
+            self._poll.unregister(stream)
+            os.dup2(nowhere, stream)
+        os.close(nowhere)
+        self._terminals = []
+        return True
+
+
+LOST_S = 5.0
+"""A robot in lockstep that doesn't come to its next tick within this time is lost [s]."""
+
+
+class Pace(Protocol):
+    """Gives one tick after the other."""
+
+    by_the_clock: bool
+    """Whether the clock sets the pace, rather than the robot."""
+    overruns: int
+    """Ticks that were left out because the one before took too long."""
+    late_s: float
+    """How late the newest tick is, against the first one that had not been taken [s]."""
+
+    def next(self) -> tuple[int, Sequence[FrameArray]]:
+        """Wait for the next tick.
+
+        Returns:
+            Its number, from 0, and the frames that have come by it.
+
+        Raises:
+            SourceError: If the bus is lost.
+        """
+        ...
+
+
+class WallPace:
+    """Ticks of the computer's monotonic clock, anchored at the first one."""
+
+    by_the_clock = True
+
+    def __init__(self, link: Link, rate_hz: int) -> None:
+        """The first tick is at once.
+
+        Args:
+            link: The bus.
+            rate_hz: Ticks a second.
+        """
+        self.overruns = 0
+        self.late_s = 0.0
+        self._link, self._period_ns = link, 1_000_000_000 // rate_hz
+        self._tick = -1
+        self._start_ns = 0
+
+    def next(self) -> tuple[int, Sequence[FrameArray]]:
+        """Wait for the next tick; those that are over by then are left out.
+
+        Returns:
+            Its number, and the frames that have come by it.
+
+        Raises:
+            SourceError: If the bus is lost.
+        """
+        now_ns = time.monotonic_ns()
+        if self._tick < 0:
+            self._tick, self._start_ns = 0, now_ns
+            return 0, self._link.receive()
+        due_ns = self._start_ns + (self._tick + 1) * self._period_ns
+        while now_ns < due_ns:
+            time.sleep((due_ns - now_ns) * 1e-9)
+            now_ns = time.monotonic_ns()
+        # Also where the process was stopped while it slept: what is over is left out.
+        left_out = (now_ns - due_ns) // self._period_ns
+        self.overruns += left_out
+        self._tick += 1 + left_out
+        self.late_s = (now_ns - due_ns) * 1e-9
+        return self._tick, self._link.receive()
+
+
+class LockstepPace:
+    """The ticks of a robot that waits for the commands of each."""
+
+    by_the_clock = False
+
+    def __init__(self, link: VirtualRobotLink) -> None:
+        """The first tick that the robot tells is tick 0.
+
+        Args:
+            link: The robot's bus.
+        """
+        self.overruns = 0
+        self.late_s = 0.0
+        self._link = link
+        self._first: int | None = None
+
+    def next(self) -> tuple[int, Sequence[FrameArray]]:
+        """Wait for the robot's next tick.
+
+        Returns:
+            Its number, and the frames that came by it.
+
+        Raises:
+            SourceError: If the robot is gone, or does not come to it.
+        """
+        found = self._link.wait_tick(LOST_S)
+        if found is None:
+            raise SourceError(
+                self._link.place, f"the robot is lost: no control tick for {LOST_S:g} s"
+            )
+        tick, frames = found
+        if self._first is None:
+            self._first = tick
+        return tick - self._first, frames
+
 
 _WORDS = {
     signal.SIGINT: "asked to stop (Ctrl-C)",

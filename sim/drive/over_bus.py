@@ -9,30 +9,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from undulog.capture.common.errors import LogWriteError, UsageError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
-from undulog.capture.recorder.ticks import SessionClock
+from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import Bus, Direction, Quantity, Robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceAddress, SourceCounts
 from undulog.capture.sources.events import Tally
 
-from ..gate.clamp import Spacing
+from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.confirmation import Confirmation
 from ..gate.gate import Gate
-from ..gate.limits import GateLimits, gate_limits
+from ..gate.limits import GateLimits, Spacing, gate_limits
 from ..gate.outcome import FaultKind, GateFault, How, Outcome, jitter
-from ..scenario.scenario import CONTROL_RATE_HZ, LONGEST_S, Scenario
+from ..scenario.scenario import LONGEST_S, Scenario
 from ..twin.recording import quick_collections
-from .bus_report import UNASKED, BusReport, Feedback, remarks_of
-from .bus_session import BusSession, stamped
-from .console_watch import ConsoleWatch
-from .driven import Driven
-from .gait_teller import GaitTeller
-from .link import Link, VirtualRobotLink
-from .loop import BusTick, ControlLoop, LoopTally
-from .pace import LockstepPace, WallPace
+from .links import Link, VirtualRobotLink
+from .loop import BusTick, ConsoleWatch, ControlLoop, LockstepPace, LoopTally, WallPace
+from .motion import Driven
 from .python_can_bus import open_link
+from .report import UNASKED, BusReport, Feedback, remarks_of
+from .session import BusSession, GaitTeller, stamped
 
 LISTEN_S = 0.5
 """A bus is listened to for so long before anything is sent [s]: whose it is, and how often joints

@@ -59,10 +59,16 @@ from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, lis
 from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import WALK, GaitTick, Readings
-from ..gait.rhythm import Change, IntegratedPhase, Swing, started
-from ..gait.serpentine import Serpentine
-from ..gait.wave import PlaneGait, WaveGenerator
-from ..scenario.gaits_toml import read_gait
+from ..gait.wave import (
+    Change,
+    IntegratedPhase,
+    PlaneGait,
+    Serpentine,
+    Swing,
+    WaveGenerator,
+    started,
+)
+from ..scenario.gaits import read_gait
 from ..scenario.scenario import LONGEST_S, Length, Scenario
 from ..scenario.scenario_file import load_scenario, scenario_names
 

@@ -15,13 +15,20 @@ from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import flag, only
-from undulog.capture.sources.can_source import DEVICE_TIME, check_interface, known_options
+from undulog.capture.sources.can import (
+    DEVICE_TIME,
+    PythonCanLink,
+    bus_class,
+    check_interface,
+    failure,
+    known_options,
+    open_bus,
+)
 from undulog.capture.sources.contract import SourceAddress
 from undulog.capture.sources.events import Tally
-from undulog.capture.sources.python_can import PythonCanLink, bus_class, failure, open_bus
 from undulog.capture.sources.socketcand import server_of
 
-from .link import VirtualRobotLink, find_virtual_robot, wait_until
+from .links import VirtualRobotLink, find_virtual_robot, wait_until
 
 _SEND_S = 0.02
 """So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one

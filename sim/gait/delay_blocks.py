@@ -28,8 +28,7 @@ from undulog.capture.common.strict_table import at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
 from .contract import Readings
-from .rhythm import Change, IntegratedPhase, Swing, started
-from .wave import Frequency, Wave, WaveGenerator
+from .wave import Change, Frequency, IntegratedPhase, Swing, Wave, WaveGenerator, started
 
 
 @dataclass(frozen=True)

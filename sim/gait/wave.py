@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated, TypeAlias
+from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,136 @@ from undulog.capture.common.strict_table import above, at_most
 from undulog.capture.robot.model import Plane, Robot
 
 from .contract import CONTROL_RATE_HZ, WALK, GaitTick, Modulation, Readings
-from .rhythm import Change, Rhythm, within_limits
+
+
+def smoothstep(x: float) -> float:
+    """Rise from 0 to 1 with no slope at either end, 3 x^2 - 2 x^3.
+
+    Args:
+        x: Where; clipped to 0 to 1.
+
+    Returns:
+        The value.
+    """
+    x = min(max(x, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def started(time_s: float, ramp_s: float) -> float:
+    """Share of amplitude and offset that has come by a time: nothing before the start, then all.
+
+    Args:
+        time_s: Time since the start [s]; negative before it.
+        ramp_s: How long the rise takes [s]; 0: no time at all.
+
+    Returns:
+        0 to 1, smooth where ``ramp_s`` is positive.
+    """
+    if ramp_s > 0.0:
+        return smoothstep(time_s / ramp_s)
+    return 1.0 if time_s >= 0.0 else 0.0
+
+
+def within_limits(
+    amplitude: FloatArray, offset: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Cut offset, then amplitude, so that offset +- amplitude stays within the limits.
+
+    Each joint is cut by its own limits. The wave keeps its shape: a cut sine would have flat tops,
+    and harmonics that no one commanded.
+
+    Args:
+        amplitude: Wanted; a negative one is half a turn of phase [rad], shape (n,).
+        offset: Wanted [rad], shape (n,).
+        lower: Lower limits [rad], shape (n,).
+        upper: Upper limits [rad], shape (n,).
+
+    Returns:
+        Amplitude and offset [rad], each of shape (n,).
+    """
+    offset = np.minimum(np.maximum(offset, lower), upper)
+    room = np.minimum(upper - offset, offset - lower)
+    return np.minimum(np.maximum(amplitude, -room), room), offset
+
+
+class Change(NamedTuple):
+    """The part of a :class:`~.sim.gait.contract.Modulation` that concerns one plane.
+
+    Attributes:
+        amplitude_factor: Multiplies each joint's amplitude, shape (n,).
+        offset: Added to each joint's offset [rad], shape (n,).
+        frequency_factor: Multiplies omega.
+    """
+
+    amplitude_factor: FloatArray
+    offset: FloatArray
+    frequency_factor: float
+
+
+class Swing(NamedTuple):
+    """What the n joints of a plane are to do from one tick on: A sin(phase) + Y.
+
+    Attributes:
+        amplitude: A, as wanted: not yet cut to the limits [rad], shape (n,).
+        offset: Y, likewise [rad], shape (n,).
+        phase: [rad], shape (n,).
+        omega: Rate of the plane's phase [rad/s].
+        lag: Signed phase from one joint to the next that the gait asks for [rad].
+    """
+
+    amplitude: FloatArray
+    offset: FloatArray
+    phase: FloatArray
+    omega: float
+    lag: float
+
+
+class Rhythm(Protocol):
+    """One plane's generator of phases, amplitudes and offsets."""
+
+    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:
+        """Advance to a time and say what to do from then on.
+
+        Args:
+            time_s: Time since the start [s], never less than in the call before.
+            change: In force from this time on.
+            readings: What the robot has told by then.
+
+        Returns:
+            What the joints are to do.
+        """
+        ...
+
+
+class IntegratedPhase:
+    """Phi' = omega, with an omega that changes only at ticks: the integral is exact.
+
+    Attributes:
+        value: Phi at the time that was advanced to last [rad].
+    """
+
+    def __init__(self, phase: float, omega: float) -> None:
+        """Start at time zero.
+
+        Args:
+            phase: Phi at the start [rad].
+            omega: Rate until the first tick says otherwise [rad/s].
+        """
+        self.value, self._omega, self._time_s = phase, omega, 0.0
+
+    def advance(self, time_s: float, omega: float) -> float:
+        """Go on to a time at the rate in force, and take another one from then on.
+
+        Args:
+            time_s: Time since the start [s], never less than in the call before.
+            omega: Rate from this time on [rad/s].
+
+        Returns:
+            Phi at this time [rad].
+        """
+        self.value += self._omega * (time_s - self._time_s)
+        self._omega, self._time_s = omega, time_s
+        return self.value
 
 
 class Wave(StrEnum):
@@ -179,3 +308,55 @@ class WaveGenerator:
             if self._per_joint:
                 values += [amplitude, offset, swing.phase]
         return GaitTick(command, np.concatenate(values), WALK, tuple(clamped))
+
+
+@dataclass(frozen=True)
+class Serpentine:
+    """Parameters of the serpentine gait.
+
+    Attributes:
+        planes: The planes that are driven; the joints of the others are held straight.
+        ramp_s: Amplitude and offset grow from nothing over this time, smoothly.
+    """
+
+    planes: dict[Plane, PlaneGait] = field(default_factory=dict[Plane, PlaneGait])
+    ramp_s: NonNegative = 2.0
+
+
+class SerpentineGait(WaveGenerator):
+    """The serpentine generator: every joint computes its own sine."""
+
+    def __init__(self, parameters: Serpentine, robot: Robot, *, per_joint: bool = False) -> None:
+        """Start at time zero with straight joints.
+
+        Args:
+            parameters: What to do.
+            robot: Who is to do it.
+            per_joint: Tell every joint's own values too, for a controller that sets them apart.
+        """
+        rhythms = {
+            plane: _SerpentineRhythm(wave, parameters.ramp_s, len(robot.joint_indices(plane)))
+            for plane, wave in parameters.planes.items()
+        }
+        super().__init__(rhythms, robot, per_joint=per_joint)
+
+
+class _SerpentineRhythm:
+    """Eq. 2, or Eq. 6: A sin(Phi(t) + (i - 1) phi) + Y, Phi(0) = phi_0."""
+
+    def __init__(self, wave: PlaneGait, ramp_s: float, joint_count: int) -> None:
+        self._wave, self._ramp_s = wave, ramp_s
+        self._omega = 2.0 * math.pi * wave.frequency_hz
+        self._phase = IntegratedPhase(wave.phase, self._omega)
+        self._lags = np.arange(joint_count, dtype=np.float64) * wave.signed_lag
+
+    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:  # noqa: ARG002
+        wave, ramp = self._wave, started(time_s, self._ramp_s)
+        omega = self._omega * change.frequency_factor
+        return Swing(
+            amplitude=ramp * wave.amplitude * change.amplitude_factor,
+            offset=ramp * wave.offset + change.offset,
+            phase=self._phase.advance(time_s, omega) + self._lags,
+            omega=omega,
+            lag=wave.signed_lag,
+        )

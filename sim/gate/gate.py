@@ -9,8 +9,8 @@
 
 It is asked once a control tick what to send. Until the pose of every joint is known it sends
 nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
-(:mod:`.sim.gate.clamp`). A fault or a request to stop leads to the ending that the robot's file
-names. While the bus is silent (:mod:`.sim.gate.watch`) nothing is sent, and the servos hold; the
+(:mod:`.sim.gate.limits`). A fault or a request to stop leads to the ending that the robot's file
+names. While the bus is silent (:mod:`.sim.gate.feedback`) nothing is sent, and the servos hold; the
 ending begins when a joint is received again. It opens nothing and waits for nothing.
 """
 
@@ -20,15 +20,23 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SourceError, UsageError
-from undulog.capture.robot.safety import OnFault
+from undulog.capture.robot.model import OnFault
 
 from ..gait.contract import Gait, GaitTick
-from .clamp import Clamp, Clamped
-from .limits import GateLimits
-from .outcome import MUTE, FaultKind, GateFault, How, Outcome
-from .ramp import Ending, Ramp, why_not_from
-from .tick import GateStep, Heard, JointStatus, Phase, Remark
-from .watch import Silence, Watch, Yielding
+from .feedback import Silence, Watch, Yielding
+from .limits import Clamp, Clamped, Ending, GateLimits, Ramp, why_not_from
+from .outcome import (
+    MUTE,
+    FaultKind,
+    GateFault,
+    GateStep,
+    Heard,
+    How,
+    JointStatus,
+    Outcome,
+    Phase,
+    Remark,
+)
 
 POSE_S = 2.0
 """So long the gate waits for the pose of every joint [s]."""

@@ -1,16 +1,31 @@
-"""The limits of a drive, joint by joint."""
+"""The limits of a drive, joint by joint.
+
+The last stage before the encoder: no command passes it that is beyond position or rate.
+
+How closely two commands may follow each other: rates hold in true time, not from tick to tick.
+
+The clamp bounds a step by what the greatest rate allows in one control period. Deadlines are
+anchored at the first tick, so behind a tick that came late the next one is due in less than a
+period: the servos would be told to go the same way in less time. The later command waits then until
+the rate allows its step. No step takes more than a period, so that no wait is longer.
+"""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
-from undulog.capture.common.arrays import FloatArray, frozen
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray, frozen
 from undulog.capture.common.errors import UsageError
-from undulog.capture.robot.model import Robot
-from undulog.capture.robot.safety import JOINT_LIMITS, OnFault, Safety
+from undulog.capture.robot.model import JOINT_LIMITS, OnFault, Robot, Safety
+
+from ..gait.wave import smoothstep
+from .outcome import JointStatus
 
 _EXAMPLES = {
     "max_rate": "4.0            # rad/s, of commands",
@@ -160,3 +175,254 @@ def gate_limits(robot: Robot) -> GateLimits:
         fault_after_s=safety.fault_after_s,
         on_fault=safety.on_fault,
     )
+
+
+_NS = 1e9
+
+
+class Spacing:
+    """When the frames of a command may be sent.
+
+    It knows when each frame of the command before was handed to the bus: a burst that was held up
+    half way, e.g. as the process was stopped, holds up what follows by as much as it needs.
+
+    Attributes:
+        waits: Commands that have to wait, so far.
+        longest_s: The longest of these waits [s].
+    """
+
+    def __init__(self, rate: FloatArray, now_ns: Callable[[], int]) -> None:
+        """Nothing was sent yet.
+
+        Args:
+            rate: Greatest rates [rad/s], shape (m,).
+            now_ns: The clock [ns].
+        """
+        self.waits, self.longest_s = 0, 0.0
+        self._rate, self._now_ns = rate, now_ns
+        self._last: FloatArray | None = None
+        self._sent_ns: IntArray = np.empty(0, dtype=np.int64)
+
+    def earliest_ns(self, command: FloatArray, count: int) -> IntArray:
+        """The earliest times at which a command's frames may be sent.
+
+        Args:
+            command: Joint angles [rad], shape (m,).
+            count: How many frames carry it; always in the same order.
+
+        Returns:
+            Each frame's, on the clock [ns], shape (count,); 0 where nothing was sent before.
+        """
+        if self._last is None:
+            return np.zeros(count, dtype=np.int64)
+        need_s = float(np.max(np.abs(command - self._last) / self._rate, initial=0.0))
+        before = self._sent_ns
+        if len(before) != count:  # not the same frames: none of them earlier than all of those
+            before = np.full(count, before.max(initial=0))
+        earliest = before + math.ceil(need_s * _NS)
+        wait_s = (int(earliest.max()) - self._now_ns()) / _NS
+        if wait_s > 0.0:
+            self.waits += 1
+            self.longest_s = max(self.longest_s, wait_s)
+        return earliest
+
+    def sent(self, command: FloatArray, sent_ns: IntArray) -> None:
+        """A command was sent.
+
+        Args:
+            command: Joint angles [rad], shape (m,).
+            sent_ns: When the bus had each of its frames, on the clock [ns], shape (n,).
+        """
+        self._last, self._sent_ns = command, sent_ns
+
+
+_ROUNDING = 1e-12  # rad; a command that is off a limit in its last bits was not cut
+
+
+class Clamped(NamedTuple):
+    """A command that may be sent.
+
+    Attributes:
+        command: Joint angles [rad], shape (m,); finite, whatever was wanted.
+        by_position: Joints that were cut to their position limits, shape (m,).
+        by_rate: Joints that were held back to their greatest rate, shape (m,).
+        unconfirmed: Joints that were held back as the bus had not confirmed the commands before,
+            shape (m,).
+        not_finite: Joints for which something was wanted that is no angle, shape (m,).
+    """
+
+    command: FloatArray
+    by_position: BoolArray
+    by_rate: BoolArray
+    unconfirmed: BoolArray
+    not_finite: BoolArray
+
+
+class Clamp:
+    """Cuts commands to position limits, and their steps to the greatest rate.
+
+    It knows the command before, which the servos hold: a step is measured from there, and is at
+    most what the greatest rate allows in one control period, also where ticks were left out. What
+    was late is caught up step by step and never by a jump; that the steps are a period apart in
+    true time, too, is for :mod:`.sim.gate.limits`.
+    """
+
+    def __init__(self, limits: GateLimits, pose: FloatArray, period_s: float) -> None:
+        """Start from a pose.
+
+        Args:
+            limits: Position and rate limits.
+            pose: The angles that the joints have [rad], shape (m,); finite.
+            period_s: Control period [s].
+
+        Raises:
+            ValueError: If the pose isn't known.
+        """
+        if not np.isfinite(pose).all():
+            raise ValueError("the pose to start from has angles that are not known")
+        self._limits, self._reach = limits, limits.rate * period_s
+        self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
+        """What was commanded last, at first the pose [rad], shape (m,)."""
+        self.cuts: dict[str, int] = dict.fromkeys(Clamped._fields[1:], 0)
+        """Commands of single joints that were changed, by why."""
+
+    def apply(
+        self, wanted: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
+    ) -> Clamped:
+        """Make a command fit to be sent; it counts as sent.
+
+        Args:
+            wanted: Joint angles [rad], shape (m,); anything.
+            bounds: Least and greatest angles that the commands on their way leave [rad], shapes
+                (m,), the last command among them; None: all.
+
+        Returns:
+            The command, and what was changed.
+        """
+        limits = self._limits
+        finite = np.isfinite(wanted)
+        within = np.clip(np.where(finite, wanted, self.last), limits.lower, limits.upper)
+        stepped = np.clip(within, self.last - self._reach, self.last + self._reach)
+        command = stepped
+        if bounds is not None:  # the last command is within, but for rounding
+            least, greatest = np.minimum(bounds[0], self.last), np.maximum(bounds[1], self.last)
+            command = np.clip(stepped, least, greatest)
+        by_position = finite & (np.abs(within - wanted) > _ROUNDING)
+        by_rate = np.abs(stepped - within) > _ROUNDING
+        unconfirmed = np.abs(command - stepped) > _ROUNDING
+        self.last = command
+        found = Clamped(command.copy(), by_position, by_rate, unconfirmed, ~finite)
+        for why, joints in zip(self.cuts, found[1:], strict=True):
+            self.cuts[why] += int(joints.sum())
+        return found
+
+
+_PEAK = 1.5  # greatest slope of 3 x^2 - 2 x^3
+
+
+class Ramp:
+    """A straight way between two poses, with no rate at either end."""
+
+    def __init__(self, start: FloatArray, target: FloatArray, rate: FloatArray) -> None:
+        """Plan it.
+
+        Args:
+            start: Angles [rad], shape (m,).
+            target: Angles [rad], shape (m,).
+            rate: Greatest rates [rad/s], shape (m,).
+        """
+        self._start, self._way = start.copy(), target - start
+        self.duration_s = _PEAK * float(np.max(np.abs(self._way) / rate, initial=0.0))
+        """How long it takes [s]."""
+
+    def at(self, time_s: float) -> FloatArray:
+        """The pose at a time.
+
+        Args:
+            time_s: Since its start [s].
+
+        Returns:
+            Angles [rad], shape (m,); the target from its end on.
+        """
+        if time_s >= self.duration_s:
+            return self._start + self._way
+        return self._start + smoothstep(time_s / self.duration_s) * self._way
+
+
+HOLD_S = 0.2
+"""So long the last pose is commanded again before nothing is sent any more [s]."""
+
+
+class Ending:
+    """The commands of an ending; it ends by its own time, whatever the joints do.
+
+    It starts from the present pose: a joint's last command where the joint is near it, else the
+    angle that the joint has, so that a blocked servo stops pushing.
+    """
+
+    def __init__(self, limits: GateLimits, last: FloatArray, status: JointStatus) -> None:
+        """Plan it.
+
+        Args:
+            limits: Rates, position limits, and how to end.
+            last: The last command [rad], shape (m,).
+            status: What the joints told by now.
+        """
+        far = np.abs(status.angle - last) > limits.tracking_error  # False where unknown
+        start = np.clip(np.where(far, status.angle, last), limits.lower, limits.upper)
+        rest = np.clip(np.zeros_like(last), limits.lower, limits.upper)
+        target = start if limits.on_fault is OnFault.HOLD else rest
+        self._ramp = Ramp(start, target, limits.ramp_rate)
+        back_s = float(np.max(np.abs(start - last) / limits.rate, initial=0.0))
+        self.duration_s = back_s + self._ramp.duration_s + HOLD_S
+        """How long it takes [s], with the way of the commands back to where the joints are."""
+
+    def at(self, time_s: float) -> FloatArray:
+        """What is wanted at a time.
+
+        Args:
+            time_s: Since its start [s].
+
+        Returns:
+            Joint angles [rad], shape (m,).
+        """
+        return self._ramp.at(time_s)
+
+
+_SHOWN = 8
+
+
+def why_not_from(angle: FloatArray, limits: GateLimits, waited_s: float) -> str | None:
+    """Why a drive can't start from a pose.
+
+    Args:
+        angle: Measured angles [rad], NaN where none came, shape (m,).
+        limits: Position limits, and how far beyond them a joint may be found.
+        waited_s: How long angles were waited for [s].
+
+    Returns:
+        One sentence; None if it can.
+    """
+    names = limits.joint_names
+    unknown = np.flatnonzero(np.isnan(angle)).tolist()
+    if unknown:
+        silent = _listed([names[i] for i in unknown], len(names))
+        return (
+            f"the pose is not known, {silent} told no angle within {waited_s:.2g} s; is the robot "
+            "switched on, and does it report unasked?"
+        )
+    beyond = np.maximum(limits.lower - angle, angle - limits.upper)
+    worst = int(np.argmax(beyond - limits.tracking_error))
+    if beyond[worst] > limits.tracking_error[worst]:
+        return (
+            f"{names[worst]} is at {angle[worst]:.3f} rad, {beyond[worst]:.3f} rad beyond its "
+            "limits; bring it back by hand"
+        )
+    return None
+
+
+def _listed(names: list[str], of: int) -> str:
+    if len(names) == of:
+        return f"all {of} joints"
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

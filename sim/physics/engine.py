@@ -15,7 +15,7 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
-from ..scenario.engines import EngineKind, Kernels
+from ..scenario.scenario import EngineKind, Kernels
 
 
 class BodyState(NamedTuple):

@@ -24,8 +24,8 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Plane, Robot
 
+from .contact import cross
 from .engine import BodyState
-from .vectors import cross
 
 _AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
 _SCALAR_LAST = [1, 2, 3, 0]

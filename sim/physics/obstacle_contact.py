@@ -40,8 +40,7 @@ from ..scenario.obstacles import (
     to_circles,
     to_rectangles,
 )
-from .contact import normal_force
-from .vectors import cross
+from .contact import cross, normal_force
 
 
 class ObstacleContact(NamedTuple):

@@ -11,7 +11,7 @@ from undulog.capture.common.config import NonNegative, Positive, read
 from undulog.capture.common.strict_table import Table, at_least, at_most
 from undulog.capture.robot.model import Plane, Robot, SensorKind
 
-from .sensor_layout import Layout, layout
+from .sensors import Layout, layout
 
 Share: TypeAlias = Annotated[float, at_least(0.0), at_most(1.0)]
 
@@ -36,8 +36,8 @@ class Calibration:
     """What a robot knows of its gait on free ground, by trying it out once.
 
     Attributes:
-        slip_ratio: K of :class:`.sim.control.reckoning.SlipOdometry`.
-        turn_gain: c of :class:`.sim.control.phase_history.PathHeading`.
+        slip_ratio: K of :class:`.sim.control.dead_reckoning.SlipOdometry`.
+        turn_gain: c of :class:`.sim.control.filters.PathHeading`.
         turn_radius_m: Of the turn with the course's largest offset [m].
     """
 

@@ -101,12 +101,10 @@ from undulog.capture.robot.model import Plane, Robot
 from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import read_faults
 from .controllers import read_controller
-from .gaits_toml import read_gait
-from .modules import read_modules
-from .scenario import LONGEST_S, Scenario
+from .gaits import read_gait
+from .scenario import LONGEST_S, Scenario, read_modules
 from .sensors import Noise, read_sensing
-from .world import read_pushes
-from .world_toml import read_world
+from .world import read_pushes, read_world
 
 _LATEST_EPOCH_S = 2**31 - 1  # stamps hold seconds as int32
 _SHELF = Shelf("scenario", "undulog.sim", "scenarios", ScenarioError)

@@ -16,22 +16,21 @@ import numpy as np
 
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.common.arrays import BoolArray, FloatArray, frozen
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray
 from undulog.capture.robot.model import Direction, Quantity, Robot
-from undulog.capture.sources.records import records
+from undulog.capture.sources.contract import records
 
-from ..gait.contract import GaitTick, Readings
+from ..gait.contract import CONTROL_RATE_HZ, GaitTick, Readings
 from ..scenario.bus_faults import BusFault
-from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from ..scenario.scenario import Scenario
 from ..sensing.contract import SensorSample
 from ..twin.recording import quick_collections
 from ..twin.twin import Twin
-from .bus import VirtualBus
-from .bus_client import Sent
-from .encode import ReplyEncoder
-from .fault_line import FaultLine
 from .pacing import Pacer, PaceTally
+from .reply_frames import FaultLine, ReplyEncoder
+from .socketcand_protocol import Sent
+from .socketcand_server import VirtualBus
 
 WATCHDOG_S = 0.5
 """After so long without a command a servo's silence is told; it holds its angle all the while."""

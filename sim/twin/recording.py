@@ -13,15 +13,14 @@ from types import TracebackType
 
 from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import LogWriteError, SimulationError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.sinks.mcap_sink import write_error
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import ClockDomain
 
 from ..gait.contract import Gait
 from ..physics.ledger import TERMS
-from ..scenario.engines import Kernels
-from ..scenario.scenario import Scenario
+from ..scenario.scenario import Kernels, Scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin
 

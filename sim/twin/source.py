@@ -17,8 +17,9 @@ from undulog.capture.sources.contract import (
     SourceEvent,
 )
 
+from ..gait.contract import CONTROL_RATE_HZ
 from ..physics.engine import engine_type
-from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
+from ..scenario.scenario import Scenario
 from ..scenario.scenario_file import load_scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin

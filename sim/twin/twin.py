@@ -16,16 +16,14 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
 
-from ..control.build import build_gait
-from ..gait.contract import Gait, GaitTick
+from ..control.adaptive import build_gait
+from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick
+from ..physics.laws import Plant
 from ..physics.ledger import Ledger
-from ..physics.plant import Plant
 from ..physics.steps import Step, Steps
-from ..scenario.engines import Kernels
-from ..scenario.scenario import CONTROL_RATE_HZ, Scenario
-from ..sensing.contract import SensorSample
-from ..sensing.mount import quantised
-from ..sensing.senses import Senses
+from ..scenario.scenario import Kernels, Scenario
+from ..sensing.contract import SensorSample, quantised
+from ..sensing.sensors import Senses
 from .stability import likely_cause
 
 MAX_SPEED = 10.0
@@ -47,7 +45,7 @@ class Sample(NamedTuple):
         energy: The ledger up to here [J], as :data:`.sim.physics.ledger.TERMS`, shape (23,).
         contact_s: For how long each link has touched an obstacle so far [s], shape (n,).
         joint_energy: The part of each joint in it [J], rows as
-            :data:`.sim.physics.energy_flows.JOINT_TERMS`, shape (9, m).
+            :data:`.sim.physics.ledger.JOINT_TERMS`, shape (9, m).
     """
 
     tick: int

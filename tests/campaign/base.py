@@ -17,8 +17,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2.writer import Writer as RosWriter
 
 from undulog.capture import SessionWriter, load_robot
+from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.log.messages.schemas import schema_text
 from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -15,7 +15,7 @@ from pathlib import Path
 import lz4.frame
 import zstandard
 
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 from .base import EPOCH_NS, PERIOD_NS, ROBOT, SCENARIO
 from .case import Result, run_command

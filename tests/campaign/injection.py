@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
 
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 from .base import DBC, EPOCH_NS, JOINTS, PERIOD_NS, PLAN, ROBOT, SCENARIO, can_messages
 from .case import Result, run_command

@@ -20,7 +20,7 @@ from rerun.chunk import RrdReader
 
 from support.paths import ROOT
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 JOINT_STATE = "sensor_msgs/msg/JointState"

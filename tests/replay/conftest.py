@@ -273,7 +273,7 @@ def read_back():
 @pytest.fixture(scope="session")
 def recording(session_file, analysis, tmp_path_factory):
     """The whole session as a recording: (what was said, what is in the file)."""
-    from undulog.replay.record.rrd import write_recording
+    from undulog.replay.feed.recording import write_recording
 
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     with Session.open(session_file) as session:
@@ -303,7 +303,7 @@ def rerun_command():
 @pytest.fixture(scope="module")
 def show(vulkan):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
-    from undulog.replay.viewer.headless import HeadlessViewer
+    from undulog.replay.viewer.viewer import HeadlessViewer
 
     with ExitStack() as stack:
 

@@ -12,7 +12,7 @@ from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.health.session_check import SessionHealth
 from undulog.capture.log.health.tallies import Timing
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

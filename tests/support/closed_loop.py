@@ -12,12 +12,12 @@ import numpy as np
 
 from support import twin_chains
 from support.analysed import experiment as together
-from undulog.analysis.oscillators.phase_log import read_phases
 from undulog.analysis.oscillators.predictions import felt_response, relax, relaxation, steady_bias
+from undulog.analysis.oscillators.weak_form import read_phases
 from undulog.analysis.results.experiment import Experiment
 from undulog.capture import Session
 from undulog.sim import GaitTick, load_scenario
-from undulog.sim.scenario.engines import Kernels
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import Driver, record
 
 AMPLITUDE, FREQUENCY_HZ, LAG = 0.4, 0.5, math.pi / 3

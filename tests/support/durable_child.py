@@ -13,7 +13,7 @@ import time
 
 from mcap.records import Channel, Metadata, Schema
 
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000

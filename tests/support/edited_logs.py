@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -26,9 +26,9 @@ from rerun.chunk import RrdReader
 
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
-from undulog.replay.layout.views import build_views
-from undulog.replay.record.rrd import APPLICATION, write_recording
-from undulog.replay.viewer.headless import HeadlessViewer
+from undulog.replay.feed.recording import APPLICATION, write_recording
+from undulog.replay.layout import build_views
+from undulog.replay.viewer.viewer import HeadlessViewer
 
 FOLDER = Path(__file__).parents[1] / "replay" / "golden"
 SESSION = FOLDER / "session.mcap"

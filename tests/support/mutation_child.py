@@ -23,10 +23,10 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.log.messages.schemas import schema_text
 from undulog.capture.log.sinks.durable_sink import DurableSink
-from undulog.capture.log.wal.wal_recover import recover
+from undulog.capture.log.wal.reader import recover
 from undulog.capture.robot.description import parse_robot
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

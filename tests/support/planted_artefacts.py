@@ -3,7 +3,7 @@
 import numpy as np
 
 from undulog.analysis.artefacts.find import find_artefacts
-from undulog.analysis.signals.reading import read_columns
+from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session, SessionWriter, load_robot
 
 EPOCH_NS = 1_735_689_600_000_000_000

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from undulog.capture.log.edit.raw_log import RawLog
+from undulog.capture.log.edit.raw_messages import RawLog
 
 
 def read(path):

@@ -4,7 +4,7 @@ import functools
 
 from mcap.records import Channel
 
-from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.writer import WriteAheadLog
 
 CHANNEL = Channel(id=1, topic="/t", message_encoding="cdr", metadata={"unit": "rad"}, schema_id=1)
 # The same in the children that get killed and here, so that each payload can be told again.

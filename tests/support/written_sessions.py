@@ -8,7 +8,7 @@ import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
 
 from undulog.capture import SessionWriter
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -16,8 +16,8 @@ from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.log.health.session_check import check_session
-from undulog.replay.content.content import Content
 from undulog.replay.draw.facts import markdown
+from undulog.replay.samples.content import Content
 
 from .robot import SECOND_TOPIC
 

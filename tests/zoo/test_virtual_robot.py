@@ -12,9 +12,9 @@ from support.processes import UNDULOG, process
 from undulog.capture import Session, load_robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
-from undulog.sim.drive.driven import find_driven
-from undulog.sim.drive.link import find_virtual_robot
+from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.drive.motion import find_driven
 from undulog.sim.gait.contract import Readings
 from zoo.judging import judge
 from zoo.outputs import OUTPUTS, statements

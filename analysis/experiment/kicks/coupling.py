@@ -35,9 +35,17 @@ from ...results.coupling import (
     rows_of,
 )
 from ...results.estimate import Estimate
-from .local import Answers, Measured, RowSums, answers_of, nonlinearity
-from .lti_reading import LtiReading, lti_reading
-from .matrices import LocalMatrices, local_matrices
+from .local import (
+    Answers,
+    LocalMatrices,
+    LtiReading,
+    Measured,
+    RowSums,
+    answers_of,
+    local_matrices,
+    lti_reading,
+    nonlinearity,
+)
 from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
 from .scatter import RunErrors, sides
 

@@ -13,23 +13,37 @@ Shifting all commands in time shifts all responses: every row of P sums to 1 and
 
 so G = P and S = -R, and how far they are from that measures nonlinearity without a model. In
 contact a chain isn't linear: every gait is its own operating point, and a complex H isn't enough.
+
+The coupling of a chain, read from kicks as if it were linear and time-invariant.
+
+Then a = H c with H_ij = (a_i / c_j)(P_ij - j R_ij), and X = H^-1 is, up to the servos on its
+diagonal and a scaling of its rows, the impedance that couples the joints. Asymmetry of P is not
+directed coupling: a reciprocal H (H = H') has an asymmetric P, too. Hence asymmetry and reach are
+told of X. Where the nonlinearity index isn't small, this is a reading and not a measurement.
+
+P, R, G and S with errors that hold whether or not runs differ by more than their own noise.
+
+Rows of P must sum to 1 and rows of R to 0. That is checked against errors which know nothing of
+those sums; where it fails in spite of the scatter between runs, something else is wrong in every
+run (most often they had not settled), and the errors are widened until the sums agree (the scale
+factor of the Particle Data Group, Review of Particle Physics, Introduction, section 5.2.2).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtrit
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
 from ...estimators.intervals import CONFIDENCE, noise_draws, norm_ratio, welch_satterthwaite
 from ...results.estimate import Estimate
 from .runs import Kick, Kind
-from .scatter import RunErrors
+from .scatter import RunErrors, run_errors
 
 
 @dataclass(frozen=True)
@@ -236,3 +250,206 @@ def stacked(blocks: Sequence[Sequence[Measured]], correlation: FloatArray | None
 
 def _is(kick: Kick, joint: int, kind: Kind) -> bool:
     return kick.joint == joint and kick.kind is kind
+
+
+BANDS = (1, 2, 3)
+
+SINGULAR = 1e10
+"""Condition number beyond which H isn't inverted."""
+
+
+@dataclass(frozen=True)
+class LtiReading:
+    """H and what its inverse says.
+
+    Attributes:
+        H: Response per command, shape (m, m).
+        condition_number: Of H, 2-norm: what its inversion may multiply relative errors by.
+        asymmetry: ||X - X'|| / ||X|| off the diagonal; 0 = reciprocal.
+        band_energy: Share of X's off-diagonal energy within |i - j| <= each of ``BANDS``.
+    """
+
+    H: ComplexArray
+    condition_number: float
+    asymmetry: Estimate
+    band_energy: tuple[Estimate, ...]
+
+
+def lti_reading(
+    P: Measured,
+    R: Measured,
+    response: ComplexArray,
+    command: ComplexArray,
+    seed: int = 11,
+    *,
+    correlation: FloatArray | None = None,
+) -> LtiReading:
+    """Read P and R as a linear time-invariant system.
+
+    Args:
+        P: d psi / d psi_c.
+        R: d ln|a| / d psi_c.
+        response: Complex amplitudes a of the base gait, shape (m,).
+        command: Complex amplitudes c of the base gait, shape (m,).
+        seed: Of the noise draws.
+        correlation: Of one run's errors, psi of all joints and then ln|a|, or None.
+
+    Returns:
+        The reading; asymmetry and bands are empty where H is singular.
+    """
+    scale = response[:, None] / command[None, :]
+    H = (scale * (P.value - 1j * R.value)).astype(np.complex128)
+    condition = float(np.linalg.cond(H))
+    if not condition < SINGULAR:
+        return LtiReading(H, condition, Estimate(), tuple(Estimate() for _ in BANDS))
+    X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
+    draws = noise_draws(stacked(((P,), (R,)), correlation), seed)
+    noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
+    error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
+    return LtiReading(H, condition, *reciprocity(X, error))
+
+
+def reciprocity(X: ComplexArray, error: ComplexArray) -> tuple[Estimate, tuple[Estimate, ...]]:
+    """Asymmetry and reach of a matrix off its diagonal.
+
+    Args:
+        X: An impedance, or what stands for one, shape (m, m).
+        error: Errors that it may have, shape (DRAWS, m, m).
+
+    Returns:
+        ||X - X'|| / ||X||, and the share of the energy within each of ``BANDS``.
+    """
+    place = np.arange(len(X))
+    distance = np.abs(place[:, None] - place[None, :])
+    outside: FloatArray = (distance > 0).astype(np.float64)
+    off: ComplexArray = X * outside
+    off_error: ComplexArray = error * outside
+    asymmetry = norm_ratio(off - off.T, off_error - off_error.swapaxes(1, 2), off, off_error)
+    bands = (
+        norm_ratio(off * (distance <= b), off_error * (distance <= b), off, off_error)
+        for b in BANDS
+    )
+    return asymmetry, tuple(squared(one) for one in bands)
+
+
+def squared(share: Estimate) -> Estimate:
+    """Energy from a ratio of norms.
+
+    Args:
+        share: Of a norm in the whole's.
+
+    Returns:
+        Share of the energy, at most 1.
+    """
+    if share.value is None:
+        return share
+    ci95 = share.ci95
+    return Estimate(
+        min(1.0, share.value**2),
+        None if ci95 is None else (min(1.0, ci95[0] ** 2), min(1.0, ci95[1] ** 2)),
+    )
+
+
+ROW_TOLERANCE = 1e-2
+"""Central differences of 0.05 leave curvature of third order in a row's sum."""
+
+
+@dataclass(frozen=True)
+class LocalMatrices:
+    """What kicks around one gait say.
+
+    Attributes:
+        P: d psi / d psi_c.
+        R: d ln|a| / d psi_c.
+        G: d ln|a| / d ln|c|, or None.
+        S: d psi / d ln|c|, or None.
+        errors: How much runs differ.
+        steady_errors: The same from combinations of runs that no second order of a kick enters.
+        phase_rows: Sums of rows of P, with errors that know nothing of these sums.
+        gain_rows: Of R.
+        agree: Whether each sum of P, then of R, is 1 or 0 within its error, all together at 95 %,
+            shape (2, m).
+        widened: Factor on the errors of each joint's phase, then log amplitude, shape (2, m).
+    """
+
+    P: Measured
+    R: Measured
+    G: Measured | None
+    S: Measured | None
+    errors: RunErrors
+    steady_errors: RunErrors
+    phase_rows: RowSums
+    gain_rows: RowSums
+    agree: BoolArray
+    widened: FloatArray
+
+
+def local_matrices(
+    kicks: Sequence[Kick | None], answers: Answers, *, amplitude: bool
+) -> LocalMatrices:
+    """Estimate the matrices.
+
+    Args:
+        kicks: Of r runs, None of one of the base gait.
+        answers: Of the same runs.
+        amplitude: Whether amplitudes are kicked both ways, too.
+
+    Returns:
+        The matrices.
+    """
+    kicked = [k for k, one in enumerate(kicks) if one is not None]
+    each = [one for one in kicks if one is not None]
+    of_kicks = Answers(
+        answers.log[kicked],
+        answers.log_gain_variance[kicked],
+        answers.phase_variance[kicked],
+        answers.dof[kicked],
+    )
+
+    def differences(errors: RunErrors | None, kind: Kind) -> tuple[Measured, Measured]:
+        return central_differences(each, replace(of_kicks, errors=errors), kind)
+
+    phase, log_gain = differences(None, Kind.PHASE)
+    derivatives = ((phase.value - 1j * log_gain.value).astype(np.complex128), None)
+    if amplitude:
+        phase, log_gain = differences(None, Kind.AMPLITUDE)
+        derivatives = (derivatives[0], (log_gain.value + 1j * phase.value).astype(np.complex128))
+    variance = np.hstack([answers.phase_variance, answers.log_gain_variance])
+    without, errors, steady = (
+        run_errors(kicks, answers.log, variance, derivatives, pairs=pairs, rows=rows)
+        for pairs, rows in ((True, False), (True, True), (False, True))
+    )
+    sums = [row_sums(one) for one in differences(without, Kind.PHASE)]
+    agree = np.stack([_agree(one, to) for one, to in zip(sums, (1.0, 0.0), strict=True)])
+    widened = np.stack(
+        [_widening(one, to, good) for one, to, good in zip(sums, (1.0, 0.0), agree, strict=True)]
+    )
+    P, R = _widen(differences(errors, Kind.PHASE), widened)
+    S, G = _widen(differences(errors, Kind.AMPLITUDE), widened) if amplitude else (None, None)
+    return LocalMatrices(P, R, G, S, errors, steady, sums[0], sums[1], agree, widened)
+
+
+def _agree(sums: RowSums, expected: float) -> BoolArray:
+    """Whether each sum is as expected, all 2 m of P and R together at 95 %."""
+    quantile = stdtrit(sums.dof, 1 - (1 - CONFIDENCE) / (4 * len(sums.value)))
+    return np.abs(sums.value - expected) <= ROW_TOLERANCE + sums.error * quantile
+
+
+def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
+    """Factor on each row's errors; 1 where all sums agree."""
+    if agree.all():
+        return np.ones(len(agree))
+    off = np.abs(sums.value - expected) / np.maximum(sums.error, np.finfo(float).tiny)
+    return np.maximum(np.where(agree, 1.0, off), max(1.0, float(np.sqrt(np.mean(off**2)))))
+
+
+def _widen(pair: tuple[Measured, Measured], factor: FloatArray) -> tuple[Measured, Measured]:
+    """Errors times each row's factor, which so many sums tell."""
+    m = len(factor[0])
+
+    def wider(one: Measured, by: FloatArray) -> Measured:
+        if np.all(by == 1.0):
+            return one
+        return replace(one, error=one.error * by[:, None], dof=np.minimum(one.dof, m))
+
+    return wider(pair[0], factor[0]), wider(pair[1], factor[1])

@@ -17,9 +17,8 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 
 from ...estimators.intervals import CONFIDENCE, noise_draws
-from ...oscillators.body import measured
 from ...oscillators.laplacian import intervals_of, spectrum
-from ...oscillators.predictions import felt_response, relaxation
+from ...oscillators.predictions import felt_response, measured, relaxation
 from ...results import formats
 from ...results.coupling import BaseResponse, LocalCoupling, rows_of
 from ...results.estimate import Estimate

@@ -12,15 +12,20 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Servo
 
-from ...results.coupling import Coupling, rows_of
+from ...results.coupling import (
+    ComplexMatrix,
+    Coupling,
+    LinearCoupling,
+    Route,
+    ToneCoupling,
+    rows_of,
+)
 from ...results.estimate import Estimate
-from ...results.sweep import ComplexMatrix, LinearCoupling, Route, ToneCoupling
 from ...signals.stretch import Options
-from ..kicks.lti_reading import SINGULAR, reciprocity
+from ..kicks.local import SINGULAR, reciprocity
 from .chain import Measured, impedance, impedance_behind_servos, inverse, servo_side, transfer
-from .data import SweepData, sweep_data
-from .distortion import distortion, sideband_energy
-from .runs import CommandTones, Sweep
+from .runs import CommandTones, Sweep, SweepData, sweep_data
+from .tones import distortion, sideband_energy
 
 NONLINEAR = 0.01
 """Distortion of a tone above which a chain isn't called linear."""

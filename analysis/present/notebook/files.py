@@ -14,10 +14,10 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
 
-from ...results import energy as result_energy
+from ...results import analysis as result_energy
+from ...results import analysis as result_over_time
+from ...results import coupling as result_sweep
 from ...results import oscillators
-from ...results import over_time as result_over_time
-from ...results import sweep as result_sweep
 from ...results.analysis import Analysis, interval_key
 from ...results.comparison import Comparison
 from ...results.coupling import Coupling, LocalCoupling

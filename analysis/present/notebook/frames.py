@@ -13,11 +13,18 @@ import pandas as pd
 from ...results.analysis import Analysis, BodyPoint, Index, JointResult
 from ...results.artefact import Artefact, Span
 from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
-from ...results.coupling import Coupling, HeldOut, LocalCoupling, Matrix, RowCheck
+from ...results.coupling import (
+    Coupling,
+    HeldOut,
+    LinearCoupling,
+    LocalCoupling,
+    Matrix,
+    RowCheck,
+    ToneCoupling,
+)
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
 from ...results.oscillators import ChainCoupling, Link, Mode, Rate
-from ...results.sweep import LinearCoupling, ToneCoupling
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 

@@ -23,7 +23,7 @@ from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, relative
 
 if TYPE_CHECKING:
-    from ..page.entries import Entries
+    from ..page.matrix import Entries
     from ..page.svg import Drawing
 
 
@@ -223,7 +223,7 @@ def _(result: Experiment) -> Pictures:
 def _(result: Coupling) -> Pictures:
     if result.matrix is None:
         raise UsageError(f"{result!r}: there is no matrix to draw")
-    from ..page.entries import entries_of
+    from ..page.matrix import entries_of
 
     return {one.symbol: partial(_matrix, one) for one in entries_of(result, ())}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import singledispatch
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from undulog.capture.common.console import plain
 
@@ -13,12 +13,53 @@ from ...experiment.answer import kick_answer, kick_detail, pair_order, sweep_ans
 from ...results import formats
 from ...results.analysis import Analysis
 from ...results.comparison import Comparison
-from ...results.coupling import Coupling, LocalCoupling
+from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.experiment import Experiment, Reversal
-from ...results.sweep import LinearCoupling
-from ..text.comparison import render_comparison
-from ..text.experiment import render_experiment, reversal_detail
-from ..text.table import render
+from ..text import render
+from ..text_experiment import render_comparison, render_experiment, reversal_detail
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ...results.shown import Shown
+    from .pictures import Picture
+
+
+class Presenter:
+    """A :class:`.Presentation`; each method imports what it needs when called."""
+
+    def text(self, result: Shown) -> str:  # noqa: D102
+
+        return text_of(result)
+
+    def headline(self, result: Shown) -> str:  # noqa: D102
+
+        return headline_of(result)
+
+    def html(self, result: Shown) -> str:  # noqa: D102
+
+        return html_of(result)
+
+    def frames(self, result: Shown) -> dict[str, pd.DataFrame]:  # noqa: D102
+        from .frames import frames_of
+
+        return frames_of(result)
+
+    def picture(self, result: Shown, what: str | None) -> Picture:  # noqa: D102
+        from .pictures import picture_of
+
+        return picture_of(result, what)
+
+    def save(self, result: Shown, path: Path, *, force: bool) -> Path:  # noqa: D102
+        from .files import save
+
+        return save(result, path, force=force)
+
+    def save_tables(self, result: Shown, folder: Path, *, force: bool) -> list[Path]:  # noqa: D102
+        from .files import save_tables
+
+        return save_tables(result, folder, force=force)
+
 
 MOST_ROWS = 40
 """Rows of a table that a notebook shows."""

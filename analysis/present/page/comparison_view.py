@@ -10,13 +10,12 @@ from markupsafe import Markup
 
 from undulog.capture.common.palette import joint_hex
 
-from ...compare.answer import WORDS, in_people_units, signed
-from ...compare.decisions import SIGNIFICANT
+from ...compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
 from ...results.analysis import SessionFacts
 from ...results.comparison import BODY, Comparison
 from ...results.estimate import Estimate
 from ...results.formats import scaled
-from ..text.comparison import margin_told, method
+from ..text_experiment import comparison_method, margin_told
 from .motion import waveforms_drawing
 from .svg import (
     INK,
@@ -138,7 +137,7 @@ class ComparisonView:
         differences: Of every joint, as a picture; None where there are none.
         waveforms: Mean cycles, or None.
         trials: What is shown to be the same.
-        method: How it was made.
+        comparison_method: How it was made.
     """
 
     comparison: Comparison
@@ -149,7 +148,7 @@ class ComparisonView:
     differences: Drawing | None
     waveforms: Drawing | None
     trials: tuple[Trial, ...]
-    method: str
+    comparison_method: str
 
 
 def comparison_view(comparison: Comparison) -> ComparisonView:
@@ -171,7 +170,7 @@ def comparison_view(comparison: Comparison) -> ComparisonView:
         differences=differences_of(comparison, "differences") if joints_of(comparison) else None,
         waveforms=waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
         trials=_trials(comparison),
-        method=method(comparison),
+        comparison_method=comparison_method(comparison),
     )
 
 
@@ -226,7 +225,7 @@ def _trials(comparison: Comparison) -> tuple[Trial, ...]:
             f"Is the {WORDS[one.quantity]} the same on both sides, within {margin_told(one)}?",
             f"largest difference {margin_told(one, one.largest)}",
             one.p,
-            "yes, shown to be the same" if one.p < SIGNIFICANT else "not shown",
+            "yes, shown to be the same" if one.p < SIGNIFICANT_DIFFERENCE else "not shown",
         )
         for one in comparison.equivalence
     )

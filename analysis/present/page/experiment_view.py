@@ -11,19 +11,16 @@ from ...experiment.answer import kick_checks, sweep_checks
 from ...experiment.sweep.coupling import NONLINEAR
 from ...results import formats
 from ...results.analysis import Analysis, JointResult
-from ...results.coupling import Coupling, LocalCoupling
+from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, Run
-from ...results.sweep import LinearCoupling
-from ..text.experiment import by_note, by_warning, method, reversal_detail
-from .entries import Entries, entries_of
-from .matrix import matrix_picture
+from ..text_experiment import by_note, by_warning, method, reversal_detail
+from .matrix import Entries, entries_of, matrix_picture
 from .mirror import mirror_profile, profiles
 from .oscillators import body_facts, entrainment_entries, modes_drawing
 from .svg import Drawing
-from .tables import Fact
+from .tables import Fact, digits
 from .trials import Trial, experiment_trials
-from .typeset import digits
 
 AGREE = 0.1
 """Z by torques and Z behind the described servos are called one up to this relative difference."""

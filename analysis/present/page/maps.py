@@ -18,7 +18,7 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from ...results.formats import decimals_for_values, number, short
 from ...session.cycles import CycleMaps
 from .svg import Drawing
-from .typeset import element
+from .tables import element
 
 MOST_COLUMNS = 150
 """Columns of a map; more cycles than these are averaged, and the page says so."""

@@ -12,9 +12,8 @@ from undulog.capture.common.arrays import FloatArray
 from ...results import formats
 from ...results.estimate import Estimate
 from ...results.oscillators import BodyOscillators, ChainCoupling
-from ..text.oscillators import chain_detail
-from .entries import Entries
-from .matrix import matrix_picture
+from ..text import chain_detail
+from .matrix import Entries, matrix_picture
 from .svg import INK, REFERENCE, WIDTH_IN, Drawing, drawing, inline_svg, key, legend, new_figure
 from .tables import Fact
 

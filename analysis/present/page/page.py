@@ -22,28 +22,38 @@ from undulog.capture.common.palette import joint_hex
 
 from ...results import formats
 from ...results.analysis import Analysis, JointResult
-from ...results.answer import Answer
+from ...results.answer import Answer, beyond
 from ...results.comparison import Comparison
-from ...results.deciding import beyond
 from ...results.estimate import Provenance
 from ...results.experiment import Experiment
 from ...session.cycles import CycleMaps
 from .. import tables
-from .artefacts import ArtefactRow, artefact_rows, flagged_joints
+from .artefacts import ArtefactRow, artefact_rows, command_response, flagged_joints, read_traces
 from .comparison_view import comparison_view
-from .driven import is_driven
-from .entries import Entries, entries_of
 from .experiment_view import experiment_view
 from .maps import cycle_drawings
-from .matrix import matrix_picture
+from .matrix import Entries, entries_of, matrix_picture
 from .motion import body_motion
 from .oscillators import ChainView, chain_views
 from .segments import segments
-from .signals import command_response, read_traces
 from .svg import Drawing
-from .tables import Fact, estimate, grid, joint_mark, key_figures, known, number, p_value
+from .tables import (
+    Fact,
+    cut,
+    digits,
+    estimate,
+    grid,
+    is_driven,
+    joint_mark,
+    key_figures,
+    known,
+    number,
+    p_value,
+    sentence,
+    softer,
+    typeset,
+)
 from .trials import LEVEL_NOTE, Trial, session_trials
-from .typeset import cut, digits, sentence, softer, typeset
 
 
 @dataclass(frozen=True)

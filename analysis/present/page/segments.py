@@ -12,7 +12,6 @@ from undulog.capture.common.palette import joint_hex
 from ...results.analysis import JointResult
 from ...results.estimate import Estimate
 from ...results.formats import degrees, estimate, number
-from .driven import is_driven
 from .svg import (
     INK,
     MUTED,
@@ -30,6 +29,7 @@ from .svg import (
     marker,
     new_figure,
 )
+from .tables import is_driven
 
 _MARKER_SIZE = 5.2
 _PLANE_WORDS = {"horizontal": "horizontal", "vertical": "vertical", None: "plane unknown"}

@@ -16,17 +16,14 @@ import numpy as np
 
 from ...common.arrays import IntArray
 from ...common.errors import DataError
-from ..file.pages import FilePages
-from ..file.storage import LogFile
+from ..file.log_file import FilePages, LogFile
 from ..mcap.chunk import Buffer
-from ..mcap.message_heads import BODY_AT, FIXED_SIZE, Places
+from ..mcap.records import BODY_AT, FIXED_SIZE, Places
 from ..messages.cdr import Layout, layout_of
-from ..messages.rosmsg import MessageType
-from ..messages.schemas import JOINT_STATE
-from .batches import Records, Window, blocks_in, record_batches
-from .groups import Group, Stamping
-from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, LayoutSorter
-from .stores import TimeStore
+from ..messages.definitions import JOINT_STATE, MessageType
+from .blocks import Records, Window, blocks_in, record_batches
+from .buffers import TimeStore
+from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, Group, LayoutSorter, Stamping
 
 _LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
 _MAX_SHARED = 8

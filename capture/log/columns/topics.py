@@ -14,11 +14,11 @@ from mcap.exceptions import McapError
 from mcap.records import Schema
 
 from ...common.errors import DataError, MissingChannelError
-from ..file.storage import LogFile
+from ..file.log_file import LogFile
 from ..mcap.chunk import LAST_NS
 from ..messages.cdr import Layout
-from ..messages.rosmsg import MessageType, parse_message_type
-from .batches import Window
+from ..messages.definitions import MessageType, parse_message_type
+from .blocks import Window
 from .columns import Messages, Request, message_blocks, message_bytes, read_messages
 
 _ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"

@@ -19,9 +19,9 @@ from mcap.records import Channel
 
 from ...common.console import progress
 from ...common.errors import DataError, MissingChannelError, UsageError
-from ...common.interruption import StopRequest
-from ..messages.topics import adds_up, is_latched
-from .edit import (
+from ...common.process import StopRequest
+from ..messages.definitions import adds_up, is_latched
+from .edited_log import (
     EDIT_RECORD,
     HEALTH_RECORD,
     NS,
@@ -33,7 +33,7 @@ from .edit import (
     refuse_output,
     refuse_stopped,
 )
-from .raw_log import RawLog, RawMessage
+from .raw_messages import RawLog, RawMessage
 
 _FOREVER_NS = 2**64
 _LOOK_EVERY = 1024

@@ -30,13 +30,12 @@ from mcap.records import Schema
 
 from ...common.console import progress
 from ...common.errors import DataError, UsageError
-from ...common.interruption import StopRequest
+from ...common.process import StopRequest
 from ..columns.layouts import names_of
 from ..columns.topics import Topics
 from ..messages.cdr import layout_of
-from ..messages.rosmsg import parse_message_type
-from ..messages.schemas import JOINT_STATE
-from .edit import (
+from ..messages.definitions import JOINT_STATE, parse_message_type
+from .edited_log import (
     EDIT_RECORD,
     HEALTH_RECORD,
     NS,
@@ -49,7 +48,7 @@ from .edit import (
     refuse_output,
     refuse_stopped,
 )
-from .raw_log import RawLog, RawMessage
+from .raw_messages import RawLog, RawMessage
 
 Record = tuple[str, dict[str, str]]
 

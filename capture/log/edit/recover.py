@@ -10,10 +10,10 @@ from typing import Any
 
 from ...common.console import progress
 from ...common.errors import DataError, LogError
-from ...common.interruption import StopRequest
-from ..file.part_files import first_part
-from ..wal.wal import wal_folder
-from .edit import (
+from ...common.process import StopRequest
+from ..file.parts import first_part
+from ..wal.writer import wal_folder
+from .edited_log import (
     HEALTH_RECORD,
     EditedLog,
     EditReport,
@@ -22,7 +22,7 @@ from .edit import (
     refuse_output,
     refuse_stopped,
 )
-from .raw_log import RawLog
+from .raw_messages import RawLog
 
 RECOVERED_RECORD = "undulog.recovered"
 """Metadata record that says what a recovered log was made from."""

@@ -26,8 +26,9 @@ from ..columns.layouts import (
     values_of,
 )
 from ..mcap.chunk import LAST_NS, Buffer
-from ..mcap.message_heads import BODY_AT, FIXED_SIZE, gather
+from ..mcap.records import BODY_AT, FIXED_SIZE, gather
 from ..messages.cdr import Layout, layout_of
+from ..messages.definitions import MessageType
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -37,10 +38,9 @@ from ..messages.frames import (
     FRAME_TOPIC_PREFIXES,
     records_at,
 )
-from ..messages.rosmsg import MessageType
 from .bus_tally import BusTally
 from .freeze import RangeTally
-from .health import LIMIT_RAD
+from .rules import LIMIT_RAD
 from .tallies import SequenceTally, TimingTally
 
 _STAMP_AT = 4  # a leading Header or Time follows the encapsulation header at once

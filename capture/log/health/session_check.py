@@ -17,16 +17,16 @@ from ...following.session import faults_in_session
 from ...robot.description import robot_in_session
 from ...robot.model import Robot
 from ..columns.topics import Topics
-from ..edit.joined import Finding
-from ..file.part_files import check_chain
-from ..file.storage import LogFile
+from ..edit.edited_log import Finding
+from ..file.log_file import LogFile
+from ..file.parts import check_chain
 from ..mcap.chunk import Block
 from ..mcap.container_check import Container, check_chunk, check_container
-from ..mcap.mcap_file import McapFile
-from ..mcap.message_heads import read_heads
+from ..mcap.file import McapFile
+from ..mcap.records import read_heads
 from ..read.session import Session
-from .health import judge_file, judge_following, verdict_of
 from .measures import FileHealth
+from .rules import judge_file, judge_following, verdict_of
 from .session_scan import SessionMeasures, SessionScan
 
 

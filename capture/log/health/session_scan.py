@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
 from ...robot.model import Robot
-from ..edit.joined import Finding, joined
+from ..edit.edited_log import Finding, joined
 from ..mcap.chunk import Buffer
+from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
-from ..messages.rosmsg import MessageType
-from ..messages.schemas import JOINT_STATE
+from .bus_tally import named_identifiers, undecoded
 from .channel_scan import ChannelScan, Limits, Series
 from .freeze import FreezeTally
-from .health import (
+from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
+from .rules import (
     judge_body,
     judge_bus,
     judge_channel,
@@ -33,10 +34,8 @@ from .health import (
     judge_topics,
     verdict_of,
 )
-from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
-from .source_health import SourceHealth, judge_source, measure_sources
+from .sources import SourceHealth, judge_source, measure_sources
 from .tallies import NS
-from .undecoded import named_identifiers, undecoded
 
 _MOST_PAIRS = 4096
 """Pairs of joint sets, measured and commanded, that are looked at for joints that stand still."""
@@ -169,7 +168,7 @@ class SessionScan:
             key: The channel.
             data: Bytes that hold their records.
             offsets: Where the records start, in the order of the session, shape (n,).
-            heads: The records' heads, of :data:`.capture.log.mcap.message_heads.HEAD`, shape (n,).
+            heads: The records' heads, of :data:`.capture.log.mcap.records.HEAD`, shape (n,).
         """
         self._scans[key].add(data, offsets, heads)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...common.arrays import IntArray, frozen
 from ...common.errors import DataError
-from .rosmsg import PRIMITIVES, Field, MessageType
+from .definitions import PRIMITIVES, Field, MessageType
 
 LITTLE_ENDIAN_HEADER = b"\x00\x01\x00\x00"
 """Encapsulation header of little-endian plain CDR."""

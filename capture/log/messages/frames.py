@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
 from .cdr import encode, layout_of
-from .schemas import message_type
+from .definitions import message_type
 
 FrameArray: TypeAlias = NDArray[np.void]
 """Array of records of :data:`FRAME_DTYPE`, or :data:`FD_FRAME_DTYPE` where it says so, (n,)."""

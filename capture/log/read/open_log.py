@@ -15,14 +15,14 @@ from ...common.errors import DataError, RobotFileError
 from ...robot.description import robot_in_session
 from ...robot.model import Robot
 from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
-from ..columns.batches import Window
+from ..columns.blocks import Window
 from ..columns.columns import Messages
-from ..columns.groups import Group
+from ..columns.layouts import Group
 from ..columns.topics import Topics
-from ..file.storage import LogFile
+from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
-from .joint_reader import JointReader
-from .own_times import StampClock
+from .joint_states import JointReader
+from .sample_times import StampClock
 from .signals import JointSignals
 
 

@@ -1,17 +1,418 @@
 """The session reader: any log to the contract, and any ROS 2 bag with JointStates, as columns.
 
-Opening reads the summary only; :mod:`.capture.log.read.view` has what is read then.
+Opening reads the summary only; :mod:`.capture.log.read.session` has what is read then.
+
+A session as its readers see it: all of an open one, a window of it, or with renamed topics.
+
+Columns are read when asked for, over a time window if given; whatever could not be read is said in
+``warnings``.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
 
-from ...common.threads import threads_or_default
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ...common.errors import MissingChannelError
+from ...common.process import threads_or_default
+from ...robot.model import Robot
+from ...robot.run import Run
+from ..columns.blocks import Window
+from ..columns.topics import Channel
+from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .open_log import OpenLog
-from .view import SessionView
+from .signals import JointSignals
+
+_NS = 1_000_000_000
+_NO_NAMES: Mapping[str, str] = MappingProxyType({})
+
+
+class SessionView:
+    """A session, or a view of it that reads through the same open file; see :meth:`view`.
+
+    Everything that reads a session takes either. Only the session itself can be closed.
+    """
+
+    def __init__(
+        self,
+        log: OpenLog,
+        *,
+        window_ns: Window = (None, None),
+        names: Mapping[str, str] = _NO_NAMES,
+        on_read: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Keep what is seen of a log; :meth:`.Session.open` and :meth:`view` call this.
+
+        Args:
+            log: The open log.
+            window_ns: Half-open window of what is read [Unix ns]; None for open ends.
+            names: Name of a topic to the name that it was logged by, where these differ.
+            on_read: Called before each read.
+        """
+        self._log = log
+        self._window_ns = window_ns
+        self._names = names
+        self._on_read = on_read
+
+    def view(
+        self,
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+        rename: Mapping[str, str] = _NO_NAMES,
+        on_read: Callable[[], None] | None = None,
+    ) -> SessionView:
+        """Look at the session through a time window, with other topic names, or until stopped.
+
+        Nothing is read or copied by this. A view of a view narrows it further.
+
+        Args:
+            start_ns: First time that is read [Unix ns]; None for the session's start.
+            stop_ns: One past the last time that is read [Unix ns]; None for the end.
+            rename: Name in the view to the topic that it stands for. Other topics that have one
+                of these names are left out of the view.
+            on_read: Called before each read and each message, and free to raise, e.g. where a
+                stop was requested.
+
+        Returns:
+            The view, usable as long as the session is open. Signals are limited by their sampling
+            times; tables, messages and frames by their log times. The numbers of messages in
+            :attr:`channels` stay those of the whole session.
+
+        Raises:
+            MissingChannelError: If a topic that is to be renamed isn't in the session.
+        """
+        for topic in rename.values():
+            if topic not in self.channels:
+                raise MissingChannelError(self.path, topic, sorted(self.channels))
+        renamed = {name: self._logged(topic) for name, topic in rename.items()}
+        return SessionView(
+            self._log,
+            window_ns=self._within(start_ns, stop_ns),
+            names={**self._names, **renamed},
+            on_read=on_read or self._on_read,
+        )
+
+    def forget(self) -> None:
+        """Let go of the memory of what was read so far.
+
+        For who goes through a long session stretch by stretch: the pages of a mapped file count as
+        this process's memory as long as they are. What is read next is the same. Columns that lie
+        in files are let go of, too, and keep their values; those in memory stay.
+        """
+        self._on_read()
+        self._log.file.forget()
+
+    # -- facts -----------------------------------------------------------------------------
+
+    @property
+    def path(self) -> Path:
+        """The file, or the folder of a split session."""
+        return self._log.path
+
+    @property
+    def channels(self) -> Mapping[str, Channel]:
+        """Topic to channel."""
+        logged = self._log.topics.channels
+        if not self._names:
+            return logged
+        away = {*self._names, *self._names.values()}
+        found = {name: replace(logged[topic], topic=name) for name, topic in self._names.items()}
+        found |= {topic: channel for topic, channel in logged.items() if topic not in away}
+        return MappingProxyType(found)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that are read, in order: one, or the parts of a split session."""
+        return tuple(file.path for file in self._log.file.files)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing or doubtful, one sentence each; grows while columns are read."""
+        return list(self._log.warnings)
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of the first message [Unix ns]; 0 where there is none."""
+        start_ns = self._window_ns[0]
+        first_ns = self._log.file.limits[0]
+        return first_ns if start_ns is None else max(first_ns, start_ns)
+
+    @property
+    def end_ns(self) -> int:
+        """Log time of the last message [Unix ns], or the window's end; 0 where there is none."""
+        stop_ns = self._window_ns[1]
+        last_ns = self._log.file.limits[1]
+        return last_ns if stop_ns is None else min(last_ns, stop_ns)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return (self.end_ns - self.start_ns) / _NS
+
+    @property
+    def chunk_times_ns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """First and last log time of each chunk [Unix ns], as it states them, shape (n,) each."""
+        return self._log.file.spans
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """The file's metadata records; ``undulog`` holds session id, epoch and versions."""
+        return MappingProxyType(self._log.file.metadata)
+
+    @property
+    def attachments(self) -> Mapping[str, bytes]:
+        """Attached files, e.g. ``robot.toml``, by name."""
+        stored = self._log.file.attachments
+        return MappingProxyType({name: item.data for name, item in stored.items()})
+
+    @property
+    def session_id(self) -> str:
+        """The session's id, or the file's name for a log that has none."""
+        return self._log.file.metadata.get("undulog", {}).get("session_id") or self.path.stem
+
+    @property
+    def settle_s(self) -> float | None:
+        """The first part that is not fit for steady-state analysis [s], None if it doesn't say."""
+        stated = self._log.file.metadata.get("undulog", {}).get("settle_s", "")
+        try:
+            seconds = float(stated)
+        except ValueError:
+            return None
+        return seconds if 0.0 <= seconds < math.inf else None
+
+    @property
+    def robot(self) -> Robot | None:
+        """The robot whose description is attached, or None."""
+        return self._log.robot
+
+    @property
+    def run(self) -> Run | None:
+        """What a twin ran: its servos, contact and physics rate; None of any other session."""
+        return self._log.run
+
+    @property
+    def robot_as_run(self) -> Robot | None:
+        """The robot with the servos and masses that a twin ran with; else as described."""
+        if self.robot is None or self.run is None:
+            return self.robot
+        return self.robot.with_modules(self.run.servo_of, self.run.mass_factor)
+
+    @property
+    def verdict(self) -> str | None:
+        """The recorder's final health verdict, or None."""
+        return self._log.file.metadata.get("undulog.health", {}).get("verdict")
+
+    @property
+    def library(self) -> str:
+        """The library that wrote the file."""
+        return self._log.file.library
+
+    @property
+    def profile(self) -> str:
+        """The MCAP profile, ``ros2`` for a log to the contract."""
+        return self._log.file.profile
+
+    # -- columns ---------------------------------------------------------------------------
+
+    def joints(
+        self,
+        topic: str,
+        field: str = "position",
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> JointSignals:
+        """One quantity of all joints of a JointState topic.
+
+        Args:
+            topic: E.g. ``/joint_states``.
+            field: ``position``, ``velocity`` or ``effort``.
+            start_ns: First sampling time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
+
+        Returns:
+            The samples, in the robot's chain order where the session has a robot, at their own
+            sampling times: header.stamp plus the logged sample offset.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If the topic is not of JointStates or the field is none of the three.
+        """
+        return self.joint_columns({topic: [field]}, start_ns=start_ns, stop_ns=stop_ns)[
+            topic, field
+        ]
+
+    def joint_columns(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> dict[tuple[str, str], JointSignals]:
+        """Several quantities in one pass over the file.
+
+        Args:
+            wanted: Topic to fields, e.g. ``{"/joint_states": ["position", "velocity"]}``.
+            start_ns: First sampling time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
+
+        Returns:
+            (topic, field) to samples, as :meth:`joints` gives them.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If a topic is not of JointStates or a field is none of the three.
+        """
+        self._on_read()
+        logged: dict[str, list[str]] = {}
+        for topic, fields in wanted.items():
+            logged.setdefault(self._logged(topic), []).extend(fields)
+        found = self._log.joints(logged, self._within(start_ns, stop_ns))
+        return {
+            (topic, field): found[self._logged(topic), field]
+            for topic, fields in wanted.items()
+            for field in fields
+        }
+
+    def table(
+        self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> pd.DataFrame:
+        """All numbers and strings of a topic, one row a message.
+
+        Args:
+            topic: Any topic whose type has a ``ros2msg`` schema.
+            start_ns: First log time wanted [Unix ns]; None for the session's start.
+            stop_ns: One past the last log time wanted [Unix ns]; None for the end.
+
+        Returns:
+            Index ``t_ns``: header.stamp [Unix ns] on the log's clock, or the log time where the
+            type has none or the stamp is zero.
+            Columns by field path, e.g. ``pose.pose.position.x`` or ``position[3]``, units as the
+            message type has them.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If its type can't be read.
+        """
+        return self._tables({topic: None}, (start_ns, stop_ns))[topic]
+
+    def columns(
+        self,
+        joints: Mapping[str, Sequence[str]],
+        tables: Mapping[str, Sequence[str] | None],
+    ) -> tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]:
+        """Joint signals and tables of all of the session, in one pass over the file.
+
+        Args:
+            joints: JointState topic to fields, as for :meth:`joint_columns`.
+            tables: Topic to field paths, e.g. ``{"/sonar": ["range"]}``; None for all of a topic.
+
+        Returns:
+            (topic, field) to signals as :meth:`joints` gives them, and topic to table as
+            :meth:`table` gives it.
+
+        Raises:
+            MissingChannelError: If the session has no such topic, or it never carries the field.
+            DataError: If a topic can't be read as asked, or is asked for both ways.
+        """
+        if self._names or self._window_ns != (None, None):
+            # A window of sampling times isn't one of log times: two passes.
+            return self.joint_columns(joints) if joints else {}, self._tables(tables, (None, None))
+        self._on_read()
+        return self._log.columns(joints, tables)
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Decode a topic message by message, for types of any shape (slow).
+
+        Args:
+            topic: Any topic with a ``ros2msg`` schema.
+
+        Yields:
+            Log time [Unix ns] and the decoded message, fields as attributes.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a message can't be decoded.
+        """
+        topics, logged = self._log.topics, self._logged(topic)
+        decode = topics.decoder(logged)
+        for log_ns, message in topics.raw(logged, self._window_ns):
+            self._on_read()
+            yield log_ns, decode(message)
+
+    def frames(
+        self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> FrameArray:
+        """Raw CAN frames of a bus, in the order they were logged.
+
+        Args:
+            topic: E.g. ``/can/can0``.
+            start_ns: First log time of a message of frames wanted [Unix ns]; None for the
+                session's start.
+            stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
+
+        Returns:
+            Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If the topic holds something else.
+        """
+        return self._frames(topic, (start_ns, stop_ns), FRAME_DTYPE, FRAME_LAYOUT)
+
+    def fd_frames(
+        self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> FrameArray:
+        """Raw CAN FD frames of a bus, in the order they were logged.
+
+        Args:
+            topic: E.g. ``/can_fd/can0``.
+            start_ns: First log time of a message of frames wanted [Unix ns]; None for the
+                session's start.
+            stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
+
+        Returns:
+            Records of :data:`.capture.log.messages.frames.FD_FRAME_DTYPE`, shape (n,).
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If the topic holds something else.
+        """
+        return self._frames(topic, (start_ns, stop_ns), FD_FRAME_DTYPE, FD_FRAME_LAYOUT)
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _tables(
+        self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window
+    ) -> dict[str, pd.DataFrame]:
+        self._on_read()
+        logged = {self._logged(topic): paths for topic, paths in wanted.items()}
+        found = self._log.tables(logged, self._within(*window_ns))
+        return {topic: found[self._logged(topic)] for topic in wanted}
+
+    def _frames(
+        self, topic: str, window_ns: Window, dtype: np.dtype[np.void], label: str
+    ) -> FrameArray:
+        self._on_read()
+        return self._log.frames(self._logged(topic), self._within(*window_ns), dtype, label)
+
+    def _logged(self, topic: str) -> str:
+        return self._names.get(topic, topic)
+
+    def _within(self, start_ns: int | None, stop_ns: int | None) -> Window:
+        """The part of a window that the view sees."""
+        starts = [one for one in (start_ns, self._window_ns[0]) if one is not None]
+        stops = [one for one in (stop_ns, self._window_ns[1]) if one is not None]
+        return max(starts, default=None), min(stops, default=None)
 
 
 class Session(SessionView):

@@ -14,11 +14,10 @@ from queue import SimpleQueue
 from mcap.records import Metadata
 
 from ...common.errors import LogWriteError, OutputExistsError
-from ..file.part_files import PART_RECORD
-from ..mcap.mcap_writer import McapWriter
-from ..wal.ballast import FULL, Ballast
-from ..wal.wal import WriteAheadLog
-from ..wal.wal_segment import sync_folder
+from ..file.parts import PART_RECORD
+from ..mcap.writer import McapWriter
+from ..wal.segment import FULL, Ballast, sync_folder
+from ..wal.writer import WriteAheadLog
 from .mcap_sink import write_description, write_error
 
 

@@ -14,14 +14,19 @@ from pathlib import Path
 from mcap.records import Header, Metadata
 
 from ...common.errors import DataError, LogWriteError, OutputExistsError, UndulogError
-from ..file.part_files import PART_RECORD, later_parts, part_path
-from ..mcap.mcap_writer import McapWriter
-from ..wal.ballast import Ballast
-from ..wal.wal import WriteAheadLog, wal_folder
-from .chunk_groups import chunk_group
+from ..file.parts import PART_RECORD, later_parts, part_path
+from ..mcap.writer import McapWriter
+from ..wal.segment import Ballast
+from ..wal.writer import WriteAheadLog, wal_folder
 from .disk_thread import DiskThread, FileDeletedError, PartStream
-from .mcap_sink import PROFILE, library_name, write_description, write_error
-from .sink import Description
+from .mcap_sink import (
+    PROFILE,
+    Description,
+    chunk_group,
+    library_name,
+    write_description,
+    write_error,
+)
 
 CHUNK_SIZE = 1 << 19
 """Bytes of messages in a chunk: as small as costs nothing in compression, since one is compressed

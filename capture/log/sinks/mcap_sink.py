@@ -1,18 +1,94 @@
-"""A session file without a write-ahead log: for what can be made again (twin, imports)."""
+"""A session file without a write-ahead log: for what can be made again (twin, imports).
+
+Which channels of a session share chunks.
+
+The topics that carry nearly all of a session's bytes have chunks of their own: to read the joint
+states of ten seconds, nothing else is decompressed, and messages of one type side by side compress
+better. The rest is so little that it shares chunks: each on its own, it would be written in crumbs.
+"""
 
 from __future__ import annotations
 
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol, TypeAlias
 
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from ...common.errors import DataError, LogWriteError, OutputExistsError
-from ..mcap.mcap_writer import McapWriter
-from .chunk_groups import chunk_group
-from .sink import Description
+from ..mcap.writer import McapWriter
+
+_BULKY = frozenset(
+    {"sensor_msgs/msg/JointState", "std_msgs/msg/UInt8MultiArray", "tf2_msgs/msg/TFMessage"}
+)
+
+
+def chunk_group(topic: str, type_name: str) -> str:
+    """The group of a channel; those of one group share chunks.
+
+    Args:
+        topic: Its topic.
+        type_name: Its message type, e.g. ``sensor_msgs/msg/Imu``.
+
+    Returns:
+        A name; empty for the channels that share what is left.
+    """
+    return topic if type_name in _BULKY else ""
+
+
+Description: TypeAlias = Schema | Channel | Attachment | Metadata
+"""What explains the messages: it comes before them."""
+
+
+class MessageSink(Protocol):
+    """Takes what a session writer encodes, in order; one thread calls it."""
+
+    def define(self, record: Description) -> None:
+        """Take what explains later messages.
+
+        Args:
+            record: Schemas before their channels, channels before their messages; the ids are
+                given by the session writer, from 1.
+
+        Raises:
+            LogWriteError: If it can't be kept.
+        """
+        ...
+
+    def write(
+        self,
+        channel_id: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int,
+        payload: bytes,
+    ) -> None:
+        """Take one message.
+
+        Args:
+            channel_id: Its channel.
+            log_time_ns: When it was recorded [Unix ns].
+            publish_time_ns: When it was sampled [Unix ns].
+            sequence: The channel's own counter.
+            payload: Its bytes.
+
+        Raises:
+            LogWriteError: If it can't be kept; it is not in the log then.
+        """
+        ...
+
+    def close(self, last: tuple[Metadata, ...]) -> None:
+        """Finalise; safe to call twice.
+
+        Args:
+            last: Metadata that belong at the end, e.g. the health verdict.
+
+        Raises:
+            LogWriteError: If it can't be finalised.
+        """
+        ...
+
 
 PROFILE = "ros2"
 """MCAP profile of a log to the contract."""

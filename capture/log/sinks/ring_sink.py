@@ -22,9 +22,8 @@ from typing import NamedTuple
 from mcap.records import Channel, Metadata, Schema
 
 from ...common.errors import LogWriteError, UndulogError
-from ..messages.topics import adds_up, is_latched
-from .mcap_sink import McapSink, write_error
-from .sink import Description, MessageSink
+from ..messages.definitions import adds_up, is_latched
+from .mcap_sink import Description, McapSink, MessageSink, write_error
 
 MARK_RECORD = "undulog.mark"
 """Metadata record of a mark: which, when, why, and what it lacks."""

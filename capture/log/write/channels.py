@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...common.arrays import FloatArray
 from ...common.errors import DataError
 from ..messages.cdr import Leaf, encode
+from ..messages.definitions import DiagnosticStatus, message_type
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -25,7 +26,6 @@ from ..messages.frames import (
     FrameArray,
     frame_message,
 )
-from ..messages.schemas import message_type
 
 Send = Callable[[int, int, bytes], None]
 """Writes one message: log time [ns], publish time [ns], bytes."""
@@ -371,3 +371,68 @@ class FrameChannel:
         if frames.dtype != self._dtype:
             raise DataError(f"frames have the layout {frames.dtype}, not {self._dtype}")
         self._send(t_ns, t_ns, frame_message(frames, self._layout, self._dtype))
+
+
+class TimeReferenceChannel:
+    """A device's clock against the host's."""
+
+    def __init__(self, template: Template) -> None:
+        """Wrap a template."""
+        self._template = template
+        self._stamps = (template.leaves["header.stamp.sec"].offset,)
+        self._reference = template.leaves["time_ref.sec"].offset
+
+    def write(self, t_host_ns: int, t_device_ns: int, *, log_time_ns: int | None = None) -> None:
+        """Write one pair of times.
+
+        Args:
+            t_host_ns: Host time [Unix ns].
+            t_device_ns: The device's own time at that moment [ns since its own epoch]; 0 to
+                2**31 s.
+            log_time_ns: Time of recording [Unix ns]; the host time if None.
+
+        Raises:
+            DataError: If the message can't hold the device's time.
+            LogWriteError: If the file can't be written.
+        """
+        try:
+            _TIME.pack_into(self._template.message, self._reference, *divmod(t_device_ns, _NS))
+        except struct.error as error:
+            raise DataError(
+                f"a device time of {t_device_ns} ns doesn't fit 32 bits of s"
+            ) from error
+        self._template.emit(t_host_ns, log_time_ns, self._stamps)
+
+
+class DiagnosticsChannel:
+    """The states of the recorder's components."""
+
+    def __init__(self, send: Send) -> None:
+        """Wrap what writes a message."""
+        self._send = send
+
+    def write(self, t_ns: int, statuses: Sequence[DiagnosticStatus]) -> None:
+        """Write the states of one moment.
+
+        Args:
+            t_ns: When [Unix ns].
+            statuses: One a component.
+
+        Raises:
+            LogWriteError: If the file can't be written.
+        """
+        seconds, nanoseconds = divmod(t_ns, _NS)
+        values = {
+            "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}},
+            "status": [
+                {
+                    "level": status.level,
+                    "name": status.name,
+                    "message": status.message,
+                    "hardware_id": status.hardware_id,
+                    "values": [{"key": k, "value": v} for k, v in status.values.items()],
+                }
+                for status in statuses
+            ],
+        }
+        self._send(t_ns, t_ns, encode(message_type("diagnostic_msgs/msg/DiagnosticArray"), values))

@@ -13,18 +13,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from undulog.analysis.compare.differences import from_runs
-from undulog.analysis.compare.side import PHASES, cycles_by_phase, phases_rad
+from undulog.analysis.compare.side import PHASES, cycles_by_phase, from_runs, phases_rad
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series, clean
-from undulog.analysis.response.gait import allowed_model
+from undulog.analysis.response.rhythm import allowed_model
 from undulog.analysis.results.analysis import Analysis
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.robot.kinematics import link_poses
 from undulog.capture.robot.model import Robot
 
-from ...content.entities import Places
+from ...samples.content import Places
 from ...samples.sampling import interpolate
 from ...samples.timeline import Rhythm
 from ...samples.tracks import Track

@@ -20,7 +20,7 @@ from undulog.analysis.results.formats import number
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 
-from ...content.entities import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
+from ...samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
 from ...samples.timeline import Clock
 from ..scene.body import power_colors
 from .steps import cycle_times_ns, mean_power, together

@@ -21,7 +21,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Robot
 
-from ...content.entities import GREY, Color, MeanCycle, Places, Series
+from ...samples.content import GREY, Color, MeanCycle, Places, Series
 from ...samples.quantities import mechanical_power, segment_power
 from ...samples.timeline import ENSEMBLE_CYCLE, Clock
 from ...samples.tracks import Track, read_columns

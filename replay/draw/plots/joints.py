@@ -18,7 +18,7 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane, Robot
 
-from ...content.entities import GREY, SCALARS, TOTAL, Color, Places, Series
+from ...samples.content import GREY, SCALARS, TOTAL, Color, Places, Series
 from ...samples.sampling import mark_gaps, rounded
 from ...samples.timeline import Clock
 from ...samples.tracks import Table, Track, tables

@@ -2,22 +2,278 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
+from rerun.components import FillMode
 
 from undulog.capture import SessionView
-from undulog.capture.robot.model import Robot
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.strict_table import Faults, Table, read_toml
+from undulog.capture.robot.model import Robot, Sensor, SensorKind
+from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
+from undulog.sim.scenario.world import World, read_world
 
-from ...content.entities import Color, Places
+from ...samples.content import Color, Places
 from ...samples.quantities import mechanical_power
-from ...samples.stretches import Span, Stretch
-from ...samples.timeline import Clock
-from . import body, markers, ranges
-from . import markers as marks
-from .motion import HeadPath, assemble, frames_of
-from .surroundings import log_surroundings, log_trail, world_of
+from ...samples.sampling import decimate, gaps, hold, ordered
+from ...samples.timeline import Clock, Span, Stretch
+from . import body
+from . import body as markers
+from . import body as marks
+from .body import ROUNDING, rounded_to
+from .motion import HeadPath, Motion, assemble, frames_of
+
+RANGES = "/world/snake/ranges"
+
+_AT_ONCE = 4
+"""Sensors that are read in one pass over the file: an hour of each takes memory."""
+_RANGE_COLOR = (232, 214, 130, 255)
+
+
+def rays(
+    robot: Robot,
+    sensors: tuple[Sensor, ...],
+    centre: FloatArray,
+    rotation: FloatArray,
+    reading: FloatArray | NDArray[np.float32],
+) -> tuple[FloatArray, FloatArray]:
+    """From each range sensor to what it sees.
+
+    Args:
+        robot: The robot, m joints.
+        sensors: The sensors, k of them; rays leave along their x axes.
+        centre: Link centres [m], shape (n, m + 1, 3).
+        rotation: Link orientations, shape (n, m + 1, 3, 3).
+        reading: Distances [m], shape (n, k); infinite, NaN or at the sensor's limit where
+            nothing is seen.
+
+    Returns:
+        Origins and vectors [m], each of shape (n, k, 3); vectors NaN where nothing is seen.
+    """
+    names = [link.name for link in robot.links]
+    carrier = [names.index(sensor.link) for sensor in sensors]
+    mount = np.array([sensor.position for sensor in sensors])
+    _, pitch, yaw = np.array([sensor.rpy for sensor in sensors]).T
+    # The x axis of Rz(yaw) Ry(pitch) Rx(roll).
+    axis = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)], -1)
+    limit = np.array([np.inf if s.range_max is None else s.range_max for s in sensors])
+    seen = np.where(reading < limit, reading, np.nan)
+    turn = rotation[:, carrier]
+    origin = centre[:, carrier] + np.einsum("nkij,kj->nki", turn, mount)
+    return origin, seen[..., None] * np.einsum("nkij,kj->nki", turn, axis)
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What the distance sensors said at the times at which they are drawn.
+
+    Attributes:
+        sensors: The sensors, k of them.
+        distance: The last reading at each time, held until the next [m], shape (n, k).
+    """
+
+    sensors: tuple[Sensor, ...]
+    distance: NDArray[np.float32]
+
+
+def read_ranges(session: SessionView, robot: Robot, at_ns: IntArray) -> Readings:
+    """Read all distance sensors.
+
+    Args:
+        session: The session.
+        robot: The robot.
+        at_ns: When they are drawn [ns], shape (n,).
+
+    Returns:
+        The readings; without sensors where none was logged.
+    """
+    sensors = tuple(one for one in range_sensors(robot) if one.topic in session.channels)
+    distance = np.full((at_ns.size, len(sensors)), np.nan, dtype=np.float32)
+    for first in range(0, len(sensors), _AT_ONCE):
+        some = sensors[first : first + _AT_ONCE]
+        tables = session.columns({}, {sensor.topic: ["range"] for sensor in some})[1]
+        for i, sensor in enumerate(some, start=first):
+            table = tables.pop(sensor.topic)
+            t_ns, values = table.index.to_numpy(dtype=np.int64), table["range"].to_numpy(np.float64)
+            distance[:, i] = hold(*ordered(t_ns, values), at_ns)
+        session.forget()
+    return Readings(sensors, distance)
+
+
+def range_sensors(robot: Robot) -> tuple[Sensor, ...]:
+    """The robot's distance sensors.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Infrared and ultrasound, in the robot's order.
+    """
+    kinds = (SensorKind.IR, SensorKind.SONAR)
+    return tuple(sensor for sensor in robot.sensors if sensor.kind in kinds)
+
+
+def log_rays(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    motion: Motion,
+    chosen: IntArray,
+    *,
+    sensors: tuple[Sensor, ...],
+    reading: FloatArray | NDArray[np.float32],
+) -> None:
+    """Draw what distance sensors see.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        motion: What moved.
+        chosen: Which of its drawing times, shape (n,).
+        sensors: The sensors, k of them.
+        reading: Distances at those times [m], shape (n, k); NaN where there is none.
+    """
+    t_ns = motion.t_ns[chosen]
+    look = rr.Arrows3D.from_fields(colors=_RANGE_COLOR, radii=rr.Radius.ui_points(1.0))
+    rec.log(RANGES, look, static=True)
+    for part, times in clock.rows(t_ns):
+        origin, vector = rays(motion.robot, sensors, *motion.links(chosen[part]), reading[part])
+        known = np.isfinite(origin).all(axis=-1) & np.isfinite(vector).all(axis=-1)
+        columns = rr.Arrows3D.columns(
+            origins=rounded_to(origin[known], ROUNDING),
+            vectors=rounded_to(vector[known], ROUNDING),
+        ).partition(np.count_nonzero(known, axis=1))
+        rec.send_columns(RANGES, times, columns)
+
+
+TRAIL = "/world/trail"
+TRAIL_RATE_HZ = 10.0
+TRAIL_SECONDS = 20.0
+
+_COLOR = (104, 108, 128, 255)
+_WHOLE = Span()
+
+
+def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDArray[np.float32]]:
+    """Straight pieces between successive head positions.
+
+    Args:
+        t_ns: Times [ns], ascending, shape (n,).
+        position: Head positions [m], shape (n, 3).
+
+    Returns:
+        Times at which the pieces end [ns], shape (k,), and pieces, shape (k, 2, 3); none across
+        a gap.
+    """
+    pieces = np.stack([position[:-1], position[1:]], axis=1).astype(np.float32)
+    whole = ~gaps(t_ns) & np.isfinite(pieces).all(axis=(1, 2))
+    return t_ns[1:][whole], pieces[whole]
+
+
+def log_trail(rec: rr.RecordingStream, clock: Clock, head: HeadPath, span: Span = _WHOLE) -> None:
+    """Draw the head's path; the view shows its last 20 s.
+
+    Args:
+        rec: The recording.
+        clock: Its timelines.
+        head: The head's path.
+        span: The part that is drawn.
+    """
+    chosen = decimate(head.t_ns, TRAIL_RATE_HZ)
+    t_ns, pieces = trail_segments(head.t_ns[chosen], head.position[chosen])
+    part = span.rows(t_ns)
+    t_ns, pieces = t_ns[part], pieces[part]
+    look = rr.LineStrips3D.from_fields(colors=_COLOR, radii=rr.Radius.ui_points(1.0))
+    rec.log(TRAIL, look, static=True)
+    for rows, times in clock.rows(t_ns):
+        rec.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces[rows]))
+
+
+CYLINDERS = "/world/obstacles/cylinders"
+BOXES = "/world/obstacles/boxes"
+TARGET = "/world/target"
+
+_STONE = (120, 126, 134, 255)
+_GOAL = (92, 200, 120, 255)
+_RIM_SIDES = 64
+
+
+def world_of(session: SessionView, warnings: list[str]) -> World | None:
+    """The world that the session's scenario describes.
+
+    Args:
+        session: The session, open.
+        warnings: Extended by what can't be read.
+
+    Returns:
+        The world; None where the session is of no twin, or its scenario can't be read.
+    """
+    data = session.attachments.get("scenario.toml")
+    if data is None:
+        return None
+    try:
+        values: dict[str, Any] = read_toml(data.decode())
+    except ValueError as error:
+        warnings.append(f"the attached scenario can't be read, obstacles are not drawn: {error}")
+        return None
+    faults = Faults()
+    world = read_world(Table(values, "", faults).table("world"), None, 0)
+    if found := faults.all():
+        reason = "; ".join(map(str, found))
+        warnings.append(f"the attached scenario has faults, obstacles are not drawn: {reason}")
+        return None
+    return world
+
+
+def log_surroundings(rec: rr.RecordingStream, world: World) -> None:
+    """Draw what does not move.
+
+    Args:
+        rec: The recording.
+        world: The world.
+    """
+    cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
+    boxes = [_box(one) for one in world.obstacles if not isinstance(one, Cylinder)]
+    if cylinders:
+        shapes = rr.Cylinders3D(
+            lengths=[one.height for one in cylinders],
+            radii=[one.radius for one in cylinders],
+            centers=[(*one.position, one.height / 2) for one in cylinders],
+            colors=[_STONE],
+            fill_mode=FillMode.Solid,
+        )
+        rec.log(CYLINDERS, shapes, static=True)
+    if boxes:
+        shapes = rr.Boxes3D(
+            sizes=[(*one.size, one.height) for one in boxes],
+            centers=[(*one.position, one.height / 2) for one in boxes],
+            quaternions=[
+                (0.0, 0.0, math.sin(one.heading / 2), math.cos(one.heading / 2)) for one in boxes
+            ],
+            colors=[_STONE],
+            fill_mode=FillMode.Solid,
+        )
+        rec.log(BOXES, shapes, static=True)
+    if world.target is not None:
+        rec.log(TARGET, _rim(world.target), static=True)
+
+
+def _box(obstacle: Obstacle) -> Box:
+    assert not isinstance(obstacle, Cylinder)  # noqa: S101 - the caller sorted them
+    return obstacle.box if isinstance(obstacle, Wall) else obstacle
+
+
+def _rim(target: Target) -> rr.LineStrips3D:
+    """The edge of the target on the ground."""
+    (x, y), r = target.position, target.radius
+    turns = [2 * math.pi * k / _RIM_SIDES for k in range(_RIM_SIDES + 1)]
+    rim = [(x + r * math.cos(turn), y + r * math.sin(turn), 0.002) for turn in turns]
+    return rr.LineStrips3D([rim], colors=[_GOAL], radii=[0.01], labels=["target"])
 
 
 class Scene:
@@ -58,7 +314,7 @@ class Scene:
         self._frames = frames_of(head, session.end_ns)
         self._sparse = np.flatnonzero(self._frames.sparse)
         at_ns = self._frames.head.t_ns[self._sparse]
-        self._readings = ranges.read_ranges(session, robot, at_ns)
+        self._readings = read_ranges(session, robot, at_ns)
         rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         world = world_of(session, warnings)
         if world is not None:
@@ -89,7 +345,7 @@ class Scene:
         body.log_ghost(self._rec, self._clock, motion, sparse)
         if self._readings.sensors:
             own = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
-            ranges.log_rays(
+            log_rays(
                 self._rec,
                 self._clock,
                 motion,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from support import planted_artefacts, twin_chains
-from undulog.analysis.signals.reading import read_columns
+from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session
 from undulog.sim import load_scenario
 from undulog.sim.twin.recording import record

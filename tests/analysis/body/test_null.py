@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
+from undulog.analysis.body.motion import observed, perfect_tracking, place_links, track
 from undulog.analysis.body.null import SAMPLES, Chain, free_chain, one_cycle, places, viscous_chain
-from undulog.analysis.body.places import observed, perfect_tracking, place_links, track
 from undulog.analysis.estimators.series import Series
 from undulog.capture import load_robot
 from undulog.capture.robot.kinematics import quaternion_from_rotation

@@ -4,9 +4,8 @@ import contrast_tables
 import numpy as np
 import pytest
 
-from undulog.analysis.estimators.contrasts import contrast_variance, response_errors
-from undulog.analysis.estimators.harmonic import fit_at
-from undulog.analysis.estimators.harmonic_moments import HarmonicModel
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
+from undulog.analysis.estimators.intervals import contrast_variance, response_errors
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import residual_noise, residual_spectrum
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from undulog.analysis.estimators.cycle_sums import cycle_sums, starts_of
-from undulog.analysis.estimators.harmonic_moments import cos_sin
+from undulog.analysis.estimators.harmonic import cos_sin
 
 
 def test_sums_of_each_cycle_empty_ones_too():

@@ -7,8 +7,8 @@ from scipy.signal import lfilter
 from undulog.analysis.estimators.demodulation import Phase, cycles_of, demodulate
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.session.demodulation_session import response_over_time
-from undulog.analysis.signals.reading import read_columns
+from undulog.analysis.session.over_time import response_over_time
+from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session, SessionWriter
 
 T = np.arange(6000) / 100

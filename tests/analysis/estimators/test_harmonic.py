@@ -5,8 +5,7 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.signal import lfilter
 
-from undulog.analysis.estimators.harmonic import fit_at, fit_shared
-from undulog.analysis.estimators.harmonic_moments import HarmonicModel
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at, fit_shared
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series, clean
 from undulog.analysis.estimators.spectrum import Noise, omega_variance, residual_noise
@@ -206,7 +205,7 @@ def test_chunks_do_not_change_the_answer(monkeypatch):
     series = [Series("q", t, np.cos(3 * t) + rng.normal(0, 0.1, 3000)) for _ in range(2)]
     whole = fit_shared(series, 3.01)
     level = residual_noise(series, whole).level
-    monkeypatch.setattr("undulog.analysis.estimators.harmonic_moments.CHUNK", 700)
+    monkeypatch.setattr("undulog.analysis.estimators.harmonic.CHUNK", 700)
     cut = fit_shared(series, 3.01)
     assert cut.omega == pytest.approx(whole.omega, abs=1e-12)
     np.testing.assert_allclose(residual_noise(series, cut).level, level, rtol=1e-9)

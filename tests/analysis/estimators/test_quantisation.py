@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from undulog.analysis.estimators.contrasts import (
+from undulog.analysis.estimators.harmonic import fit_at
+from undulog.analysis.estimators.intervals import (
     contrast_variance,
     lag_contrast_variance,
     response_errors,
 )
-from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.quantisation import lattice_step
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import ResidualBins, residual_spectrum

@@ -10,7 +10,7 @@ import pytest
 
 import undulog
 from support.analysed import experiment
-from undulog.analysis.present.text.experiment import render_experiment
+from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.session.runs import mirror_fault
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.errors import UsageError

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.analysis.plan.body_modes import slowest_mode, transverse_mass
 from undulog.analysis.plan.designs import tones
+from undulog.analysis.plan.gait_base import slowest_mode, transverse_mass
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 

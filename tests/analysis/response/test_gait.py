@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from undulog.analysis.estimators.cycle_sums import worst_drift
 from undulog.analysis.estimators.harmonic import fit_at, fit_shared
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.estimators.settling import worst_drift
 from undulog.analysis.response.fitting import fit_gait
-from undulog.analysis.response.gait import driven, find_rhythm, phase_step, wave_name
+from undulog.analysis.response.rhythm import driven, find_rhythm, phase_step, wave_name
 from undulog.analysis.signals.windows import Stretch, covered, settled, steady_runs, whole_cycles
 
 

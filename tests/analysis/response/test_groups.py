@@ -4,8 +4,7 @@ import group_tables
 import numpy as np
 import pytest
 
-from undulog.analysis.estimators.harmonic import fit_at
-from undulog.analysis.estimators.harmonic_moments import HarmonicModel
+from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import residual_noise

@@ -7,7 +7,7 @@ import pytest
 
 import undulog
 from undulog.analysis import analyse_session
-from undulog.analysis.results.remarks import Lacking, Note, Remarks
+from undulog.analysis.results.answer import Lacking, Note, Remarks
 from undulog.capture import Session, SessionWriter
 
 NAMES = tuple(f"j{k}" for k in range(8))

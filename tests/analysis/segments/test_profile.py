@@ -5,9 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from undulog.analysis.segments.family import Member, Scatter, critical_value
 from undulog.analysis.segments.outliers import standing_out
-from undulog.analysis.segments.profile import Profile, contrasts, family_of
+from undulog.analysis.segments.profile import (
+    Member,
+    Profile,
+    Scatter,
+    contrasts,
+    critical_value,
+    family_of,
+)
 
 SIGMA, COLUMNS = 1e-3, 24
 

@@ -5,8 +5,8 @@ import pytest
 
 from undulog.analysis.estimators.intervals import welch_satterthwaite
 from undulog.analysis.response.response import Response
-from undulog.analysis.session.coupling_of_one_gait import one_gait_coupling
 from undulog.analysis.session.heterogeneity import energy_indices, gini, response_indices, spread
+from undulog.analysis.session.runs import one_gait_coupling
 
 BINS = 10
 

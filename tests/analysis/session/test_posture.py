@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from undulog.analysis.results.analysis import Window
-from undulog.analysis.session.posture import posture
+from undulog.analysis.session.runs import posture
 from undulog.capture import Session, SessionWriter, load_robot
 
 EPOCH_NS = 1_735_689_600_000_000_000

@@ -11,7 +11,7 @@ from support.paths import DOCS
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
 from undulog.sim import load_scenario, scenario_names
-from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.twin.recording import record
 
 STEADY = [

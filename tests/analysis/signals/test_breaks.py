@@ -12,7 +12,7 @@ from undulog.analysis import analyse_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.following.session import faults_in_session
-from undulog.capture.log.read.unbroken import BREAK_S, longest_unbroken
+from undulog.capture.log.read.sample_times import BREAK_S, longest_unbroken
 
 NS = 1_000_000_000
 HOUR = 3600 * NS

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undulog.capture import load_robot
-from undulog.capture.bus.bit_field import BitField
 from undulog.capture.bus.decoding import BusDecoder
+from undulog.capture.bus.map_entry import BitField
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.messages.frames import (
     DIR_RX,
@@ -23,8 +23,8 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
+from undulog.capture.robot.bus_map import UNITS
 from undulog.capture.robot.description import parse_robot
-from undulog.capture.robot.units import UNITS
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undulog.capture import load_robot
-from undulog.capture.bus.bit_field import BitField
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
+from undulog.capture.bus.map_entry import BitField
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.capture.robot.description import parse_robot

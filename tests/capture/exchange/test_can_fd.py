@@ -18,10 +18,10 @@ from mcap_ros2.decoder import DecoderFactory
 import undulog
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.log_export import export_log
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import (
     DIR_RX,
@@ -34,8 +34,8 @@ from undulog.capture.log.messages.frames import (
     empty_fd_frames,
     empty_frames,
 )
-from undulog.capture.recorder.recorder import Ending, Recorder
-from undulog.capture.recorder.ticks import SessionClock
+from undulog.capture.recorder.loop import Ending, Recorder
+from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext

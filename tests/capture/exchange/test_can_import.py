@@ -12,10 +12,10 @@ from scipy.optimize import minimize_scalar
 from support.paths import ARCSNAKE
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError, OutputExistsError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.log_export import export_log
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import (
     DIR_RX,

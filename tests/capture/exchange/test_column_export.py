@@ -18,11 +18,10 @@ from undulog.capture.common.errors import (
     MissingExtraError,
     UsageError,
 )
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.column_export import TABLE_FORMATS, export_columns
-from undulog.capture.exchange.column_map import column_map_from_options
-from undulog.capture.exchange.csv_import import import_csv
+from undulog.capture.exchange.csv_import import column_map_from_options, import_csv
+from undulog.capture.exchange.export import TABLE_FORMATS, export_columns
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -69,7 +68,7 @@ def assert_same_samples(table, session, topic, field, column):
 def test_each_sample_has_a_row_at_its_own_time(
     suffix, rows_per_block, polled, tmp_path: Path, monkeypatch
 ):
-    monkeypatch.setattr("undulog.capture.exchange.column_export._ROWS_PER_BLOCK", rows_per_block)
+    monkeypatch.setattr("undulog.capture.exchange.export._ROWS_PER_BLOCK", rows_per_block)
     output = tmp_path / f"x{suffix}"
     report = export_columns(polled, output)
     assert report.rows == {"/joint_states": 600, "/joint_current": 600}
@@ -119,7 +118,7 @@ def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
     from mcap.writer import Writer
 
     from undulog.capture.log.messages.cdr import encode
-    from undulog.capture.log.messages.schemas import message_type, schema_text
+    from undulog.capture.log.messages.definitions import message_type, schema_text
 
     kind = message_type("sensor_msgs/msg/JointState")
     with (tmp_path / "run.mcap").open("wb") as stream:
@@ -219,7 +218,7 @@ def test_what_fails_leaves_nothing_behind(polled, tmp_path: Path, monkeypatch):
         with pytest.raises(LogWriteError, match="stopped on request"):
             export_columns(polled, output, force=True, stop=stop)
         with monkeypatch.context() as patch:
-            patch.setattr("undulog.capture.exchange.column_export._sorted_blocks", full_disk)
+            patch.setattr("undulog.capture.exchange.export._sorted_blocks", full_disk)
             with pytest.raises(LogWriteError, match="can't be written: No space left"):
                 export_columns(polled, output, force=True)
         assert output.read_text() == "precious"

@@ -9,9 +9,13 @@ import pytest
 from support.paths import ARCSNAKE
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import FaultyFileError, ImportFormatError, UsageError
-from undulog.capture.common.interruption import StopRequest
-from undulog.capture.exchange.column_map import column_map_from_options, read_column_map
-from undulog.capture.exchange.csv_import import import_csv, is_frame_csv
+from undulog.capture.common.process import StopRequest
+from undulog.capture.exchange.csv_import import (
+    column_map_from_options,
+    import_csv,
+    is_frame_csv,
+    read_column_map,
+)
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 
 GEAR = 22

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.log_export import export_log
 from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,

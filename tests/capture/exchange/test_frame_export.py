@@ -18,11 +18,11 @@ import undulog
 from support.paths import TRACE as RECORDING
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError, UsageError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange.can_import import import_can
+from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.exchange.log_export import export_log
 from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,

@@ -13,8 +13,7 @@ import pytest
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.column_map import column_map_from_options
-from undulog.capture.exchange.csv_import import import_csv
+from undulog.capture.exchange.csv_import import column_map_from_options, import_csv
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db")
 NUMBERS = (

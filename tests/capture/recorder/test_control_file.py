@@ -22,8 +22,12 @@ from support.control_clients import (
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import TEND_POLLS, ControlServer
-from undulog.capture.recorder.control_client import ControlClient
-from undulog.capture.recorder.control_socket import default_sockets, find_sockets, socket_folder
+from undulog.capture.recorder.control_client import (
+    ControlClient,
+    default_sockets,
+    find_sockets,
+    socket_folder,
+)
 
 # -- the file ------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.capture.recorder.ticks import EachSecond
+from undulog.capture.recorder.status import EachSecond
 
 NS = 1_000_000_000
 

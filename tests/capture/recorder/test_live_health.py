@@ -16,13 +16,12 @@ from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.health.freeze import FreezeTally, RangeTally
 from undulog.capture.log.health.session_check import SessionHealth, check_session
 from undulog.capture.log.health.session_scan import SessionMeasures
+from undulog.capture.log.messages.definitions import OK, DiagnosticStatus
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
-from undulog.capture.log.messages.topics import OK, DiagnosticStatus
-from undulog.capture.log.sinks.mcap_sink import McapSink
-from undulog.capture.log.sinks.sink import Description, MessageSink
-from undulog.capture.recorder import live_health
-from undulog.capture.recorder.live_health import LiveHealth
-from undulog.capture.recorder.tapped_sink import TappedSink
+from undulog.capture.log.sinks.mcap_sink import Description, McapSink, MessageSink
+from undulog.capture.recorder import health as live_health
+from undulog.capture.recorder.health import LiveHealth
+from undulog.capture.recorder.storage import TappedSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000

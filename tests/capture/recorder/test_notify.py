@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-from undulog.capture.recorder.unit import Notifier
+from undulog.capture.recorder.systemd import Notifier
 
 
 @pytest.fixture(params=["path", "abstract"])

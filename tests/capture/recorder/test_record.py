@@ -18,11 +18,11 @@ from support import processes
 from support.paths import ROOT
 from support.processes import UNDULOG, run, wait_for
 from undulog.capture import Session, load_robot
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import DIR_TX, empty_frames
-from undulog.capture.recorder.live_health import LiveHealth
-from undulog.capture.recorder.record import Recording
+from undulog.capture.recorder.health import LiveHealth
+from undulog.capture.recorder.recording import Recording
 from undulog.capture.recorder.settings import resolve
 
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")

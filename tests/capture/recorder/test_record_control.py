@@ -15,8 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 import undulog
 from support import processes
 from support.processes import UNDULOG, run, wait_for
-from undulog.capture.recorder.control_client import ControlClient
-from undulog.capture.recorder.control_socket import find_sockets
+from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
 PATIENCE_S = 60.0
 
@@ -28,7 +27,7 @@ def place(tmp_path, monkeypatch):
     runtime.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    monkeypatch.setattr("undulog.capture.recorder.control_socket._SYSTEM_FOLDER", tmp_path / "none")
+    monkeypatch.setattr("undulog.capture.recorder.control_client._SYSTEM_FOLDER", tmp_path / "none")
     return tmp_path
 
 

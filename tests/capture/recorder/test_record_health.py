@@ -17,7 +17,7 @@ from support.paths import ROOT
 from support.processes import start, wait_for
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.sources.records import HEAD
+from undulog.capture.sources.contract import HEAD
 
 NS = 1_000_000_000
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undulog.capture.common.arrays import IntArray
-from undulog.capture.recorder.envelope import Envelope
+from undulog.capture.recorder.clock_envelope import Envelope
 from undulog.capture.recorder.source_clock import JUMP_NS, ClockEstimate, SourceClock
 from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 

@@ -22,18 +22,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from undulog.capture.log.health.source_health import measure_sources, read_statuses
-from undulog.capture.log.messages.topics import ERROR, OK, STALE, WARN
-from undulog.capture.recorder.screen import clock_time, plain_line, screen, time_left
+from undulog.capture.log.health.sources import measure_sources, read_statuses
+from undulog.capture.log.messages.definitions import ERROR, OK, STALE, WARN
+from undulog.capture.recorder.screen import Terminal, clock_time, plain_line, screen, time_left
 from undulog.capture.recorder.source_clock import ClockEstimate
-from undulog.capture.recorder.statuses import (
+from undulog.capture.recorder.status import (
     EventLine,
     RecorderSnapshot,
     SourceSnapshot,
     TopicSnapshot,
     statuses,
 )
-from undulog.capture.recorder.terminal import Terminal
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000
@@ -336,8 +335,8 @@ def test_what_is_written_is_what_a_check_reads(tmp_path) -> None:
     """Statuses to a file and back, the counts of the sources included."""
     from undulog.capture import SessionWriter
     from undulog.capture.log.columns.topics import Topics
-    from undulog.capture.log.file.storage import LogFile
-    from undulog.capture.log.messages.schemas import message_type
+    from undulog.capture.log.file.log_file import LogFile
+    from undulog.capture.log.messages.definitions import message_type
 
     path = tmp_path / "s.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:

@@ -13,7 +13,7 @@ import pytest
 
 from support.processes import run, undulog
 from undulog.capture.common.errors import UsageError
-from undulog.capture.recorder.unit import UNIT_NAME, hidden_folder, installed_program, unit_text
+from undulog.capture.recorder.systemd import UNIT_NAME, hidden_folder, installed_program, unit_text
 
 PATIENCE_S = 60.0
 EXPOSURE = 2.0  # of 10, as `systemd-analyze security` counts; 2.5 would still be "OK"

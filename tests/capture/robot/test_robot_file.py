@@ -13,13 +13,14 @@ from undulog.capture.robot.model import (
     BusPoll,
     ClockDomain,
     Direction,
+    OnFault,
     Plane,
     Quantity,
+    Safety,
     Sensor,
     SensorKind,
     Servo,
 )
-from undulog.capture.robot.safety import OnFault, Safety
 from undulog.sim.gate.limits import missing_limits, safety_example
 
 MINIMAL = """

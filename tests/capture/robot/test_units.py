@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.bus_map import SESSION_UNIT, UNITS, unit_for, valid_units
 from undulog.capture.robot.model import Quantity
-from undulog.capture.robot.units import SESSION_UNIT, UNITS, unit_for, valid_units
 
 
 @pytest.mark.parametrize(

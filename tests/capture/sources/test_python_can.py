@@ -16,14 +16,17 @@ from undulog.capture.log.messages.frames import (
 )
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.can_source import (
+from undulog.capture.sources.can import (
     DEVICE_TIME,
     LISTEN_ONLY,
     NO_CONTROLLER,
+    bus_class,
+    failure,
+    fd_frames_of,
+    frames_of,
     known_options,
     open_can,
 )
-from undulog.capture.sources.python_can import bus_class, failure, fd_frames_of, frames_of
 
 
 def message_of(frame) -> can.Message:

@@ -21,11 +21,11 @@ from support import processes
 from support.paths import ROOT
 from support.processes import wait_for
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.common.priority import raised_priority
+from undulog.capture.common.process import raised_priority
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.source_clock import SourceClock
-from undulog.capture.sources.receive_thread import ReceiveThread
+from undulog.capture.sources.reader_thread import ReceiveThread
 
 # One frame a packet, never waiting; at each line of stdin so many, with 0.1 ms between.
 SENDER = """

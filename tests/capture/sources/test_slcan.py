@@ -26,7 +26,7 @@ from undulog.capture.log.messages.frames import (
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
-from undulog.capture.sources.slcan_text import STAMP_PERIOD_MS, SlcanText
+from undulog.capture.sources.slcan import STAMP_PERIOD_MS, SlcanText
 
 
 def lines(frames, stamps_ms=None) -> bytes:

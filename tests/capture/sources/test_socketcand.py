@@ -22,7 +22,7 @@ from undulog.capture.log.messages.frames import (
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
-from undulog.capture.sources.socketcand_text import SocketcandText
+from undulog.capture.sources.socketcand import SocketcandText
 
 
 def messages(frames, blank: str = "") -> bytes:

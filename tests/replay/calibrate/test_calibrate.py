@@ -13,12 +13,11 @@ import undulog as front
 from support.paths import TRACE
 from support.twin_fits import fitted, room_for
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.common.interruption import StopRequest
-from undulog.replay.calibrate.determined import ridges
+from undulog.capture.common.process import StopRequest
+from undulog.replay.calibrate.identifiability import ridges
 from undulog.replay.calibrate.lack_of_fit import misfit
-from undulog.replay.calibrate.noise import memory, score_covariance
 from undulog.replay.calibrate.parameters import Unknown
-from undulog.replay.calibrate.solve import solve
+from undulog.replay.calibrate.solve import memory, score_covariance, solve
 from undulog.replay.commands import fit as cli
 from undulog.sim.scenario.scenario_file import load_scenario
 

@@ -11,8 +11,7 @@ from scipy.signal import lfilter
 import undulog as front
 from support import twin_fits
 from undulog.capture import Session, SessionWriter
-from undulog.replay.calibrate.alternatives import play_direction
-from undulog.replay.calibrate.answers import Measured
+from undulog.replay.calibrate.identifiability import play_direction
 from undulog.replay.calibrate.lack_of_fit import (
     JointFit,
     LackOfFit,
@@ -23,6 +22,7 @@ from undulog.replay.calibrate.lack_of_fit import (
     periodic,
     step_of,
 )
+from undulog.replay.calibrate.parameters import Measured
 
 SIGMA = 0.005
 OMEGA = 2 * np.pi

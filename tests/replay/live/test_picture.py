@@ -5,7 +5,7 @@ import pytest
 
 from support.live_stage import EPOCH_NS, Recorder, Relay
 from undulog.capture import Session
-from undulog.replay.record.rrd import write_recording
+from undulog.replay.feed.recording import write_recording
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from support.processes import freeze, wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder import live_feed
-from undulog.capture.recorder.live_spawn import spawn_relay
+from undulog.capture.recorder.live_feed import spawn_relay
 from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
 from undulog.replay.live.inbox import Inbox
 
@@ -226,7 +226,7 @@ def test_spawned_relay_says_why_it_ended(tmp_path):
 
 
 def test_frozen_relay_that_was_spawned_can_be_ended(stage, monkeypatch):
-    monkeypatch.setattr("undulog.capture.recorder.live_spawn._GRACE_S", 0.2)
+    monkeypatch.setattr("undulog.capture.recorder.live_feed._GRACE_S", 0.2)
     relay = spawn_relay(stage.path, ["--connect", "rerun+http://127.0.0.1:9/proxy"])
     wait_for(lambda: stage.path.is_socket() or relay.poll() is not None)
     freeze(relay.pid)

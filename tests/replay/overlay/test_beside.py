@@ -15,12 +15,12 @@ from undulog.analysis.compare.compare import Choices, compare_sessions
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop
-from undulog.capture.common.interruption import StopRequest
 from undulog.capture.common.palette import joint_colors
+from undulog.capture.common.process import StopRequest
 from undulog.replay.overlay.alignment import Align, align, times_of
+from undulog.replay.overlay.combine import bring_together
 from undulog.replay.overlay.layout import all_views
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.together import bring_together
 from undulog.replay.overlay.write import Converted, write_beside
 from undulog.replay.samples.timeline import Rhythm
 

@@ -7,9 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.sim.control.filters import LowPass, NearMemory, SideLatch
-from undulog.sim.control.laws import amplitude, bend, frequency
-from undulog.sim.control.phase_history import TURN, BodyWave, PathHeading, PhaseHistory
+from undulog.sim.control.filters import (
+    TURN,
+    BodyWave,
+    LowPass,
+    NearMemory,
+    PathHeading,
+    PhaseHistory,
+    SideLatch,
+)
+from undulog.sim.control.reactions import amplitude, bend, frequency
 
 DISTANCES = np.linspace(0.0, 3.0, 31)
 

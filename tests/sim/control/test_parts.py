@@ -10,11 +10,9 @@ from undulog.capture.robot.description import load_robot
 from undulog.capture.robot.model import Plane, Robot, Sensor, SensorKind
 from undulog.sim import PlaneGait, Readings, Serpentine
 from undulog.sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
-from undulog.sim.control.course import RandomCourse, StraightOn, TargetCourse
-from undulog.sim.control.lookout import Distances, Lookout
-from undulog.sim.control.moment import Moment
-from undulog.sim.control.reckoning import Pose, SlipOdometry
-from undulog.sim.gait.build import generator
+from undulog.sim.control.dead_reckoning import Pose, SlipOdometry
+from undulog.sim.control.heading import RandomCourse, StraightOn, TargetCourse
+from undulog.sim.control.obstacle_monitor import Distances, Lookout, Moment
 from undulog.sim.gait.contract import WALK
 from undulog.sim.scenario.controllers import (
     Controller,
@@ -26,7 +24,8 @@ from undulog.sim.scenario.controllers import (
     TargetHeading,
 )
 from undulog.sim.scenario.controllers import Lookout as LookoutParameters
-from undulog.sim.scenario.sensor_layout import layout
+from undulog.sim.scenario.gaits import generator
+from undulog.sim.scenario.sensors import layout
 
 SNAKE = load_robot("snake25")
 WAVE = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 0.5, math.pi / 6)}, ramp_s=0.0)

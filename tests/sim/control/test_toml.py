@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from undulog.capture.common.errors import ScenarioError
 from undulog.sim import Readings, load_scenario, parse_scenario
-from undulog.sim.control.build import build_gait
+from undulog.sim.control.adaptive import build_gait
 from undulog.sim.scenario.controllers import (
     Calibration,
     Controller,

@@ -17,26 +17,23 @@ from support.processes import wait_for
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_TX
-from undulog.capture.robot.model import Direction, Quantity
-from undulog.capture.robot.safety import OnFault
+from undulog.capture.robot.model import Direction, OnFault, Quantity
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim import load_scenario
-from undulog.sim.control.build import build_gait
-from undulog.sim.drive.driven import find_driven
-from undulog.sim.drive.link import find_virtual_robot, sent_text
-from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.control.adaptive import build_gait
+from undulog.sim.drive.links import find_virtual_robot, sent_text
+from undulog.sim.drive.loop import CommandEncoder, WallPace
+from undulog.sim.drive.motion import find_driven
 from undulog.sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
-from undulog.sim.drive.pace import WallPace
 from undulog.sim.drive.python_can_bus import open_link
 from undulog.sim.gate.outcome import How
 from undulog.sim.sensing.contract import JointSample
-from undulog.sim.serve.bus import VirtualBus
 from undulog.sim.serve.pacing import Pacer
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
-from undulog.sim.serve.socketcand_server import SocketcandServer
+from undulog.sim.serve.socketcand_server import SocketcandServer, VirtualBus
 from undulog.sim.twin.twin import Twin
 
 STEP = np.radians(0.01)  # of a command on the bus of snake25

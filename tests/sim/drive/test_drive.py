@@ -17,8 +17,8 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait
-from undulog.sim.drive.command_session import CommandReplay, RecordedCommands
 from undulog.sim.drive.in_process import FadingGait
+from undulog.sim.drive.motion import CommandReplay, RecordedCommands
 from undulog.sim.gait.contract import GaitTick
 from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 

@@ -12,10 +12,10 @@ import undulog as front
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.description import parse_robot
-from undulog.capture.robot.safety import Safety
-from undulog.sim.drive.driven import find_driven
+from undulog.capture.robot.model import Safety
 from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world
 from undulog.sim.drive.dry_run_text import reported, told
+from undulog.sim.drive.motion import find_driven
 
 EPOCH_NS = 1_735_689_600_000_000_000
 RATE_HZ = 100

@@ -11,10 +11,10 @@ import pytest
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.bus.encoding import poll_frames
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.capture.robot.description import load_robot
-from undulog.sim.drive.driven import find_driven
+from undulog.sim.drive.motion import find_driven
 from undulog.sim.drive.over_bus import bus_plan, drive_bus
 from undulog.sim.gate.outcome import How
 

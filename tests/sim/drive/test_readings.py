@@ -9,7 +9,7 @@ from undulog.capture import load_robot
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 from undulog.capture.robot.model import Direction, Quantity
-from undulog.sim.drive.readings_from_bus import BusReadings
+from undulog.sim.drive.links import BusReadings
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import ControlServer
-from undulog.sim.drive.gait_teller import GaitTeller
+from undulog.sim.drive.session import GaitTeller
 from undulog.sim.gait.contract import GaitTick
 
 NAMES = tuple(f"horizontal.{key}" for key in ("A", "omega", "lag", "offset", "phase"))

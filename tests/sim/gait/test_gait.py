@@ -7,7 +7,7 @@ import pytest
 
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, Wave
-from undulog.sim.gait.rhythm import smoothstep, within_limits
+from undulog.sim.gait.wave import smoothstep, within_limits
 
 NOTHING = Readings(np.empty(0), np.empty(0))
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import ClockDomain, Joint, Link, Plane, Robot
 from undulog.sim import PlaneGait, Readings, Serpentine, Wave
-from undulog.sim.gait.build import generator
 from undulog.sim.gait.contract import Modulation
 from undulog.sim.gait.delay_blocks import DelayBlocks, DelayLine
 from undulog.sim.gait.oscillators import OscillatorChain, OscillatorChains, OscillatorKind
+from undulog.sim.scenario.gaits import generator
 
 NOTHING = Readings(np.full(7, np.nan), np.full(7, np.nan))
 STEP_S = 0.01

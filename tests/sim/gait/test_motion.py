@@ -14,7 +14,7 @@ import pytest
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
 from undulog.sim import Readings, load_scenario
-from undulog.sim.gait.build import generator
+from undulog.sim.scenario.gaits import generator
 from undulog.sim.twin.recording import record
 from undulog.sim.twin.twin import Twin
 

@@ -12,13 +12,11 @@ from hypothesis.extra.numpy import arrays
 
 from undulog.capture import load_robot
 from undulog.capture.common.errors import UsageError
-from undulog.capture.robot.safety import OnFault
+from undulog.capture.robot.model import OnFault
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gate.clamp import Clamp, Spacing
-from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.ramp import Ending, Ramp
-from undulog.sim.gate.tick import JointStatus
-from undulog.sim.gate.watch import Yielding
+from undulog.sim.gate.feedback import Yielding
+from undulog.sim.gate.limits import Clamp, Ending, Ramp, Spacing, gate_limits
+from undulog.sim.gate.outcome import JointStatus
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

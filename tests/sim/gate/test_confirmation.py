@@ -12,10 +12,9 @@ import pytest
 
 from support.far_end import beyond_rate, largest_burst
 from undulog.capture import load_robot
-from undulog.sim.gate.clamp import Clamp
 from undulog.sim.gate.confirmation import Confirmation
-from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.watch import Silence
+from undulog.sim.gate.feedback import Silence
+from undulog.sim.gate.limits import Clamp, gate_limits
 
 LIMITS = gate_limits(load_robot("snake25"))
 COUNT, PERIOD_S, STEP = 25, 0.01, 0.04

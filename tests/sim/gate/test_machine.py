@@ -8,14 +8,13 @@ import pytest
 from undulog.capture import load_robot
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import DIR_TX, ERROR_FLAG, empty_frames
-from undulog.capture.robot.safety import OnFault
+from undulog.capture.robot.model import OnFault
 from undulog.capture.sources.events import BUS_OFF
 from undulog.sim.gait.contract import GaitTick, Readings
+from undulog.sim.gate.feedback import Presence
 from undulog.sim.gate.gate import HOLD_S, POSE_S, Gate
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.outcome import FaultKind, GateFault, How, jitter
-from undulog.sim.gate.presence import Presence
-from undulog.sim.gate.tick import Heard, JointStatus, Phase
+from undulog.sim.gate.outcome import FaultKind, GateFault, Heard, How, JointStatus, Phase, jitter
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

@@ -15,13 +15,12 @@ from hypothesis.extra.numpy import arrays
 
 from undulog.capture import load_robot
 from undulog.capture.common.errors import SourceError, UsageError
-from undulog.capture.robot.safety import OnFault
+from undulog.capture.robot.model import OnFault
 from undulog.sim.drive.loop import CommandEncoder
 from undulog.sim.gait.contract import GaitTick, Readings
 from undulog.sim.gate.gate import Gate
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.outcome import FaultKind, GateFault
-from undulog.sim.gate.tick import Heard, JointStatus, Phase
+from undulog.sim.gate.outcome import FaultKind, GateFault, Heard, JointStatus, Phase
 
 ROBOT = load_robot("snake25")
 COUNT, RATE_HZ = len(ROBOT.joints), 100

@@ -14,9 +14,9 @@ from undulog.capture.robot.model import Link
 from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.engine import engine_type
 from undulog.sim.physics.steps import Steps
-from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.scenario.scenario import EngineKind, Kernels
+from undulog.sim.twin.session_log import frame_origins, urdf
 from undulog.sim.twin.twin import Twin
-from undulog.sim.twin.urdf import frame_origins, urdf
 
 
 @pytest.fixture

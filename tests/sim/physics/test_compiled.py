@@ -12,12 +12,12 @@ from undulog.capture.robot.model import Link
 from undulog.sim import FrictionLaw, Ground, World, load_scenario
 from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
-from undulog.sim.physics.compiled_laws import CompiledLaws
+from undulog.sim.physics.compiled_kernels import CompiledLaws
 from undulog.sim.physics.laws import NumpyLaws
 from undulog.sim.physics.servo import Servos
 from undulog.sim.physics.steps import Steps
-from undulog.sim.scenario.engines import EngineKind, Kernels
 from undulog.sim.scenario.obstacles import Cylinder
+from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.twin.recording import record
 from undulog.sim.twin.twin import Twin
 

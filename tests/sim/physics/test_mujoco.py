@@ -14,8 +14,8 @@ from undulog.capture.robot.model import Link, Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
 from undulog.sim.physics.engine import engine_type
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.scenario.engines import EngineKind
 from undulog.sim.scenario.obstacles import Box, Cylinder
+from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.twin.twin import Twin
 
 pytest.importorskip("mujoco")
@@ -129,7 +129,7 @@ def test_two_processes_find_the_same_bits(tmp_path):
     code = """
 import dataclasses, hashlib
 from undulog.sim import load_scenario
-from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.twin.twin import Twin
 scenario = load_scenario("flat").changed(duration_s=0.5)
 with Twin(dataclasses.replace(scenario, engine=EngineKind.MUJOCO)) as twin:

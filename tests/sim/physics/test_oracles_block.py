@@ -8,7 +8,7 @@ import pytest
 
 from undulog.sim import FrictionLaw, Ground, World
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.scenario.world import tilted_gravity
 from undulog.sim.twin.twin import Twin
 

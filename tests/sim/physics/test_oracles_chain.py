@@ -9,7 +9,7 @@ import pytest
 from undulog.capture.robot.model import Link, Plane
 from undulog.sim import PlaneGait, Serpentine, World
 from undulog.sim.physics.engine import engine_type
-from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.twin.twin import Twin
 
 IN_SPACE = {"gravity": (0, 0, 0), "height": 0.0, "heading": 0.4, "velocity": (0.1, 0.0, 0.0)}

@@ -15,8 +15,7 @@ from scipy.integrate import solve_ivp
 
 from undulog.capture.robot.model import Link, Plane
 from undulog.sim import PlaneGait, Serpentine, World, load_scenario
-from undulog.sim.physics.energy_flows import JOINT_TERMS
-from undulog.sim.physics.ledger import TERMS
+from undulog.sim.physics.ledger import JOINT_TERMS, TERMS
 from undulog.sim.twin.twin import Twin
 
 MASS, LENGTH, INERTIA = 0.5, 0.2, 2e-3

@@ -12,7 +12,7 @@ from undulog.capture.robot.model import Plane, Servo
 from undulog.sim import PlaneGait, Serpentine, World
 from undulog.sim.physics.ledger import TERMS
 from undulog.sim.physics.servo import Rotors, Servos
-from undulog.sim.scenario.engines import EngineKind, Kernels
+from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario
 from undulog.sim.twin.stability import stability
 from undulog.sim.twin.twin import Twin

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.sensors import AccelerometerModel, CompassModel
-from undulog.sim.sensing.accelerometer import Accelerometer
-from undulog.sim.sensing.compass import Compass
-from undulog.sim.sensing.mount import rotation_from_rpy
+from undulog.sim.sensing.contract import rotation_from_rpy
+from undulog.sim.sensing.inertial import Accelerometer, Compass
 
 DT, PERIOD, G = 1e-3, 10, 9.81
 GRAVITY = (0.0, 0.0, -G)

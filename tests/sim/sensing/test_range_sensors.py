@@ -10,8 +10,7 @@ from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.obstacles import Cylinder, Wall
 from undulog.sim.scenario.sensors import InfraredModel, SonarModel
-from undulog.sim.sensing.ranging import Infrared, Sonar, cone, decoded, voltage
-from undulog.sim.sensing.rays import RayCaster
+from undulog.sim.sensing.ranging import Infrared, RayCaster, Sonar, cone, decoded, voltage
 
 DT, PERIOD = 1e-3, 10
 EXACT = InfraredModel(noise_v=0.0, adc_bits=24)

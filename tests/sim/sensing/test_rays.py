@@ -7,7 +7,7 @@ import pybullet
 import pytest
 
 from undulog.sim.scenario.obstacles import Box, Cylinder, Wall
-from undulog.sim.sensing.rays import RayCaster
+from undulog.sim.sensing.ranging import RayCaster
 
 INF = math.inf
 

@@ -14,7 +14,7 @@ from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, e
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
-from undulog.sim.serve.encode import ReplyEncoder
+from undulog.sim.serve.reply_frames import ReplyEncoder
 from undulog.sim.serve.robot import CommandLatch
 
 STEP = {"position": 0.01, "velocity": 0.1, "torque": 1, "current": 1}

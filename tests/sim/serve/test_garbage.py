@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undulog.capture.log.messages.frames import empty_frames
+from undulog.sim.serve.socketcand_protocol import ClientText
 from undulog.sim.serve.socketcand_server import SocketcandServer
-from undulog.sim.serve.socketcand_text import ClientText
 
 WORDS = (
     b"< open can0 >",

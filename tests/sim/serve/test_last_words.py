@@ -10,7 +10,7 @@ from support.processes import wait_for
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
-from undulog.sim.drive.link import find_virtual_robot
+from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.serve.socketcand_server import HOLD_S, SocketcandServer
 
 COUNT = 40

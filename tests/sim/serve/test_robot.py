@@ -13,21 +13,18 @@ from support.processes import wait_for
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Direction, Quantity
-from undulog.sim.gait.contract import GaitTick
+from undulog.sim.gait.contract import CONTROL_RATE_HZ, GaitTick
 from undulog.sim.scenario.bus_faults import parse_faults
-from undulog.sim.scenario.scenario import CONTROL_RATE_HZ
 from undulog.sim.scenario.sensors import Noise, SensorModels, ServoPolling
 from undulog.sim.sensing.contract import JointSample
-from undulog.sim.serve.bus import VirtualBus
-from undulog.sim.serve.encode import ReplyEncoder
-from undulog.sim.serve.fault_line import FaultLine
 from undulog.sim.serve.pacing import PATIENCE_NS, Pacer
+from undulog.sim.serve.reply_frames import FaultLine, ReplyEncoder
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
-from undulog.sim.serve.socketcand_server import SocketcandServer
+from undulog.sim.serve.socketcand_server import SocketcandServer, VirtualBus
 from undulog.sim.twin.twin import Twin
 
 JOINTS = 4

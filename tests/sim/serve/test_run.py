@@ -24,9 +24,9 @@ from undulog.capture import Session, load_robot
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
-from undulog.sim.drive.driven import find_driven
-from undulog.sim.drive.link import find_virtual_robot
+from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
+from undulog.sim.drive.motion import find_driven
 from undulog.sim.gait.contract import Readings
 
 PATIENCE_S = 300

@@ -26,13 +26,16 @@ from undulog.capture.log.messages.frames import (
     empty_frames,
 )
 from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.contract import SourceContext
+from undulog.capture.sources.contract import SourceContext, records
 from undulog.capture.sources.events import Tally
-from undulog.capture.sources.records import records
-from undulog.capture.sources.socketcand_text import SocketcandText
-from undulog.sim.serve.bus import VirtualBus
-from undulog.sim.serve.socketcand_server import MOST_CLIENTS, MOST_SENT, SocketcandServer
-from undulog.sim.serve.socketcand_text import ClientText, frame_text, sent_frame
+from undulog.capture.sources.socketcand import SocketcandText
+from undulog.sim.serve.socketcand_protocol import ClientText, frame_text, sent_frame
+from undulog.sim.serve.socketcand_server import (
+    MOST_CLIENTS,
+    MOST_SENT,
+    SocketcandServer,
+    VirtualBus,
+)
 
 PATIENCE_S = 60.0
 

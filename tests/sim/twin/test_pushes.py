@@ -7,7 +7,7 @@ import pytest
 
 from undulog.sim import World, parse_scenario
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.scenario.engines import EngineKind
+from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.scenario.world import Push
 from undulog.sim.twin.twin import Twin
 

@@ -14,7 +14,7 @@ import pytest
 from support.processes import UNDULOG, start, undulog, wait_for
 from undulog.capture import Session
 from undulog.capture.common.errors import OutputExistsError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim import (
     Ground,
@@ -25,12 +25,11 @@ from undulog.sim import (
     load_scenario,
     parse_scenario,
 )
-from undulog.sim.physics.energy_flows import JOINT_TERMS
-from undulog.sim.physics.ledger import TERMS
+from undulog.sim.physics.ledger import JOINT_TERMS, TERMS
 from undulog.sim.sensing.contract import JointSample
 from undulog.sim.twin.recording import record
+from undulog.sim.twin.session_log import urdf
 from undulog.sim.twin.twin import Twin
-from undulog.sim.twin.urdf import urdf
 
 HUNDREDTH_NS = 10_000_000
 POWERS = {

@@ -10,8 +10,8 @@ import pytest
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Serpentine, World
 from undulog.sim.physics.ledger import TERMS
-from undulog.sim.scenario.engines import EngineKind
 from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial, Wall
+from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.twin.twin import Twin
 
 MASS, V = 0.3, 0.4  # of three links; the speed at which they come

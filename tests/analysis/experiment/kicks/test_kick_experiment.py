@@ -8,7 +8,7 @@ import pytest
 
 import undulog
 from support.analysed import experiment
-from undulog.analysis.present.text.experiment import render_experiment
+from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LocalCoupling
 from undulog.capture import SessionWriter
 

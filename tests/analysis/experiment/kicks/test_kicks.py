@@ -9,10 +9,10 @@ from undulog.analysis.experiment.kicks.local import (
     Measured,
     answers_of,
     central_differences,
+    lti_reading,
     nonlinearity,
     row_sums,
 )
-from undulog.analysis.experiment.kicks.lti_reading import lti_reading
 from undulog.analysis.experiment.kicks.runs import (
     Kick,
     Kind,

@@ -9,8 +9,7 @@ import pytest
 from support.kick_runs import kicked
 from undulog.analysis.experiment.answer import kick_answer
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.local import Answers
-from undulog.analysis.experiment.kicks.matrices import local_matrices
+from undulog.analysis.experiment.kicks.local import Answers, local_matrices
 from undulog.analysis.experiment.kicks.runs import Kick, KickExperiment, Kind, sort_kicks
 from undulog.analysis.experiment.kicks.scatter import run_errors
 

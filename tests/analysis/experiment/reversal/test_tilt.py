@@ -8,11 +8,12 @@ import pytest
 from scipy import stats
 
 from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
-from undulog.analysis.experiment.reversal.modules import ordered_pairs, reversal_of
-from undulog.analysis.experiment.reversal.tilt import (
+from undulog.analysis.experiment.reversal.modules import (
     common_ratio,
     floor_lean,
     heading_strata,
+    ordered_pairs,
+    reversal_of,
     tilt_check,
 )
 from undulog.capture.common.errors import UsageError

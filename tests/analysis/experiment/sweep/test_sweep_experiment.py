@@ -10,8 +10,8 @@ import undulog
 from support.analysed import experiment
 from undulog.analysis.experiment.sweep.chain import servo_side
 from undulog.analysis.plan.designs import tones
-from undulog.analysis.present.text.experiment import render_experiment
-from undulog.analysis.results.sweep import LinearCoupling, Route
+from undulog.analysis.present.text_experiment import render_experiment
+from undulog.analysis.results.coupling import LinearCoupling, Route
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 

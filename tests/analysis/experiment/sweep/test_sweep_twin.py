@@ -11,8 +11,8 @@ from support import twin_chains
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
 from undulog.sim import load_scenario
-from undulog.sim.drive.driven import find_driven
-from undulog.sim.scenario.engines import Kernels
+from undulog.sim.drive.motion import find_driven
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import Driver, record
 
 SIGMA, AMPLITUDE = 2e-4, 0.02

@@ -10,9 +10,9 @@ import pytest
 
 from undulog.analysis import Choices, Experiment, compare_sessions, load
 from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.coupling import ComplexMatrix, LinearCoupling, Route, ToneCoupling
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
-from undulog.analysis.results.sweep import ComplexMatrix, LinearCoupling, Route, ToneCoupling
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
 

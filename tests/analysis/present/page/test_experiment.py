@@ -8,10 +8,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page import typeset
+from undulog.analysis.present.page import tables as typeset
 from undulog.analysis.present.page.artefacts import artefact_rows, told_times
-from undulog.analysis.present.page.entries import Entries, entries_of
-from undulog.analysis.present.page.matrix import matrix_picture
+from undulog.analysis.present.page.matrix import Entries, entries_of, matrix_picture
 from undulog.analysis.present.page.mirror import profiles
 from undulog.analysis.present.page.page import render
 from undulog.analysis.present.page.trials import experiment_trials, session_trials

@@ -8,9 +8,9 @@ from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
-from undulog.capture.log.columns.stores import ColumnStore, EchoColumn, Times, TimeStore
+from undulog.capture.log.columns.buffers import ColumnStore, EchoColumn, Times, TimeStore
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.log.read.own_times import Series, own_times
+from undulog.capture.log.read.sample_times import Series, own_times
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{k:02d}" for k in range(1, 6)]

@@ -13,9 +13,9 @@ from mcap.writer import Writer as McapWriter
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
-from undulog.capture.log.columns import arenas
-from undulog.capture.log.columns.arenas import Piece, ahead, helpers
-from undulog.capture.log.file.storage import LogFile
+from undulog.capture.log.columns import blocks as arenas
+from undulog.capture.log.columns.blocks import Piece, ahead, helpers
+from undulog.capture.log.file.log_file import LogFile
 from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000

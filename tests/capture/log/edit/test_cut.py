@@ -28,7 +28,7 @@ from support.edited_logs import (
 )
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.log.edit.cut import cut_log
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 # -- cut -------------------------------------------------------------------------------------
 

@@ -23,10 +23,10 @@ from support.edited_logs import (
 )
 from support.processes import python, start
 from undulog.capture.common.errors import UndulogError
-from undulog.capture.common.interruption import StopRequest
+from undulog.capture.common.process import StopRequest
 from undulog.capture.log.edit.cut import cut_log
 from undulog.capture.log.edit.merge import merge_logs
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 # -- both ------------------------------------------------------------------------------------
 
@@ -88,7 +88,7 @@ def test_a_stop_leaves_nothing(tmp_path: Path):
 
 SLOW = """
 import sys, time, undulog
-from undulog.capture.log.edit import edit
+from undulog.capture.log.edit import edited_log as edit
 write = edit.EditedLog.write
 def slowly(*arguments):
     print("writing", flush=True)

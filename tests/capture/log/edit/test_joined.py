@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from undulog.capture.log.edit.joined import Fault, joined, listed
+from undulog.capture.log.edit.edited_log import Fault, joined, listed
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, schema_text
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -30,7 +30,7 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.log.edit.cut import cut_log
 from undulog.capture.log.edit.merge import merge_logs
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 # -- merge -----------------------------------------------------------------------------------
 

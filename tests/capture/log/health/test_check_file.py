@@ -27,7 +27,7 @@ from support.checked_sessions import (
 from undulog.capture import SessionWriter
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.mcap.chunk import walk_records
-from undulog.capture.log.messages.schemas import schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 
 def chunk_spans(path: Path, topic: str) -> list[tuple[int, int]]:

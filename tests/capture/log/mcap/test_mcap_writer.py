@@ -20,7 +20,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from undulog.capture.log.mcap.mcap_writer import McapWriter
+from undulog.capture.log.mcap.writer import McapWriter
 
 NUMBER = st.integers(0, 2**64 - 1)
 CALLS = st.lists(

@@ -8,8 +8,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.messages.cdr import encode, layout_of
-from undulog.capture.log.messages.rosmsg import parse_message_type
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, parse_message_type, schema_text
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP = {"sec": 1_700_000_000, "nanosec": 123_456_789}

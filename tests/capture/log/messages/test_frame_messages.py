@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from undulog.capture.log.messages.cdr import encode
+from undulog.capture.log.messages.definitions import message_type
 from undulog.capture.log.messages.frames import (
     FRAME_DTYPE,
     FRAME_LAYOUT,
@@ -15,7 +16,6 @@ from undulog.capture.log.messages.frames import (
     frames_from_bytes,
     records_at,
 )
-from undulog.capture.log.messages.schemas import message_type
 
 RECORDS = st.integers(0, 300).flatmap(
     lambda count: st.binary(min_size=32 * count, max_size=32 * count)

@@ -10,11 +10,11 @@ import pytest
 from support.paths import ROOT
 from support.processes import python
 from undulog.capture import SessionWriter
-from undulog.capture.log.mcap.mcap_payloads import McapPayloads
+from undulog.capture.log.mcap.payloads import McapPayloads
 
 READS = """
 import gc, sys, weakref
-from undulog.capture.log.mcap.mcap_payloads import McapPayloads
+from undulog.capture.log.mcap.payloads import McapPayloads
 from pathlib import Path
 
 class Ring:

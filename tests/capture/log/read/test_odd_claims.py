@@ -15,7 +15,7 @@ from undulog.capture import Session
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.edit.merge import merge_logs
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.rosmsg import parse_message_type
+from undulog.capture.log.messages.definitions import parse_message_type
 from undulog.replay.samples.tracks import drawn_topics
 
 RULE = "=" * 80

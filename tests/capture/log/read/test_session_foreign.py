@@ -22,7 +22,7 @@ from support.written_sessions import (
 from undulog.capture import Session
 from undulog.capture.common.errors import MissingChannelError
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.schemas import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type, schema_text
 
 # -- reading logs of other makes ---------------------------------------------------------------
 

@@ -19,10 +19,9 @@ from support.read_back import read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.schemas import schema_text
-from undulog.capture.log.messages.topics import ERROR, OK, DiagnosticStatus
+from undulog.capture.log.messages.definitions import ERROR, OK, DiagnosticStatus, schema_text
 from undulog.capture.log.sinks.durable_sink import DurableSink
-from undulog.capture.recorder.tapped_sink import TappedSink
+from undulog.capture.recorder.storage import TappedSink
 
 CHILD = recorder.__file__
 EPOCH_NS = recorder.EPOCH_NS

@@ -18,8 +18,8 @@ from undulog.capture.common.errors import (
     NotALogError,
     OutputExistsError,
 )
-from undulog.capture.log.wal.wal import WriteAheadLog, wal_folder
-from undulog.capture.log.wal.wal_recover import recover
+from undulog.capture.log.wal.reader import recover
+from undulog.capture.log.wal.writer import WriteAheadLog, wal_folder
 
 # -- what goes in comes out ----------------------------------------------------------------------
 

@@ -18,9 +18,9 @@ import pytest
 
 from support.wal_messages import CHANNEL, MESSAGE, check_messages, filled, message
 from undulog.capture.common.errors import LogError
-from undulog.capture.log.wal.wal import WriteAheadLog
-from undulog.capture.log.wal.wal_format import SegmentHeader
-from undulog.capture.log.wal.wal_recover import recover
+from undulog.capture.log.wal.format import SegmentHeader
+from undulog.capture.log.wal.reader import recover
+from undulog.capture.log.wal.writer import WriteAheadLog
 
 # -- the kill --------------------------------------------------------------------------------------
 
@@ -29,7 +29,7 @@ KILLED = (
     + """
 import os, sys
 from mcap.records import Channel
-from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.writer import WriteAheadLog
 
 wal = WriteAheadLog(sys.argv[1], segment_size=int(sys.argv[2]), sync_interval_s=0.05)
 for channel in (1, 2, 3):

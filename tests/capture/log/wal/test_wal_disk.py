@@ -11,9 +11,9 @@ import pytest
 from support.processes import python, wait_for
 from support.wal_messages import MESSAGE, check_messages, message
 from undulog.capture.common.errors import LogWriteError
-from undulog.capture.log.wal.wal import WriteAheadLog
-from undulog.capture.log.wal.wal_recover import recover
-from undulog.capture.log.wal.wal_segment import free_bytes, require_space
+from undulog.capture.log.wal.reader import recover
+from undulog.capture.log.wal.segment import free_bytes, require_space
+from undulog.capture.log.wal.writer import WriteAheadLog
 
 # -- the disk --------------------------------------------------------------------------------
 
@@ -97,7 +97,7 @@ FILL = (
     + """
 import sys
 from undulog.capture.common.errors import LogWriteError
-from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.writer import WriteAheadLog
 
 wal = WriteAheadLog(sys.argv[1], segment_size=1 << 16)
 accepted = 0

@@ -15,7 +15,7 @@ from support.processes import wait_for
 from support.wal_messages import message
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.log.wal.wal import WriteAheadLog
+from undulog.capture.log.wal.writer import WriteAheadLog
 from undulog.capture.sources.sender import FrameSender
 
 PAGE = resource.getpagesize()

@@ -5,18 +5,22 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.analysis.results.energy import EnergyResult, JointCycles, Transport
+from undulog.analysis.results.analysis import (
+    EnergyResult,
+    JointCycles,
+    JointOverTime,
+    ResponseOverTime,
+    Transport,
+)
 from undulog.analysis.results.estimate import Estimate
-from undulog.analysis.results.over_time import JointOverTime, ResponseOverTime
 from undulog.analysis.session.cycles import CycleMaps
 from undulog.capture import Session
 from undulog.capture.common.palette import joint_colors
-from undulog.replay.content.entities import ENERGY, GAIN, LAG, CycleTable
 from undulog.replay.draw.cycles.heat_maps import cell_colors, heat_maps
-from undulog.replay.draw.cycles.response import charts
-from undulog.replay.draw.cycles.steps import cycle_tables, together
+from undulog.replay.draw.cycles.steps import charts, cycle_tables, together
 from undulog.replay.draw.scene.body import power_colors
-from undulog.replay.record.rrd import write_recording
+from undulog.replay.feed.recording import write_recording
+from undulog.replay.samples.content import ENERGY, GAIN, LAG, CycleTable
 
 STARTS = (0.0, 1.0, 2.0)
 STOPS = (1.0, 2.0, 3.0)

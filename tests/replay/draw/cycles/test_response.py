@@ -6,7 +6,7 @@ import math
 import pytest
 
 from undulog.analysis.results.estimate import Estimate
-from undulog.replay.draw.cycles.response import charts
+from undulog.replay.draw.cycles.steps import charts
 
 
 def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from undulog.replay.draw.plots.gait import changes, rhythm_of
-from undulog.replay.draw.scene.surroundings import trail_segments
+from undulog.replay.draw.scene.stage import trail_segments
 from undulog.replay.samples.tracks import Track
 
 T = np.arange(500, dtype=np.int64) * 10_000_000

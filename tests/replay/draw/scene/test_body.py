@@ -8,11 +8,11 @@ from undulog.capture.robot.kinematics import link_poses
 from undulog.replay.draw.scene.body import (
     ROUNDING,
     TURN_ROUNDING,
+    above_joints,
     capsule_columns,
     capsule_poses,
     capsule_shape,
 )
-from undulog.replay.draw.scene.markers import above_joints
 from undulog.replay.draw.scene.motion import HeadPath, assemble, frames_of
 from undulog.replay.samples.quantities import segment_power
 from undulog.replay.samples.tracks import Track

@@ -52,7 +52,7 @@ def angles():
 @pytest.fixture(scope="module")
 def file(robot, angles, tmp_path_factory):
     """That robot, recorded and converted."""
-    from undulog.replay.record.rrd import write_recording
+    from undulog.replay.feed.recording import write_recording
 
     folder = tmp_path_factory.mktemp("meshes")
     path = folder / "boxes.mcap"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import Session, SessionWriter
-from undulog.replay.record.rrd import write_recording
+from undulog.replay.feed.recording import write_recording
 from undulog.sim import load_scenario
 from undulog.sim.scenario.obstacles import Cylinder, Wall
 

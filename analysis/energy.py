@@ -1,0 +1,497 @@
+"""Energy of each joint, four ways, on the samples' own times.
+
+E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
+can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
+times motor current, signed and clipped. Where the log has the powers themselves, accumulated within
+each sampling interval (:class:`.PowerTopic`), their means are added up;
+else sampled factors are multiplied, and what the two do within an interval is lost. Gaps are not
+bridged: no time inside them counts.
+
+Energies against the twin's own ledger, where a session has one.
+
+The twin books energy at its physics rate. An analysis that has to multiply samples misses what
+happens between them; where the two differ by much, there is a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import DataError, LogError
+from undulog.capture.log.read.signals import Signal
+from undulog.capture.robot.model import Robot
+
+from .body.steps import GRAVITY, body_steps
+from .estimators.cycle_sums import Weighed, cycle_sums, weigh
+from .estimators.intervals import around, t_factor
+from .estimators.series import Series, clean
+from .results.analysis import Closure, Each, EnergyResult, JointCycles, Transport
+from .results.answer import Note
+from .results.estimate import Estimate
+from .signals.columns import Columns
+from .signals.windows import Span
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energies of one power signal, cycle by cycle.
+
+    Attributes:
+        net_j: Integral of the power in each cycle [J], shape (c,).
+        plus_j: Of its positive part [J], shape (c,).
+        coverage: Fraction of the window that has samples.
+        covered: Fraction of each cycle that has samples, shape (c,).
+    """
+
+    net_j: FloatArray
+    plus_j: FloatArray
+    coverage: float
+    covered: FloatArray
+
+    @property
+    def abs_j(self) -> FloatArray:
+        """Integral of the absolute power in each cycle, 2 plus - net [J], shape (c,)."""
+        return 2 * self.plus_j - self.net_j
+
+
+def integrate(
+    powers: Sequence[Series], start_s: float, stop_s: float, cycles: int = 1
+) -> list[Energy | None]:
+    """Integrate powers over one window; those with the same times are weighed once.
+
+    Args:
+        powers: Powers [W], each on its own times.
+        start_s: Start of the window [s].
+        stop_s: Its end, not included [s].
+        cycles: Parts of equal length that the window is cut into.
+
+    Returns:
+        The energies of each, or None where the window has no samples of it.
+    """
+    found: list[Energy | None] = []
+    last: Weighed | None = None
+    for power in powers:
+        part = power.between(start_s, stop_s)
+        if part.count < 2 or stop_s <= start_s:
+            found.append(None)
+            continue
+        if last is None or not np.array_equal(last.t_s, part.t_s):
+            last = weigh(part.t_s, start_s, stop_s, cycles)
+        work = last.weights * part.values
+        net = cycle_sums(work, last.starts)
+        plus = cycle_sums(np.maximum(work, 0.0, out=work), last.starts)
+        found.append(Energy(net, plus, last.coverage, last.covered))
+    return found
+
+
+def add_up(net: Series, plus: Series, start_s: float, stop_s: float, cycles: int) -> Energy | None:
+    """Add up mean powers over one window; each holds for one sampling interval about its time.
+
+    Args:
+        net: Mean powers [W], shape (n,).
+        plus: Means of their positive parts [W], at the same times.
+        start_s: Start of the window [s].
+        stop_s: Its end [s].
+        cycles: Parts of equal length that the window is cut into, c.
+
+    Returns:
+        The energies, or None where the window has no samples or the two differ in their times.
+    """
+    if stop_s <= start_s or net.count < 2 or not np.array_equal(net.t_s, plus.t_s):
+        return None
+    length_s = net.period_s
+    begin = net.t_s - length_s / 2
+    edges = np.linspace(start_s, stop_s, cycles + 1)
+    last = np.maximum(np.searchsorted(begin, edges, side="right") - 1, 0)
+    within = np.clip(edges - begin[last], 0.0, length_s)
+
+    def of(values: FloatArray) -> FloatArray:
+        before = np.concatenate(([0.0], np.cumsum(values)))[last] * length_s
+        return np.diff(before + values[last] * within)
+
+    time_s = of(np.ones(net.count))
+    if not time_s.any():
+        return None
+    share = np.minimum(time_s * cycles / (stop_s - start_s), 1.0)
+    return Energy(of(net.values), of(plus.values), float(share.mean()), share)
+
+
+def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
+    """Product of two signals as a power on the first one's times.
+
+    Args:
+        first: E.g. torque, or current.
+        second: E.g. velocity, or voltage; interpolated where it was sampled at other times, but
+            not across its gaps.
+        origin_ns: Unix time that becomes 0 s.
+
+    Returns:
+        The power [W].
+    """
+    if np.array_equal(first.t_ns, second.t_ns):
+        factor = second.values
+    else:
+        factor = _interpolate(first.t_ns, second)
+    return clean(first.name, first.t_ns, first.values * factor, origin_ns)
+
+
+def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
+    known = clean(signal.name, signal.t_ns, signal.values, int(t_ns[0]) if t_ns.size else 0)
+    if known.count < 2:
+        return np.full(t_ns.size, np.nan)
+    t_s = (t_ns - t_ns[0]).astype(np.float64) * 1e-9
+    values = known.at(t_s)
+    values[(t_s < known.t_s[0]) | (t_s > known.t_s[-1])] = np.nan
+    for k in known.gaps:
+        values[(t_s > known.t_s[k]) & (t_s < known.t_s[k + 1])] = np.nan
+    return values
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Energies of one joint.
+
+    Attributes:
+        mechanical: By torque and velocity; None where they were not recorded.
+        electrical: By voltage and current; None likewise.
+        sampled: Which of the two are products of samples: what the factors do within a sampling
+            interval is not in them.
+    """
+
+    mechanical: Energy | None
+    electrical: Energy | None
+    sampled: frozenset[str] = frozenset()
+
+
+STEADY_SHARE = 0.2
+"""A voltage that varies by less than this part of its mean is a supply's: a motor's follows the
+duty, through zero and back in every cycle."""
+
+
+def energy_result(
+    session: SessionView,
+    columns: Columns,
+    energies: Mapping[str, Energies],
+    span: Span,
+    *,
+    transport: Transport,
+    closure: Closure | None,
+    warn: Warn,
+) -> EnergyResult:
+    """Set the energies out in cycles.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+        energies: By joint name.
+        span: The window.
+        transport: Cost of transport.
+        closure: Against the ledger, or None.
+        warn: Told where E_el is made of the supply's voltage.
+
+    Returns:
+        The result.
+    """
+    shift_s = (span.origin_ns - session.start_ns) * 1e-9
+    edges = np.linspace(span.start_s, span.stop_s, max(span.cycles, 1) + 1) + shift_s
+    joints: list[JointCycles] = []
+    for name, one in energies.items():
+        mechanical, electrical = one.mechanical, one.electrical
+        joints.append(
+            JointCycles(
+                name,
+                net_j=_each(mechanical, "net_j"),
+                plus_j=_each(mechanical, "plus_j"),
+                abs_j=_each(mechanical, "abs_j"),
+                el_j=_each(electrical, "net_j"),
+                el_clipped_j=_each(electrical, "plus_j"),
+                coverage=_each(mechanical, "covered"),
+                el_coverage=_each(electrical, "covered"),
+            )
+        )
+    source = electrical_source(session, columns)
+    if source == "supply":
+        topic = columns.topics["voltage"]
+        warn(
+            f"{topic} stays as it is while the joints work, so it is the supply's, not the "
+            "motors': E_el is an upper bound"
+        )
+    return EnergyResult(
+        tuple(edges[:-1].tolist()),
+        tuple(edges[1:].tolist()),
+        tuple(joints),
+        source,
+        transport,
+        closure,
+        _unknown(energies.values()),
+    )
+
+
+def electrical_source(session: SessionView, columns: Columns) -> str | None:
+    """What electrical energy is made of.
+
+    Args:
+        session: An open session.
+        columns: Its columns.
+
+    Returns:
+        ``simulated``, ``motor``, ``supply``, or None where current or voltage was not recorded.
+    """
+    both = [name for name in columns.voltage if name in columns.current]
+    if not both:
+        return None
+    if "scenario" in session.metadata.get("undulog", {}):
+        return "simulated"
+    return "supply" if _all_steady(columns.voltage[name].values for name in both) else "motor"
+
+
+def _unknown(energies: Iterable[Energies]) -> str | None:
+    """What the log leaves open, in one sentence."""
+    sampled = frozenset[str]().union(*(one.sampled for one in energies))
+    factors = {"mechanical": "torque and velocity", "electrical": "voltage and current"}
+    parts = [f"{kind} energies are products of sampled {factors[kind]}" for kind in sorted(sampled)]
+    if not parts:
+        return None
+    return (
+        f"{' and '.join(reversed(parts))}: what these do within a sampling interval is not in the "
+        "log, so the error is unknown"
+    )
+
+
+def _all_steady(voltages: Iterable[FloatArray]) -> bool:
+    for values in voltages:
+        known = values[np.isfinite(values)]
+        if known.size and np.ptp(known) > STEADY_SHARE * abs(float(known.mean())):
+            return False
+    return True
+
+
+def _each(one: Energy | None, name: str) -> Each:
+    return None if one is None else tuple(getattr(one, name).tolist())
+
+
+LEDGER_TOPIC = "/energy_ledger"
+TERMS = {
+    "net": ("mechanical", "mechanical_net"),
+    "plus": ("mechanical", "mechanical_plus"),
+    "abs": ("mechanical", "mechanical_abs"),
+    "el": ("electrical", "electrical_net"),
+    "el_clipped": ("electrical", "electrical_plus"),
+}
+"""Energy to what it is of, and to its term in the ledger."""
+
+TOLERANCE = 0.05
+"""Difference, as a share of the absolute energy, that is worth a warning."""
+
+
+def check_ledger(
+    session: SessionView, energies: Iterable[Energies], span: Span, warn: Warn
+) -> Closure | None:
+    """Compare the joints' energies with the ledger's over the same window, and close its balance.
+
+    Args:
+        session: An open session.
+        energies: Of all joints.
+        span: The window.
+        warn: Told where they differ by more than ``TOLERANCE``.
+
+    Returns:
+        The closure, or None where the session has no ledger.
+    """
+    try:
+        booked = booked_energies(session, span)
+    except (DataError, LogError) as error:
+        warn(f"{LEDGER_TOPIC} can't be read: {error}")
+        return None
+    if booked is None:
+        return None
+    found = whole_robot(energies)
+    off: dict[str, float] = {}
+    for name, (kind, term) in TERMS.items():
+        if name in found and term in booked:
+            off[name] = found[name] - booked[term]
+            scale = max(found["abs" if kind == "mechanical" else "el_abs"], abs(booked[term]))
+            if name in ("net", "el") and abs(off[name]) > TOLERANCE * scale:
+                warn(
+                    f"{kind} energy is {found[name]:.4g} J from the samples but {booked[term]:.4g} "
+                    f"J in the twin's ledger ({LEDGER_TOPIC}): samples once a control cycle miss "
+                    "what happens within it"
+                )
+    whole = booked.get("mechanical_abs", 0.0)
+
+    def share(energy_j: float | None) -> float | None:
+        return None if energy_j is None or whole <= 0 else energy_j / whole
+
+    return Closure(
+        mechanical_balance=share(booked.get("mechanical_residual")),
+        electrical_balance=share(booked.get("electrical_residual")),
+        **{name: share(off.get(name)) for name in TERMS},
+    )
+
+
+def booked_energies(session: SessionView, span: Span) -> dict[str, float] | None:
+    """What the twin's ledger books over a window.
+
+    Args:
+        session: An open session.
+        span: The window.
+
+    Returns:
+        Energies of the whole robot [J], by the ledger's terms; None where there is no ledger.
+
+    Raises:
+        DataError: If the ledger's topic can't be read.
+        LogError: If the file can't.
+    """
+    if LEDGER_TOPIC not in session.channels:
+        return None
+    ledger = session.joints(LEDGER_TOPIC)
+    booked: dict[str, float] = {}
+    for name, t_ns, values in zip(ledger.names, ledger.t_ns, ledger.values, strict=True):
+        term = clean(name, t_ns, values, span.origin_ns)
+        if term.count > 1 and term.t_s[0] <= span.stop_s:
+            # Cumulative, so that a difference is the energy of the window.
+            late, early = (
+                float(np.interp(t, term.t_s, term.values)) for t in (span.stop_s, span.start_s)
+            )
+            booked[name] = late - early
+    return booked
+
+
+def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
+    """Energies of all joints together.
+
+    Args:
+        energies: Of the joints.
+
+    Returns:
+        Sums [J], by the names in :data:`TERMS`, with ``el_abs`` besides; those that no joint has
+        are absent.
+    """
+    joints = list(energies)
+    sums: dict[str, float] = {}
+    for kind, names in (
+        ("mechanical", ("net", "plus", "abs")),
+        ("electrical", ("el", "el_clipped", "el_abs")),
+    ):
+        known = [one for one in (getattr(joint, kind) for joint in joints) if one is not None]
+        for name, part in zip(names, ("net_j", "plus_j", "abs_j"), strict=True):
+            if known:
+                sums[name] = sum(float(getattr(one, part).sum()) for one in known)
+    return sums
+
+
+LEAST_WAY = 0.01
+"""Displacement in a cycle, over the body's length, below which a robot goes nowhere."""
+
+
+def transport(
+    session: SessionView,
+    responses: Mapping[str, Series],
+    energies: Mapping[str, Energies],
+    span: Span,
+    warn: Warn,
+) -> Transport:
+    """Cost of transport of a session.
+
+    Args:
+        session: An open session.
+        responses: Measured joint angles that can be trusted, by name.
+        energies: By joint name, in cycles.
+        span: Whole cycles.
+        warn: Told why there is no value.
+
+    Returns:
+        The cost, or the reason why it is not applicable.
+    """
+    mass = None if session.robot is None else session.robot.total_mass
+    nothing = Estimate()
+    distance = nothing
+    reasons: list[str] = []
+
+    def refuse(sentence: str) -> None:
+        reasons.append(sentence.rpartition("no cost of transport: ")[2])
+
+    steps = body_steps(session, responses, span, refuse)
+    if steps is not None and session.robot is not None:
+        distance = _distance(steps.forward_m)
+        reasons += _goes_nowhere(steps.forward_m, distance, session.robot)
+    if steps is None or reasons:
+        why = "; ".join(reasons)
+        warn(Note(f"cost of transport is not applicable: {why}"))
+        return Transport(distance, mass, *[nothing] * 5, why=why)
+    weighed = steps.mass_kg * GRAVITY * steps.forward_m
+    kinds = {
+        "mechanical": [one.mechanical for one in energies.values()],
+        "electrical": [one.electrical for one in energies.values()],
+    }
+    cost: dict[str, Estimate] = {}
+    lacking: list[str] = []
+    for kind, found in kinds.items():
+        sums = _sums(found)
+        if sums is None:
+            lacking.append(f"no {kind} energy of some joints")
+            sums = {}
+        for name in ("net", "plus", "abs"):
+            value = _ratio(sums[name], weighed) if name in sums else nothing
+            cost[f"{kind} {name}"] = value
+    if lacking:
+        warn(Note(f"cost of transport is partly null: {' and '.join(lacking)}"))
+    return Transport(
+        distance,
+        mass,
+        cost["mechanical net"],
+        cost["mechanical plus"],
+        cost["mechanical abs"],
+        cost["electrical net"],
+        cost["electrical plus"],
+        "; ".join(lacking),
+    )
+
+
+def _distance(way: FloatArray) -> Estimate:
+    """Net displacement, with the interval that its scatter over cycles gives."""
+    half = t_factor(way.size - 1) * float(way.std(ddof=1)) * way.size**0.5
+    total = float(way.sum())
+    return Estimate(total, around(total, half))
+
+
+def _goes_nowhere(way: FloatArray, distance: Estimate, robot: Robot) -> list[str]:
+    """Why a displacement can't be divided by; empty where it can."""
+    total = float(way.sum())
+    least = LEAST_WAY * sum(link.length for link in robot.links) * way.size
+    if total >= least and distance.ci95 is not None and distance.ci95[0] > 0:
+        return []
+    moved = f"the centre of mass moves by {1000 * total:.3g} mm in {way.size} cycles"
+    return [f"{moved}, which can't be told from 0"]
+
+
+def _sums(found: Sequence[Energy | None]) -> dict[str, FloatArray] | None:
+    """Energies of all joints together in each cycle; None if one is unknown."""
+    known = [one for one in found if one is not None]
+    if not known or len(known) < len(found):
+        return None
+    return {
+        "net": np.sum([one.net_j for one in known], axis=0),
+        "plus": np.sum([one.plus_j for one in known], axis=0),
+        "abs": np.sum([one.abs_j for one in known], axis=0),
+    }
+
+
+def _ratio(above: FloatArray, below: FloatArray) -> Estimate:
+    """Ratio of two sums over cycles, with the interval of a ratio estimator.
+
+    With r the ratio, var r = n / (n - 1) sum (a - r b)^2 / (sum b)^2 (Cochran, Sampling Techniques,
+    1977, section 6.3).
+    """
+    n, total = above.size, float(below.sum())
+    value = float(above.sum()) / total
+    scatter = float(np.sum((above - value * below) ** 2))
+    half = t_factor(n - 1) * (n / (n - 1) * scatter) ** 0.5 / abs(total)
+    return Estimate(value, around(value, half))

@@ -1,1 +1,0 @@
-"""What moving costs: energies by joint and cycle, cost of transport, closure of the balance."""

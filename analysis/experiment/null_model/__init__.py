@@ -1,1 +1,0 @@
-"""A session of one direction against a model of identical modules."""

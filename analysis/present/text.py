@@ -1,0 +1,376 @@
+"""The result as text for a terminal: the answer first, then the joints, the method last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+
+from undulog.capture.common import console as text_table
+from undulog.capture.common.console import UNLIMITED, plain
+
+from ..results import formats
+from ..results.analysis import Analysis, EnergyResult
+from ..results.estimate import Estimate
+from ..results.null_model import ModelledAnalysis, told_null
+from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, Link, LoopMode
+from . import tables
+from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
+
+_ABOUT = {
+    "sensor": "Artefact of the sensor",
+    "sensor or joint": "Sensor or joint",
+    "record": "Artefact of the record",
+    "limit": "At a limit",
+}
+
+_SPANS = 3
+"""Stretches of an artefact that a line names at most."""
+
+
+def more_lines(analysis: Analysis) -> Iterator[str]:
+    """Lines to print after the tables.
+
+    Args:
+        analysis: The result.
+
+    Yields:
+        Plain text without a line break.
+    """
+    if analysis.energy is not None:
+        yield from _energy(analysis.energy)
+    yield from _over_time(analysis)
+    yield from _dead_bands(analysis)
+    for one in analysis.artefacts:
+        spans = [f"{start:.2f} to {stop:.2f} s" for start, stop in one.spans_s[:_SPANS]]
+        more = len(one.spans_s) - _SPANS
+        times = ", ".join(spans) + (f" and {more} more" if more > 0 else "")
+        note = f" ({one.note})" if one.note else ""
+        where = f"{one.quantity} on {one.topic}" if one.topic else one.quantity
+        about = f"{plain(one.joint)}, {where}: {one.flag}{note}"
+        yield f"{_ABOUT[one.about]}: {about}{': ' if times else ''}{times}"
+
+
+def _dead_bands(analysis: Analysis) -> Iterator[str]:
+    """A line for each joint with stick or play: how far its command travels in vain."""
+    for joint in analysis.joints:
+        band = joint.dead_band
+        if band is None:
+            continue
+        ends = [
+            (Estimate(one.travel_rad, one.travel_ci95), Estimate(one.step_rad, one.step_ci95))
+            for one in (band.top, band.bottom)
+        ]
+        ends = ends[:1] if ends[0] == ends[1] else ends
+        widths = ", ".join(formats.estimate(formats.degrees(one), "°", most=2) for one, _ in ends)
+        steps = ", ".join(formats.estimate(formats.degrees(one), "°", most=2) for _, one in ends)
+        where = "both reversals" if len(ends) == 1 else "its upper and lower reversal"
+        lag = math.degrees(band.lag_change_rad)
+        yield (
+            f"Dead band: {plain(joint.name)}, {band.kind} ({band.evidence}): at {where} "
+            f"the command travels {widths} before the joint moves and catches up by {steps}; "
+            f"of gain and lag the dead band alone makes {band.gain_change:.3f} and {lag:.1f}°"
+        )
+
+
+def _energy(energy: EnergyResult) -> Iterator[str]:
+    cost = energy.transport
+    named = (("E_net", cost.net), ("E_abs", cost.abs), ("E_el", cost.el))
+    known = [f"{name} {formats.estimate(one, most=4)}" for name, one in named if one.value]
+    if known:
+        way = formats.estimate(cost.distance_m, " m", most=3)
+        yield f"Cost of transport E/(m g d): {', '.join(known)}, over {way}"
+    if energy.unknown is not None:
+        yield formats.sentence(energy.unknown)
+    closure = energy.closure
+    if closure is not None and closure.mechanical_balance is not None:
+        parts = [f"balance {100 * closure.mechanical_balance:.3f} %"]
+        parts += [] if closure.net is None else [f"E_net {100 * closure.net:.2f} %"]
+        parts += [] if closure.el is None else [f"E_el {100 * closure.el:.2f} %"]
+        yield f"Against the twin's ledger, in % of E_abs: {', '.join(parts)}"
+
+
+def _over_time(analysis: Analysis) -> Iterator[str]:
+    """The range of gain and lag over cycles, where there is no one gait to tell them for."""
+    if analysis.over_time is None or analysis.gait.frequency_hz.value is not None:
+        return
+    known = [
+        (gain, lag, rate)
+        for joint in analysis.over_time.joints
+        for gain, lag, rate in zip(joint.gain, joint.lag_rad, joint.frequency_hz, strict=True)
+        if gain is not None and lag is not None
+    ]
+    gains, lags, rates = (sorted(one[k] for one in known) for k in range(3))
+    low, high = (formats.degrees(Estimate(one)).value for one in (lags[0], lags[-1]))
+    yield (
+        f"Cycle by cycle, by the logged phase: {len(analysis.over_time.joints)} joints, gain "
+        f"{formats.number(gains[0], 2)} to {formats.number(gains[-1], 2)}, lag "
+        f"{formats.number(low, 1)} to {formats.number(high, 1)}°, {rates[0]:.2f} to "
+        f"{rates[-1]:.2f} Hz (--json has each)"
+    )
+
+
+def chain_detail(chain: ChainCoupling) -> Iterable[str]:
+    """A chain of oscillators, told from its phases.
+
+    Args:
+        chain: The result.
+
+    Yields:
+        Sentences; the first is the answer.
+    """
+    where = f"Oscillators, {chain.plane}:"
+    if not chain.identifiable:
+        record = f" To tell it, record {chain.record}." if chain.record else ""
+        yield f"{where} coupling not identifiable: {chain.why}.{record}"
+        return
+    number = chain.condition_number
+    condition = formats.MISSING if number is None else f"{number:.3g}"
+    strongest = max(chain.links, key=lambda link: link.K.value or 0.0)
+    yield (
+        f"{where} {len(chain.links)} couplings told (condition number {condition}); the strongest "
+        f"is {strongest.source} on {strongest.target}, K = {formats.estimate(strongest.K, ' 1/s')}."
+    )
+    yield f"K [1/s]: {'; '.join(_link(link) for link in chain.links)}."
+    fed = [one for one in chain.oscillators if one.feedback.value is not None]
+    if fed:
+        told = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
+        yield f"Feedback of each servo's own angle [1/s]: {told}."
+    yield f"Method: {chain.why}, {chain.duration_s:.3g} s of phases."
+
+
+def body_detail(body: BodyOscillators) -> Iterable[str]:
+    """What oscillators that feel their servos would do on this body.
+
+    Args:
+        body: The result.
+
+    Yields:
+        Sentences; the first is the answer.
+    """
+    yield f"Oscillators that feel their servos: {body.answer}."
+    worst = max(mode.sensitivity for mode in body.modes)
+    noise = body.pseudospectrum.noise
+    yield (
+        f"I - P is a signed Laplacian and not normal (a rate moves by up to {worst:.1f} times an "
+        f"error of P, whose norm is below {noise:.2g}); a deviation may grow for a while at "
+        f"{formats.estimate(body.growth, ' eps')}."
+    )
+
+
+def _link(link: Link) -> str:
+    return f"{link.source} on {link.target} {formats.estimate(link.K)}"
+
+
+class Sheet:
+    """The text of a result for a terminal: sentences, wrapped, and tables."""
+
+    def __init__(self, width: int, *, color: bool) -> None:
+        """Begin.
+
+        Args:
+            width: Columns of the terminal.
+            color: Whether to use bold and dim type.
+        """
+        from rich.console import Console
+
+        self._text = StringIO()
+        self._console = Console(
+            file=self._text,
+            width=max(width, 40),
+            color_system="standard" if color else None,
+            force_terminal=color,
+            highlight=False,
+            markup=False,
+            emoji=False,
+        )
+
+    def print(self, line: str = "", style: str = "") -> None:
+        """Add a sentence.
+
+        Args:
+            line: Any text; what would end a line or control a terminal is escaped.
+            style: Of the line.
+        """
+        self._console.print(plain(line), style=style)
+
+    def table(self, table: tables.AnyTable) -> None:
+        """Add a table, without what it can spare where the terminal is too narrow for all of it.
+
+        Args:
+            table: The table.
+        """
+        columns = [column for column in table.columns if column.text is not None]
+        cells = zip(*(column.cells(table.rows, TERMINAL) for column in columns), strict=True)
+        styles = ["bold" if table.bold(row) else "" for row in table.rows]
+        heads = [
+            text_table.Column(column.text or "", left=column.kind != "number", spare=column.spare)
+            for column in columns
+        ]
+        rows = [
+            [(_shown(cell), style) for cell in row]
+            for row, style in zip(cells, styles, strict=True)
+        ]
+        lines, left_out = text_table.table(heads, rows, self._console.width)
+        for line in lines:
+            self._console.print(line, soft_wrap=True)
+        if left_out:
+            names = ", ".join(left_out)
+            self.print(f"Without {names}: the terminal is too narrow; --json has all.", "dim")
+
+    def text(self) -> str:
+        """Return all of it.
+
+        Returns:
+            Several lines, the last one ended.
+        """
+        return "\n".join(line.rstrip() for line in self._text.getvalue().splitlines()) + "\n"
+
+
+def _shown(cell: Cell) -> str:
+    match cell:
+        case None:
+            return formats.MISSING
+        case Quantity(estimate, decimals, unit):
+            value = formats.number(estimate.value, decimals) + unit
+            return f"{value} {formats.interval(estimate.ci95, decimals)}".rstrip()
+        case Ends(low, high):
+            return f"{_shown(low)} to {_shown(high)}"
+        case PValue():
+            return formats.p_value(cell)
+        case _:
+            return str(cell)
+
+
+def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -> str:
+    """Set a result as text.
+
+    Args:
+        analysis: The result.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        Several lines, the last one ended.
+    """
+    sheet = Sheet(width, color=color)
+    name, answer = Path(analysis.session.path).name, analysis.answer
+    sheet.print(f"{name}: {answer.sentence}", "bold")
+    sheet.print(answer.detail)
+    moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
+    shown: list[tables.AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
+    if analysis.body is not None:
+        shown.append(tables.body_table(analysis.body))
+    if any(one.value is not None for one in analysis.heterogeneity.values()):
+        shown.append(tables.index_table(analysis.heterogeneity))
+    for table in shown:
+        sheet.print()
+        sheet.table(table)
+    sheet.print()
+    for line in more_lines(analysis):
+        sheet.print(line)
+    coupling = analysis.coupling
+    if not coupling.identifiable:
+        record = f" To identify it, record {coupling.record}." if coupling.record else ""
+        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    for chain in analysis.oscillators:
+        for line in chain_detail(chain):
+            sheet.print(line)
+    if isinstance(analysis, ModelledAnalysis):
+        for line in told_null(analysis.null_model):
+            sheet.print(line)
+    for warning in analysis.warnings:
+        sheet.print(f"Warning: {warning}")
+    sheet.print(_method(analysis), "dim")
+    for note in analysis.notes:
+        sheet.print(f"Note: {note}", "dim")
+    return sheet.text()
+
+
+def _method(analysis: Analysis) -> str:
+    spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in analysis.gait.windows)
+    cycles = sum(w.cycles for w in analysis.gait.windows)
+    gait = analysis.gait
+    if gait.frequency_hz.value is None:
+        return f"Method: energies integrated on the samples' own times over {spans}."
+    fitted = gait.fitted
+    span = "" if fitted is None else f" of {fitted.start_s:.2f} to {fitted.stop_s:.2f} s"
+    rhythm = f"one frequency for all joints: {formats.estimate(gait.frequency_hz, ' Hz', most=6)}"
+    if len(gait.groups) > 1:
+        rhythm = (
+            "one frequency for each group of joints, with the harmonics of all in every joint: "
+            f"{formats.gait_frequency(gait)}"
+        )
+    return (
+        f"Method: harmonic least squares{span} on each sample's own time, {rhythm}; "
+        "95 % intervals from the residual's spectrum beside it, Student's t; "
+        f"lag positive = response late; energies over {cycles:.0f} whole cycles, {spans}."
+    )
+
+
+_PART = 0.5
+"""Joints with this share of a pattern's largest are named."""
+
+
+def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False) -> str:
+    """Set a prediction as text.
+
+    Args:
+        loop: The prediction.
+        width: Columns of the terminal.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        Several lines, the last one ended.
+    """
+    sheet = Sheet(width, color=color)
+    sheet.print(formats.sentence(loop.answer), "bold")
+    for line in loop.limits:
+        sheet.print(formats.sentence(line))
+    sheet.print()
+    sheet.table(_mode_table(loop))
+    if loop.relaxation is not None:
+        first, last = (np.array(loop.relaxation.phase_rad[k]) for k in (0, -1))
+        left = np.linalg.norm(last - last.mean()) / np.linalg.norm(first - first.mean())
+        sheet.print()
+        sheet.print(
+            f"Of the kick {100 * left:.0f} % of what tells the phases apart is left after "
+            f"{loop.relaxation.times_s[-1]:.1f} s; all phases over time with --json."
+        )
+    sheet.print(
+        "Method: d phi' = eps (diag(g cos D)(P - I) + diag(g sin D) R) d phi, nothing fitted; "
+        f"g and D the gain and lag at {loop.frequency_hz:.3g} Hz"
+        + (f", an age of {loop.age_s:g} s included" if loop.age_s > 0 else "")
+        + "; intervals by drawing the errors of P, R, g and D anew.",
+        "dim",
+    )
+    return sheet.text()
+
+
+def _mode_table(loop: ClosedLoop) -> Table[tuple[int, LoopMode]]:
+    columns: list[Column[tuple[int, LoopMode]]] = [
+        Column("pattern", None, lambda row: str(row[0]), kind="word"),
+        Column("rate 1/s (95 %)", None, lambda row: formats.estimate(row[1].rate, most=5)),
+        Column("time s", None, lambda row: _time(row[1].rate.value or 0.0)),
+        Column("turns rad/s", None, lambda row: row[1].turning.value, (4, 4), spare=1),
+        Column("mostly in", None, lambda row: _mostly(row[1], loop.joints), kind="word", spare=2),
+    ]
+    return Table(columns, list(enumerate(loop.modes, start=1)))
+
+
+def _time(rate: float) -> str:
+    time = formats.number(1 / abs(rate), 1) if abs(rate) > 0 else formats.MISSING
+    return f"{time}{' (grows)' if rate < 0 else ''}"
+
+
+def _mostly(mode: LoopMode, joints: tuple[str, ...]) -> str:
+    """Joints with most of a pattern, and their signs against the largest."""
+    share = np.array(mode.pattern_abs)
+    turn = np.array(mode.pattern_rad) - mode.pattern_rad[int(np.argmax(share))]
+    return " ".join(
+        f"{'+' if math.cos(turn[k]) >= 0 else formats.MINUS}{joints[k]}"
+        for k in np.flatnonzero(share >= _PART * share.max()).tolist()
+    )

@@ -1,1 +1,0 @@
-"""Results as sentences and tables for a terminal."""

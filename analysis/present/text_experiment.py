@@ -1,0 +1,322 @@
+"""An experiment as text for a terminal: the answer first, then mirror pairs and runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from undulog.capture.common.console import UNLIMITED, plain
+
+from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS
+from ..experiment.answer import kick_detail, sweep_detail, sweep_method
+from ..experiment.reversal.modules import SIGNIFICANT
+from ..results import formats
+from ..results.comparison import Change, Comparison, Equivalence
+from ..results.coupling import LinearCoupling, LocalCoupling
+from ..results.estimate import Estimate
+from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
+from .tables import difference_table, mirror_table, run_table, waveform_table
+from .text import Sheet, body_detail
+
+MOST_CHANGES = 12
+"""Lines of what was changed; the rest is in the JSON."""
+
+_DESIGNS = {
+    "sessions": "one session a side, errors from each session's own noise (Welch-Satterthwaite)",
+    "groups": "independent runs, errors from their scatter (Welch)",
+    "pairs": "paired runs, errors from the scatter of their differences",
+}
+
+
+def render_comparison(
+    comparison: Comparison, *, width: int = UNLIMITED, color: bool = False
+) -> str:
+    """Set a comparison as text.
+
+    Args:
+        comparison: The result.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        Several lines, the last one ended.
+    """
+    sheet = Sheet(width, color=color)
+    sheet.print(f"{comparison.answer}.", "bold")
+    for side, sessions in (("A", comparison.a), ("B", comparison.b)):
+        names = ", ".join(plain(Path(one.path).name) for one in sessions)
+        sheet.print(f"{side}: {names}")
+    if comparison.partial is not None:
+        sheet.print(f"Partial: {comparison.partial}")
+    sheet.print()
+    for line in _changed(comparison.changed):
+        sheet.print(line)
+    sheet.print()
+    sheet.table(difference_table(comparison))
+    if comparison.waveforms:
+        sheet.print()
+        sheet.table(waveform_table(comparison))
+    sheet.print()
+    sheet.print(_equivalence(comparison))
+    for warning in comparison.warnings:
+        sheet.print(f"Warning: {plain(warning)}")
+    sheet.print(f"Method: {comparison_method(comparison)}", "dim")
+    return sheet.text()
+
+
+def _changed(changed: tuple[Change, ...]) -> list[str]:
+    if not changed:
+        return ["What was changed: the sessions say nothing of it; what they say is the same."]
+    lines = ["What was changed (A, then B):"]
+    for one in changed[:MOST_CHANGES]:
+        a, b = (
+            formats.short(value) if value is not None else "not set" for value in (one.a, one.b)
+        )
+        lines.append(f"  {plain(one.name)}: {a} -> {b}")
+    rest = len(changed) - MOST_CHANGES
+    return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
+
+
+def margin_told(one: Equivalence, value: float | None = None) -> str:
+    """A margin, or a difference that is held to it, in the unit people read.
+
+    Args:
+        one: The test.
+        value: In the test's unit; its margin if None.
+
+    Returns:
+        For example ``2 %``, ``0.35°`` or ``0.01 J``.
+    """
+    factor, unit = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}.get(
+        one.unit, (1.0, f" {one.unit}")
+    )
+    if one.quantity == "gain":
+        factor, unit = 100.0, " %"
+    return f"{(one.margin if value is None else value) * factor:.2g}{unit}"
+
+
+def _equivalence(comparison: Comparison) -> str:
+    parts: list[str] = []
+    for one in comparison.equivalence:
+        shown = "yes" if one.p < SIGNIFICANT_DIFFERENCE else "not shown"
+        parts.append(
+            f"{WORDS[one.quantity]} within {margin_told(one)} {shown} (p {formats.p_value(one.p)})"
+        )
+    return f"The same within margins: {'; '.join(parts)}."
+
+
+def comparison_method(comparison: Comparison) -> str:
+    """How a comparison was made.
+
+    Args:
+        comparison: The result.
+
+    Returns:
+        One sentence, beginning in lower case.
+    """
+    return (
+        f"aligned by gait phase; {_DESIGNS[comparison.design]}; decisions over all "
+        f"{len(comparison.differences)} quantities after Holm at "
+        f"{100 * SIGNIFICANT_DIFFERENCE:g} %, "
+        "intervals hold together at 95 % after Bonferroni; the same within margins: two one-sided "
+        "tests (TOST), each claim by itself at 5 %."
+    )
+
+
+_MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
+"""How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
+
+
+def render_experiment(
+    experiment: Experiment, *, width: int = UNLIMITED, color: bool = False
+) -> str:
+    """Set an experiment as text.
+
+    Args:
+        experiment: The result.
+        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        color: Whether to use bold and dim type.
+
+    Returns:
+        Several lines, the last one ended.
+    """
+    sheet = Sheet(width, color=color)
+    count = len(experiment.sessions)
+    sheet.print(f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.", "bold")
+    reversal = experiment.reversal
+    if reversal is not None:
+        for line in reversal_detail(reversal):
+            sheet.print(line)
+        sheet.print()
+        sheet.table(mirror_table(reversal))
+    if isinstance(experiment.coupling, LocalCoupling):
+        for line in kick_detail(experiment.coupling):
+            sheet.print(line)
+    if experiment.oscillators is not None:
+        for line in body_detail(experiment.oscillators):
+            sheet.print(line)
+    if isinstance(experiment.coupling, LinearCoupling):
+        for line in sweep_detail(experiment.coupling):
+            sheet.print(line)
+    sheet.print()
+    sheet.table(run_table(experiment))
+    sheet.print()
+    own = [f"{warning} ({names})" for warning, names in by_warning(experiment)]
+    for warning in (*experiment.warnings, *own):
+        sheet.print(f"Warning: {warning}")
+    coupling = experiment.coupling
+    if not coupling.identifiable:
+        record = f" To identify it, record {coupling.record}." if coupling.record else ""
+        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    sheet.print(f"Method: {method(experiment)}", "dim")
+    for note, names in by_note(experiment):
+        sheet.print(f"Note: {note} ({names})", "dim")
+    return sheet.text()
+
+
+def reversal_detail(reversal: Reversal) -> Iterable[str]:
+    """What stands below the answer.
+
+    Args:
+        reversal: The test.
+
+    Yields:
+        Sentences.
+    """
+    for pair in reversal.pairs:
+        yield (
+            f"{pair.name} against its mirror {pair.mirror}, over both directions: "
+            f"{_gain(pair.log_gain_contrast)} in gain, {_lag(pair.lag_contrast_rad)} in lag "
+            f"({formats.told_p(pair.p)}, ordered by {pair.by})."
+        )
+    if reversal.pairs:
+        first = reversal.pairs[0]
+        yield (
+            f"Which of the two differs, the contrast can't decide: swap {first.name} for another "
+            "module and record again, or compare one direction with a model (--null)."
+        )
+    if reversal.p < SIGNIFICANT:
+        yield _tilt(reversal.tilt, reversal.middle)
+    shares = (reversal.module_share, reversal.boundary_share)
+    if shares[0].value is not None:
+        yield (
+            f"Spread over the joints: modules {formats.percent(shares[0])}, "
+            f"boundary {formats.percent(shares[1])}."
+        )
+    if max(reversal.equivalence_gain_p, reversal.equivalence_lag_p) < SIGNIFICANT:
+        yield "Shown to be alike: every mirror pair within 2 % and 1°."
+    yield f"The test is {reversal.blind}."
+
+
+def _tilt(tilt: FloorTilt, middle: str | None) -> str:
+    """What speaks for and against a tilted floor."""
+    lean = ""
+    if tilt.gravity_rad.value is not None:
+        fall = formats.estimate(formats.degrees(tilt.gravity_rad), "°", most=2)
+        lean = f" Recorded gravity: the floor falls by {fall} along the body."
+    if tilt.headings is Headings.BALANCED:
+        return f"A tilted floor cancels: {tilt.strata} sets of mirror-image runs.{lean}"
+    checks = f"the common part is {formats.estimate(tilt.ratio, most=2)} of the contrast"
+    if tilt.middle is not None:
+        middle_size = formats.number(tilt.middle, 2) if math.isfinite(tilt.middle) else "any size"
+        checks += f", the middle joint {middle} at most {middle_size} of the largest contrast"
+    verdict = "excluded" if tilt.excluded else "not excluded"
+    return f"A tilted floor is {verdict}: {checks} (a tilt makes both large).{lean}"
+
+
+def _gain(log_gain: Estimate) -> str:
+    return formats.estimate(formats.relative(log_gain), " %", most=2)
+
+
+def _lag(lag_rad: Estimate) -> str:
+    return formats.estimate(formats.degrees(lag_rad), "°", most=2)
+
+
+def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
+    """Return the sessions' own warnings, each once, without what the experiment itself answers.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Warning, and the names of the files that have it, or ``all sessions``.
+    """
+    return _by_sentence(experiment, [one.warnings for one in experiment.sessions])
+
+
+def by_note(experiment: Experiment) -> list[tuple[str, str]]:
+    """Return the sessions' own notes, each once, without what the experiment itself answers.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        Note, and the names of the files that have it, or ``all sessions``.
+    """
+    return _by_sentence(experiment, [one.notes for one in experiment.sessions])
+
+
+def _by_sentence(
+    experiment: Experiment, sentences: Sequence[Sequence[str]]
+) -> list[tuple[str, str]]:
+    expected = ["boundary or module:"]
+    if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
+        expected += _MANY_TONES
+    files: dict[str, list[str]] = {}
+    for session, own in zip(experiment.sessions, sentences, strict=True):
+        for sentence in own:
+            if not sentence.startswith(tuple(expected)):
+                files.setdefault(sentence, []).append(Path(session.session.path).name)
+    everyone = len(experiment.sessions)
+    return [
+        (sentence, "all sessions" if len(names) == everyone else ", ".join(names))
+        for sentence, names in files.items()
+    ]
+
+
+def method(experiment: Experiment) -> str:
+    """How the numbers of an experiment were made.
+
+    Args:
+        experiment: The result.
+
+    Returns:
+        One sentence, beginning in lower case.
+    """
+    coupling = experiment.coupling
+    if isinstance(coupling, LocalCoupling):
+        return _kick_method(coupling)
+    if isinstance(coupling, LinearCoupling):
+        return sweep_method(coupling)
+    return _reversal_method(experiment.reversal)
+
+
+def _kick_method(coupling: LocalCoupling) -> str:
+    return (
+        f"local kicks, {coupling.kicked_runs} runs around {coupling.base_runs} without a "
+        "kick: central differences of each joint's phase and log amplitude, intervals at 95 % from "
+        "the noise within runs and the scatter between them (Student's t), that of the largest "
+        "coupling of all together, those of indices at least 95 %; all four matrices with --json."
+    )
+
+
+def _reversal_method(reversal: Reversal | None) -> str:
+    if reversal is None:
+        return "each session by itself as undulog analyse gives it; nothing is pooled."
+    tried = (
+        f"all {reversal.labellings}"
+        if reversal.labellings_tried == reversal.labellings
+        else f"{reversal.labellings_tried} random ones of {reversal.labellings}"
+    )
+    within = " within each set of mirror-image runs" if reversal.tilt.strata > 1 else ""
+    return (
+        f"reversal, {reversal.forward_runs} + {reversal.reverse_runs} runs: each joint "
+        "with the wave from head to tail minus its mirror joint with the wave from tail to head; "
+        "largest studentised contrast or common part of a pair T = "
+        f"{formats.number(reversal.statistic, 2)}, its null by "
+        f"dealing out the runs' labels anew{within} ({tried}; p can't go below "
+        f"{formats.number(reversal.p_floor, 4)}), family-wise over pairs, gain and lag, so that "
+        "5 % is the level of the whole answer; intervals hold together at 95 %, those of shares by "
+        "bootstrap over runs."
+    )

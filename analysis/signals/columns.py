@@ -1,0 +1,280 @@
+"""The columns of a session that an analysis needs, and what is known about how it was run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from undulog.capture import SessionView
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import DataError, MissingChannelError
+from undulog.capture.following.session import MOST_JOINTS
+from undulog.capture.log.messages.definitions import PowerTopic
+from undulog.capture.log.read.signals import JointSignals, Signal
+from undulog.capture.robot.model import Robot
+
+from ..results.answer import Lacking, Note
+
+DRAG_RATIO = 10.0
+"""K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""
+
+COMMAND_TOPIC = "/joint_commands"
+RESPONSE_TOPIC = "/joint_states"
+CURRENT_TOPIC = "/joint_current"
+VOLTAGE_TOPIC = "/joint_voltage"
+
+QUANTITIES = ("command", "position", "velocity", "effort", "current", "voltage", "reference")
+"""What is read of each joint."""
+
+_OF_ITS_OWN = {
+    "velocity": ("/joint_velocity", "position"),
+    "effort": ("/joint_effort", "position"),
+}
+
+_CONTRACT = {"/joint_sample_offset", "/joint_command_offset", "/joint_temperature", "/gait"} | {
+    *("/energy_ledger", CURRENT_TOPIC, VOLTAGE_TOPIC, "/joint_velocity", "/joint_effort"),
+    *PowerTopic,
+}
+"""JointStates that are neither commands nor positions."""
+
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Signals by joint name; a joint or a quantity that was not recorded is absent.
+
+    Attributes:
+        names: All joints, head to tail.
+        command: Commanded positions [rad].
+        position: Measured positions [rad].
+        velocity: [rad/s].
+        effort: [N m].
+        current: Motor current [A].
+        voltage: Motor voltage [V].
+        reference: Positions by a second sensor [rad].
+        powers: Mean powers [W] that were accumulated within each sampling interval, by topic.
+        topics: Quantity, as the attributes above are called, to the topic that it was read from.
+    """
+
+    names: tuple[str, ...]
+    command: Mapping[str, Signal]
+    position: Mapping[str, Signal]
+    velocity: Mapping[str, Signal]
+    effort: Mapping[str, Signal]
+    current: Mapping[str, Signal]
+    voltage: Mapping[str, Signal]
+    reference: Mapping[str, Signal]
+    powers: Mapping[PowerTopic, Mapping[str, Signal]]
+    topics: Mapping[str, str]
+
+    def of(self, quantity: str) -> Mapping[str, Signal]:
+        """One quantity by its name.
+
+        Args:
+            quantity: One of ``QUANTITIES``.
+
+        Returns:
+            Signals by joint name.
+        """
+        signals: Mapping[str, Signal] = getattr(self, quantity)
+        return signals
+
+
+def read_columns(
+    session: SessionView,
+    command_topic: str,
+    response_topic: str,
+    warn: Warn,
+    *,
+    reference_topic: str | None = None,
+) -> Columns:
+    """Read what is there, and say what is not.
+
+    Args:
+        session: An open session.
+        command_topic: JointState topic of the commands.
+        response_topic: JointState topic of the responses.
+        warn: Takes one sentence for each thing missing.
+        reference_topic: JointState topic of a second sensor of the positions, or None.
+
+    Returns:
+        The columns.
+
+    Raises:
+        MissingChannelError: If neither topic is there, or one that was chosen is not; the message
+            lists those that are.
+            those that are.
+        DataError: If a topic is not of JointStates, or there are too many joints.
+    """
+    wanted = {
+        "command": (command_topic, "position"),
+        "position": (response_topic, "position"),
+        "velocity": (response_topic, "velocity"),
+        "effort": (response_topic, "effort"),
+        "current": (CURRENT_TOPIC, "position"),
+        "voltage": (VOLTAGE_TOPIC, "position"),
+        **{topic: (topic, "position") for topic in PowerTopic},
+    }
+    if reference_topic is not None:
+        wanted["reference"] = (reference_topic, "position")
+    joint_topics = sorted(
+        topic for topic, one in session.channels.items() if one.type_name == _JOINT_STATE
+    )
+    asked = [(command_topic, response_topic)]
+    asked += [] if reference_topic is None else [(reference_topic,)]
+    named = [(command_topic, COMMAND_TOPIC), (response_topic, RESPONSE_TOPIC)]
+    asked += [(topic,) for topic, usual in named if topic != usual]  # chosen, so it must be there
+    for topics in asked:
+        if not set(topics) & set(session.channels):
+            there = joint_topics or sorted(session.channels)
+            raise MissingChannelError(session.path, _wanted(topics, session.warnings), there)
+    wanted = {key: one for key, one in wanted.items() if one[0] in session.channels}
+    found = _read(session, wanted)
+    if response_topic == RESPONSE_TOPIC:
+        # A bus that gives them in frames of their own has them on topics of their own.
+        own = {key: one for key, one in _OF_ITS_OWN.items() if one[0] in session.channels}
+        own = {key: one for key, one in own.items() if key not in found}
+        found |= _read(session, own) if own else {}
+        wanted |= own
+    others = [one for one in joint_topics if one not in _CONTRACT]
+    for key, kind, topic in (
+        ("command", "commands", command_topic),
+        ("position", "positions", response_topic),
+    ):
+        if key not in found:
+            option = "--command-topic" if key == "command" else "--response-topic"
+            spare = [one for one in others if one not in (command_topic, response_topic)]
+            named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
+            told = f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"
+            warn(Lacking(told))
+    accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
+    if not accumulated and ("velocity" not in found or "effort" not in found):
+        lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
+        warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
+    _check_voltage(session, found, warn)
+    names = session.robot.joint_names if session.robot is not None else ()
+    seen = dict.fromkeys(names)
+    for key in ("command", "position"):
+        if key in found:
+            seen |= dict.fromkeys(found[key].names)
+    if len(seen) > MOST_JOINTS:
+        raise DataError(
+            f"{session.path.name}: {len(seen)} joints on {response_topic} and {command_topic}; at "
+            f"most {MOST_JOINTS} are analysed"
+        )
+    by_name = {
+        key: {name: signals.signal(name) for name in signals.names}
+        for key, signals in found.items()
+    }
+    absent: dict[str, Signal] = {}
+    return Columns(
+        names=tuple(seen),
+        **{key: by_name.get(key, absent) for key in QUANTITIES},
+        powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
+        topics={key: wanted[key][0] for key in found},
+    )
+
+
+def settle_time_s(session: SessionView) -> float:
+    """Settling time that the session states [s]; 0 where it states none.
+
+    Args:
+        session: An open session.
+
+    Returns:
+        From the session's start.
+    """
+    return session.settle_s or 0.0
+
+
+def drag_ratio(session: SessionView) -> float:
+    """Ratio of the drag across a link to that along it, for the viscous null.
+
+    Args:
+        session: An open session.
+
+    Returns:
+        That of the twin's ground, else the default.
+    """
+    stated = None if session.run is None else session.run.drag_ratio
+    return DRAG_RATIO if stated is None else stated
+
+
+def planes_of(robot: Robot | None) -> dict[str, str]:
+    """Plane of each joint by name; empty without a robot description.
+
+    Args:
+        robot: The robot, or None.
+
+    Returns:
+        Joint name to ``horizontal`` or ``vertical``.
+    """
+    if robot is None:
+        return {}
+    return {joint.name: joint.plane.value for joint in robot.joints}
+
+
+def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
+    """Joint names by plane.
+
+    Args:
+        robot: The robot, or None.
+        names: Joint names.
+
+    Returns:
+        Plane to names, in their order; all under ``chain`` without a robot description.
+    """
+    planes = planes_of(robot)
+    result: dict[str, list[str]] = {}
+    for name in names:
+        result.setdefault(planes.get(name, "chain"), []).append(name)
+    return result
+
+
+def _wanted(topics: Sequence[str], warnings: Sequence[str]) -> str:
+    """What is missing; where the file itself is not whole, that is why."""
+    told = " or ".join(topics)
+    return f"{told} ({'; '.join(warnings)})" if warnings else told
+
+
+def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
+    """All in one pass if all are there; else one by one, leaving out what is empty."""
+    topics: dict[str, list[str]] = {}
+    for topic, field in wanted.values():
+        fields = topics.setdefault(topic, [])
+        if field not in fields:
+            fields.append(field)
+    try:
+        found = session.joint_columns(topics)
+        return {key: found[one] for key, one in wanted.items()}
+    except MissingChannelError:
+        some: dict[str, JointSignals] = {}
+        for key, (topic, field) in wanted.items():
+            try:
+                some[key] = session.joints(topic, field)
+            except MissingChannelError:
+                continue
+        return some
+
+
+def _check_voltage(session: SessionView, found: dict[str, JointSignals], warn: Warn) -> None:
+    """E_el needs the voltage at the motor: a bridge's duty times the supply, not the supply."""
+    lacking = [
+        topic
+        for key, topic in (("current", CURRENT_TOPIC), ("voltage", VOLTAGE_TOPIC))
+        if key not in found
+    ]
+    accumulated = PowerTopic.ELECTRICAL in found and PowerTopic.ELECTRICAL_PLUS in found
+    if lacking:
+        if not accumulated:
+            warn(Note(f"no {' and no '.join(lacking)}: electrical energies are null"))
+        found.pop("current", None)
+        return
+    if not accumulated and "scenario" not in session.metadata.get("undulog", {}):
+        warn(
+            Note(
+                f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, "
+                "E_el is too large"
+            )
+        )

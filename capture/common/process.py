@@ -1,0 +1,221 @@
+"""Ending on request: a signal becomes a flag, so that a loop ends between two samples.
+
+A recorder or a simulation that is told to stop must leave a whole file. Inside
+:func:`interruptible` the first SIGINT, SIGTERM or SIGHUP sets ``requested``; a second one of the
+same kind acts as it would have without us, for a loop that doesn't look. A loop that has to end in
+an orderly way even then takes two: the second one sets ``again``.
+
+Priority of the threads that empty the kernel's buffers: these hold milliseconds of a busy bus.
+
+Real-time priority is asked for first, and of that the lowest (SCHED_RR 1): where a system groups
+processes by session or service, nice values count only within a group. A recorder takes some tenth
+of a core; the kernel leaves others at least 5 % of each. Who started it with a positive nice value
+or a policy of its own is left in peace.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TypeVar
+
+from .errors import UsageError
+
+NICE = -10
+"""Asked for where real-time priority is refused."""
+
+_REAL_TIME = os.sched_param(1)
+_RESET = os.SCHED_RESET_ON_FORK  # for what the recorder starts: a viewer, a shell
+
+
+@dataclass(frozen=True)
+class Priority:
+    """What became of the request.
+
+    Attributes:
+        text: The priority, e.g. ``SCHED_RR 1``, or that it was refused.
+        refused: Whether it was.
+    """
+
+    text: str
+    refused: bool = False
+
+
+@contextmanager
+def raised_priority() -> Generator[Priority]:
+    """Raise the priority of all threads that the process has at the moment, and lower it again.
+
+    Yields:
+        What they have got.
+    """
+    policy, nice = os.sched_getscheduler(0) & ~_RESET, os.getpriority(os.PRIO_PROCESS, 0)
+    if policy != os.SCHED_OTHER or nice > 0:
+        yield Priority(f"as it was started: {_named(policy, nice)}")
+        return
+    try:
+        _set_all(os.SCHED_RR, nice)
+        got = Priority("SCHED_RR 1")
+    except PermissionError:
+        try:
+            _set_all(os.SCHED_OTHER, min(nice, NICE))
+            got = Priority(f"nice {min(nice, NICE)}")
+        except PermissionError:
+            got = Priority(f"refused: {_named(policy, nice)}", refused=True)
+    try:
+        yield got
+    finally:
+        _set_all(os.SCHED_OTHER, nice)
+
+
+def share_priority() -> None:
+    """Give the calling thread the priority of the main thread; for threads that begin later."""
+    main = os.getpid()
+    with suppress(PermissionError):
+        _set(0, os.sched_getscheduler(main), os.getpriority(os.PRIO_PROCESS, main))
+
+
+def _set_all(policy: int, nice: int) -> None:
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(ProcessLookupError):  # it ended meanwhile
+            _set(int(task.name), policy, nice)
+
+
+def _set(thread: int, policy: int, nice: int) -> None:
+    if os.getpriority(os.PRIO_PROCESS, thread) != nice:
+        os.setpriority(os.PRIO_PROCESS, thread, nice)
+    if policy & ~_RESET == os.SCHED_RR:
+        os.sched_setscheduler(thread, os.SCHED_RR | _RESET, _REAL_TIME)
+    elif os.sched_getscheduler(thread) & ~_RESET != os.SCHED_OTHER:
+        os.sched_setscheduler(thread, os.SCHED_OTHER | _RESET, os.sched_param(0))
+
+
+def _named(policy: int, nice: int) -> str:
+    return f"nice {nice}" if policy == os.SCHED_OTHER else f"policy {policy}"
+
+
+_MOST_BY_DEFAULT = 4
+"""Beyond this the reader itself, which is one thread, is what takes the time."""
+
+
+def threads_or_default(threads: int | None) -> int:
+    """How many threads to use.
+
+    Args:
+        threads: As many as was asked for; None for one a core that this process may use, at most
+            four.
+
+    Returns:
+        At least 1.
+
+    Raises:
+        UsageError: If less than one was asked for.
+    """
+    if threads is None:
+        usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+        return min(usable or os.cpu_count() or 1, _MOST_BY_DEFAULT)
+    if threads < 1:
+        raise UsageError(f"threads={threads}: give 1 or more, or None for one a core")
+    return threads
+
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+MANY = 1 << 18
+"""Samples of all channels from which on the work is shared out."""
+
+_SHARES = 16
+"""Shares for each thread, so that none waits long for the last."""
+
+
+def in_threads(
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    samples: int,
+    after: Callable[[], None] = lambda: None,
+) -> list[_Result]:
+    """Apply a function to independent items, in threads where there is much to do.
+
+    Args:
+        function: Spends its time in NumPy, which lets other threads run.
+        items: What it is applied to.
+        samples: All that it will look at.
+        after: Called after each item, by the thread that worked on it.
+
+    Returns:
+        Its results, in the order of the items; the same bits however many threads there are.
+    """
+    threads = threads_or_default(None)
+
+    def work(some: Sequence[_Item]) -> list[_Result]:
+        results = list[_Result]()
+        for item in some:
+            results.append(function(item))
+            after()
+        return results
+
+    if samples < MANY or threads == 1:
+        return work(items)
+    # Shares of many items, since handing out one costs some 30 us.
+    size = max(1, len(items) // (threads * _SHARES))
+    shares = [items[first : first + size] for first in range(0, len(items), size)]
+    with ThreadPoolExecutor(threads) as pool:
+        return [result for share in pool.map(work, shares) for result in share]
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class StopRequest:
+    """Whether, and by which signal, an end was asked for."""
+
+    def __init__(self) -> None:
+        """Start without a request."""
+        self.signal: signal.Signals | None = None
+        self.again = False
+        """Whether it was asked for a second time."""
+
+    @property
+    def requested(self) -> bool:
+        """Whether an end was asked for."""
+        return self.signal is not None
+
+
+@contextmanager
+def interruptible(*, twice: bool = False) -> Generator[StopRequest]:
+    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop.
+
+    Only for the main thread, as Python has it for signal handlers. The former handlers are back
+    on leaving.
+
+    Args:
+        twice: Take a second SIGINT or SIGTERM as a request, too; only the third acts as it would
+            have. A terminal that goes says so by more than one SIGHUP: these only count once.
+
+    Yields:
+        The request; look at ``requested`` between two samples.
+    """
+    request = StopRequest()
+    former = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        kind = signal.Signals(number)
+        request.again = request.again or (request.requested and kind is not signal.SIGHUP)
+        request.signal = request.signal or kind
+        if not twice or (request.again and kind is not signal.SIGHUP):
+            signal.signal(number, former[kind])
+
+    try:
+        for number in _SIGNALS:
+            if former[number] is not signal.SIG_IGN:  # nohup stays in force
+                signal.signal(number, note)
+        yield request
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)

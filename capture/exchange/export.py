@@ -1,0 +1,441 @@
+"""Joint columns of a session as a table of rows, one a sample, for pandas and its like.
+
+Columns: ``t_ns`` (the sample's own time, Unix ns), ``topic``, ``joint``, and one for each quantity,
+named ``TOPIC.FIELD [UNIT]`` without the topic's leading slash, or ``TOPIC [UNIT]`` where the topic
+is the quantity: ``joint_states.velocity [rad/s]``, ``joint_current [A]``. A row has the quantities
+of its topic, and nothing in the columns of other topics. Nothing is resampled or filled in: joints
+that were asked one after the other have rows at different times. Rows are sorted by time within a
+topic.
+
+A spreadsheet takes text in a CSV that begins with ``=``, ``+``, ``-`` or ``@`` for a formula. So
+a name of a topic, a joint or a column that begins with such a character, with a tab, a line end or
+an apostrophe has an apostrophe before it in CSV, and only there: take one leading apostrophe away
+to have the name. Numbers are never changed.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+import numpy as np
+
+from ..bus.decoded_topics import JOINT_TOPIC
+from ..common.arrays import FloatArray, IntArray
+from ..common.console import progress, refuse_existing
+from ..common.errors import MissingChannelError, MissingExtraError, UsageError
+from ..common.files import check_stop, part_file
+from ..common.process import StopRequest
+from ..log.messages.definitions import JOINT_STATE
+from ..log.read.joint_states import UNITS
+from ..log.read.session import Session
+from ..log.read.signals import JointSignals
+from .frame_blocks import LossTally, chosen_buses, frame_blocks, frame_facts
+from .frame_formats import FRAME_FORMATS
+
+
+@dataclass
+class ExportReport:
+    """What an export of frames did.
+
+    Attributes:
+        source: The session.
+        output: The trace.
+        title: Name of its format.
+        buses: Bus to number of frames written.
+        warnings: What the format doesn't hold, or the session doesn't give, one sentence each.
+    """
+
+    source: Path
+    output: Path
+    title: str
+    buses: dict[str, int]
+    warnings: list[str] = field(default_factory=list[str])
+
+
+def export_log(
+    source: Path,
+    output: Path,
+    *,
+    bus: str | None = None,
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ExportReport:
+    """Write the raw frames of a session as a trace of another format.
+
+    The frames of one bus come in the order they were logged, those of several, and of a bus with
+    both classic and CAN FD frames, by their times. Identifier, flags, length code, data, direction
+    and time are kept as far as the format holds them; what it doesn't hold is counted in the
+    report. A candump log that was imported comes back bit for bit.
+
+    Args:
+        source: The session.
+        output: The trace to write; its suffix is one of
+            :data:`.capture.exchange.frame_formats.FRAME_FORMATS`.
+        bus: The bus to write; all if None.
+        force: Replace an existing file.
+        stop: Ends the export, with nothing left behind.
+
+    Returns:
+        What was done.
+
+    Raises:
+        UsageError: If the suffix is no format that can be written, or the output is the session.
+        OutputExistsError: If the output is there and ``force`` is not given.
+        MissingChannelError: If the session has no raw frames, or no such bus.
+        LogWriteError: If the output can't be written or the export was stopped; nothing is left
+            behind then.
+    """
+    chosen = FRAME_FORMATS.get(output.suffix.lower())
+    if chosen is None:
+        valid = ", ".join(FRAME_FORMATS)
+        raise UsageError(f"{output}: no format has the suffix {output.suffix!r}; valid: {valid}")
+    refuse_same(source, output)
+    refuse_existing(output, force=force)
+    tally = LossTally()
+    with Session.open(source) as session:
+        facts = frame_facts(session, chosen_buses(session, bus))
+        with (
+            part_file(output) as part,
+            progress(f"export {output.name}", 1.0) as bar,
+            chosen.open(part, facts) as write,
+        ):
+            for block in frame_blocks(session, facts.buses, fd=chosen.holds_fd):
+                kept = replace(
+                    block,
+                    frames=chosen.kept(block.frames),
+                    fd_frames=chosen.kept(block.fd_frames) if chosen.holds_fd else block.fd_frames,
+                )
+                tally.add(block.frames, kept.frames)
+                tally.add(block.fd_frames, kept.fd_frames)
+                write(kept)
+                bar.update(block.done)
+                check_stop(output, stop)
+        counts, warnings = dict(facts.counts), [*session.warnings, *chosen.notes(facts)]
+        if chosen.holds_fd:
+            counts = {bus: count + facts.fd_counts[bus] for bus, count in counts.items()}
+        elif left_out := sum(facts.fd_counts.values()):
+            warnings.append(f"{left_out} CAN FD frames left out: the format has 8 bytes a frame")
+        warnings += tally.sentences()
+    return ExportReport(source, output, chosen.title, counts, warnings)
+
+
+def refuse_same(source: Path, output: Path) -> None:
+    """Check that an export doesn't replace its own session.
+
+    Args:
+        source: The session.
+        output: The file to write.
+
+    Raises:
+        UsageError: If they are one file.
+    """
+    if output.exists() and source.exists() and output.samefile(source):
+        raise UsageError(f"{output} is the session itself; choose another name")
+
+
+DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())
+"""The topics written unless others are named, those of them that the session has."""
+
+_MOST_TOPICS = 500
+_ROWS_PER_BLOCK = 100_000
+_FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
+"""How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
+
+
+@dataclass
+class ColumnReport:
+    """What an export of columns did.
+
+    Attributes:
+        source: The session.
+        output: The table.
+        columns: Names of its columns.
+        rows: Topic to number of rows.
+        warnings: What is missing or doubtful, one sentence each.
+    """
+
+    source: Path
+    output: Path
+    columns: list[str]
+    rows: dict[str, int] = field(default_factory=dict[str, int])
+    warnings: list[str] = field(default_factory=list[str])
+
+
+@dataclass(frozen=True)
+class RowBlock:
+    """Rows of one topic.
+
+    Attributes:
+        topic: The topic.
+        names: Joint names.
+        joint: Index into ``names`` for each row, shape (n,).
+        t_ns: Sampling times [Unix ns], shape (n,).
+        values: Column name to values, shape (n,); NaN where a sample has none.
+    """
+
+    topic: str
+    names: tuple[str, ...]
+    joint: IntArray
+    t_ns: IntArray
+    values: dict[str, FloatArray]
+
+
+WriteRows = Callable[[RowBlock], None]
+
+
+class TableFormat(Protocol):
+    """One format of tables."""
+
+    def __call__(self, path: Path, columns: Sequence[str]) -> AbstractContextManager[WriteRows]:
+        """Create a table.
+
+        Args:
+            path: The file.
+            columns: Names of the quantities' columns.
+
+        Returns:
+            A ``with`` block around what writes rows.
+
+        Raises:
+            OSError: If it can't be written.
+            MissingExtraError: If a package for it is not installed.
+        """
+        ...
+
+
+def export_columns(
+    source: Path,
+    output: Path,
+    *,
+    topics: Sequence[str] = (),
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ColumnReport:
+    """Write joint columns of a session as a table.
+
+    One topic is held in memory at a time.
+
+    Args:
+        source: The session.
+        output: The table to write; its suffix is one of :data:`TABLE_FORMATS`.
+        topics: JointState topics; if none, those of :data:`DEFAULT_TOPICS` that are there.
+        force: Replace an existing file.
+        stop: Ends the export, with nothing left behind.
+
+    Returns:
+        What was done.
+
+    Raises:
+        UsageError: If the suffix is no format that can be written, the output is the session, or
+            so many topics would make too wide a table.
+        OutputExistsError: If the output is there and ``force`` is not given.
+        MissingChannelError: If the session has no such topic, or none of the default ones.
+        DataError: If a topic is not of JointStates.
+        MissingExtraError: If a package for the format is not installed.
+        LogWriteError: If the output can't be written or the export was stopped; nothing is left
+            behind then.
+    """
+    open_table = TABLE_FORMATS.get(output.suffix.lower())
+    if open_table is None:
+        valid = ", ".join(TABLE_FORMATS)
+        raise UsageError(f"{output}: no table has the suffix {output.suffix!r}; valid: {valid}")
+    refuse_same(source, output)
+    refuse_existing(output, force=force)
+    with Session.open(source) as session:
+        chosen = _topics(session, topics)
+        if len(chosen) > _MOST_TOPICS:
+            raise UsageError(
+                f"{source} has {len(chosen)} joint topics; a table takes at most {_MOST_TOPICS}: "
+                "name those that you want with --topics"
+            )
+        wanted = {topic: _columns(session, topic) for topic in chosen}
+        columns = [name for found in wanted.values() for name in found.values()]
+        report = ColumnReport(source, output, ["t_ns", "topic", "joint", *columns])
+        with (
+            part_file(output) as part,
+            progress(f"export {output.name}", len(wanted)) as bar,
+            open_table(part, columns) as write,
+        ):
+            for number, (topic, found) in enumerate(wanted.items()):
+                report.rows[topic] = 0
+                if not found:
+                    report.warnings.append(f"{topic} carries no values")
+                    continue
+                for block, done in _blocks(session, topic, found):
+                    write(block)
+                    report.rows[topic] += len(block.t_ns)
+                    bar.update(number + done)
+                    check_stop(output, stop)
+        report.warnings += session.warnings
+    return report
+
+
+@contextmanager
+def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
+    """CSV in UTF-8; floats with as many digits as bring them back exactly, NaN as an empty cell."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        head = ["t_ns", "topic", "joint", *map(_as_text, columns)]
+        _writer(stream, head).writerow(head)
+
+        def write(block: RowBlock) -> None:
+            empty = [""] * len(block.t_ns)
+            cells = [
+                _cells(block.values[name]) if name in block.values else empty for name in columns
+            ]
+            row_joints: list[int] = block.joint.tolist()
+            names = [_as_text(name) for name in block.names]
+            joints = [names[j] for j in row_joints]
+            topics = [_as_text(block.topic)] * len(joints)
+            writer = _writer(stream, [*names, *topics[:1]])
+            writer.writerows(zip(block.t_ns.tolist(), topics, joints, *cells, strict=True))
+
+        yield write
+
+
+@contextmanager
+def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
+    """Parquet: t_ns int64, topic and joint dictionaries of strings, the rest float64 or null."""
+    try:
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetWriter
+    except ImportError as error:
+        raise MissingExtraError("a .parquet table", "parquet", "pyarrow") from error
+    module: Any = pa  # its types are incomplete
+    text = module.dictionary(module.int32(), module.string())
+    fields: list[Any] = [("t_ns", module.int64()), ("topic", text), ("joint", text)]
+    schema = module.schema([*fields, *((name, module.float64()) for name in columns)])
+    with ParquetWriter(path, schema) as table:
+        writer: Any = table
+
+        def write(block: RowBlock) -> None:
+            count = len(block.t_ns)
+            topic = np.zeros(count, dtype=np.int32)
+            arrays: list[Any] = [
+                module.array(block.t_ns),
+                module.DictionaryArray.from_arrays(topic, [block.topic]),
+                module.DictionaryArray.from_arrays(block.joint.astype(np.int32), block.names),
+            ]
+            arrays += [
+                module.array(block.values[name], mask=np.isnan(block.values[name]))
+                if name in block.values
+                else module.nulls(count, module.float64())
+                for name in columns
+            ]
+            writer.write_table(module.Table.from_arrays(arrays, schema=schema))
+
+        yield write
+
+
+TABLE_FORMATS: dict[str, TableFormat] = {".csv": _open_csv, ".parquet": _open_parquet}
+"""Suffix to what creates a table."""
+
+
+def _writer(stream: TextIO, texts: Sequence[str]) -> Any:
+    """A writer of rows with those texts; a carriage return ends a row where it isn't quoted."""
+    odd = any("\r" in text for text in texts)  # the module doesn't quote for it
+    quoting = csv.QUOTE_NONNUMERIC if odd else csv.QUOTE_MINIMAL
+    return csv.writer(stream, lineterminator="\n", quoting=quoting)
+
+
+def _as_text(name: str) -> str:
+    """A name that no spreadsheet takes for a formula."""
+    return f"'{name}" if name.startswith(_FORMULA) else name
+
+
+def _cells(values: FloatArray) -> list[object]:
+    cells: list[object] = values.tolist()
+    for row in np.flatnonzero(np.isnan(values)).tolist():
+        cells[row] = ""
+    return cells
+
+
+def _topics(session: Session, wanted: Sequence[str]) -> list[str]:
+    if wanted:
+        return list(dict.fromkeys(wanted))
+    joint = [t for t, channel in session.channels.items() if channel.type_name == JOINT_STATE]
+    if not joint:
+        raise MissingChannelError(session.path, "joint topics", sorted(session.channels))
+    return [topic for topic in DEFAULT_TOPICS if topic in joint] or sorted(joint)
+
+
+def _columns(session: Session, topic: str) -> dict[str, str]:
+    """The fields that a topic carries, with the names of their columns."""
+    found: dict[str, str] = {}
+    for name in UNITS:
+        try:
+            unit = session.joints(topic, name).unit
+        except MissingChannelError:
+            if topic not in session.channels:
+                raise
+            continue
+        # The contract puts every quantity of a joint, not only angles, into a position.
+        named_by_topic = name == "position" and unit != UNITS[name]
+        found[name] = (
+            topic.removeprefix("/") + ("" if named_by_topic else f".{name}") + f" [{unit}]"
+        )
+    return found
+
+
+def _blocks(
+    session: Session, topic: str, columns: Mapping[str, str]
+) -> Iterator[tuple[RowBlock, float]]:
+    """A topic's rows, sorted by time, with how much of them is done, 0 to 1."""
+    read = session.joint_columns({topic: list(columns)})
+    sets = _aligned([read[topic, name] for name in columns])
+    for number, signals in enumerate(sets):
+        for block, done in _sorted_blocks(signals, [columns[one.field] for one in signals]):
+            yield block, (number + done) / len(sets)
+
+
+def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
+    """Sets of signals that have the same joints and times, so that they share rows.
+
+    That is one set, but for foreign logs that leave a field empty in some messages.
+    """
+    sets: list[list[JointSignals]] = []
+    for one in signals:
+        for known in sets:
+            if known[0].names == one.names and all(
+                np.array_equal(a, b) for a, b in zip(known[0].t_ns, one.t_ns, strict=True)
+            ):
+                known.append(one)
+                break
+        else:
+            sets.append([one])
+    return sets
+
+
+def _sorted_blocks(
+    signals: Sequence[JointSignals], columns: Sequence[str]
+) -> Iterator[tuple[RowBlock, float]]:
+    """Rows of signals that share joints and times."""
+    first = signals[0]
+    if not first.names:
+        return
+    orders = [np.argsort(t_ns, kind="stable") for t_ns in first.t_ns]
+    times = [t_ns[order] for t_ns, order in zip(first.t_ns, orders, strict=True)]
+    longest = max(times, key=len)
+    step = max(1, _ROWS_PER_BLOCK // len(times))
+    edges = np.unique(longest[step::step])
+    cuts = [[0, *np.searchsorted(t_ns, edges).tolist(), len(t_ns)] for t_ns in times]
+    for k in range(len(edges) + 1):
+        pieces = [slice(cut[k], cut[k + 1]) for cut in cuts]
+        t_ns = np.concatenate([t[piece] for t, piece in zip(times, pieces, strict=True)])
+        joint = np.repeat(np.arange(len(times)), [piece.stop - piece.start for piece in pieces])
+        rows = np.argsort(t_ns, kind="stable")
+        values = {
+            name: np.concatenate(
+                [
+                    values[order[piece]]
+                    for values, order, piece in zip(one.values, orders, pieces, strict=True)
+                ]
+            )[rows]
+            for name, one in zip(columns, signals, strict=True)
+        }
+        block = RowBlock(first.topic, first.names, joint[rows], t_ns[rows], values)
+        yield block, (k + 1) / (len(edges) + 1)

@@ -1,0 +1,488 @@
+"""Message records in bulk: those of many blocks are found and checked together.
+
+Blocks of a log decompressed side by side, in memory that is used again and again.
+
+A chunk holds about a hundred messages of a topic, and a look at so few costs more than what is
+seen. So the blocks of a few megabytes go into one buffer, which is used again for later ones:
+memory that is written for the first time costs a page fault each 4 KiB, as much as decompression.
+While one buffer is looked at, threads fill another.
+
+Work done ahead on threads, its results in order: bounded, and over when its user is done.
+
+Decompression lets go of Python's lock, so threads of one process share it among the cores.
+"""
+
+from __future__ import annotations
+
+import itertools
+import mmap
+import struct
+from collections import deque
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from typing import Generic, TypeAlias, TypeVar
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from ...common.arrays import IntArray
+from ...common.errors import LogError
+from ..file.log_file import LogFile, keep_freed, new_pages
+from ..mcap.chunk import LAST_NS, PREFIX_SIZE, Block, Buffer
+from ..mcap.records import BODY_AT, FIXED_SIZE, HEAD, Places, gather
+
+_T = TypeVar("_T")
+
+
+class Piece(Generic[_T]):
+    """A piece of work: who comes first does it, a helper or the one who needs the result."""
+
+    def __init__(self, work: Callable[[], _T], helpers: ThreadPoolExecutor | None) -> None:
+        """Offer it to the helpers.
+
+        Args:
+            work: The work.
+            helpers: Threads; None where there are none.
+        """
+        self._work = work
+        self._taken = None if helpers is None else helpers.submit(work)
+        self._done: list[_T] = []
+
+    def hurry(self) -> None:
+        """Do it now unless a helper has begun it."""
+        if not self._done and (self._taken is None or self._taken.cancel()):
+            self._taken = None
+            self._done.append(self._work())
+
+    def result(self) -> _T:
+        """What the work gave; waits for it.
+
+        Returns:
+            The result; what the work raises is raised here, or where it was done in a hurry.
+        """
+        self.hurry()
+        return self._done[0] if self._taken is None else self._taken.result()
+
+
+@contextmanager
+def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
+    """The threads that help a caller; at the end of the block none is left.
+
+    Args:
+        threads: How many work, the caller's own among them.
+
+    Yields:
+        The others; None where there are none.
+    """
+    if threads == 1:
+        yield None
+        return
+    pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="undulog-read")
+    try:
+        yield pool
+    finally:  # also when the caller stops half-way: what hasn't begun never will
+        pool.shutdown(cancel_futures=True)
+
+
+def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:
+    """Items in order, each taken from where they come from some time before it is needed.
+
+    Args:
+        items: Whose making starts some work.
+        count: How many are taken beyond the one that is given.
+
+    Yields:
+        The items. When the next is asked for, the one before is taken as done with.
+    """
+    waiting: deque[_T] = deque()
+    for item in items:
+        waiting.append(item)
+        if len(waiting) > count:
+            yield waiting.popleft()
+    yield from waiting
+
+
+ARENA_SIZE = 8 << 20
+SAME_SIZE = 9 << 18
+"""Bytes of blocks of one channel that share a buffer: about what a core's own cache holds. They
+have so many messages of a topic that more would save nothing."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A block's payload in a buffer.
+
+    Attributes:
+        block: The block.
+        base: What its message offsets count from.
+        stop: One past its last byte.
+    """
+
+    block: Block
+    base: int
+    stop: int
+
+
+_Found: TypeAlias = tuple[Buffer, Placed] | LogError
+"""A buffer and what is in it, or why the block can't be read."""
+
+
+def filled_arenas(
+    log_file: LogFile,
+    channel_ids: Collection[int],
+    blocks: Sequence[Block],
+    warn: Callable[[str], None],
+    threads: int,
+) -> Iterator[tuple[Buffer, list[Placed]]]:
+    """Buffers full of payloads, in file order; one that can't share a buffer comes alone.
+
+    Args:
+        log_file: The file.
+        channel_ids: Blocks whose index has none of these channels are passed over.
+        blocks: Where to look.
+        warn: Takes one sentence for each block that couldn't be read.
+        threads: How many decompress, the caller's among them; others do so ahead of what is used.
+
+    Yields:
+        A buffer, which is overwritten when the next is asked for, and what is in it.
+    """
+    ids = set(channel_ids)
+    wanted = [
+        each
+        for each in blocks
+        if (not ids.isdisjoint(each.index_at) if each.index_at else not each.is_empty)
+    ]
+    runs = list(_runs(log_file, wanted))
+    spare = 1 if threads > 1 and len(runs) > 1 else 0
+    keep_freed(ARENA_SIZE)  # no copy of messages is larger
+    scratch = log_file.scratch
+    arenas = [scratch.pop() if scratch else new_pages(ARENA_SIZE) for _ in range(1 + spare)]
+    with helpers(max(min(threads, len(wanted)), 1)) as pool:
+        for pieces in ahead(_begun(log_file, runs, arenas, pool), spare):
+            if pool is not None:
+                for piece in reversed(pieces):  # the helpers come from the other end
+                    piece.hurry()
+            found = [piece.result() for piece in pieces]
+            for each in found:
+                if isinstance(each, LogError):
+                    warn(f"{each}; its messages are missing")
+            filled = [each for each in found if not isinstance(each, LogError)]
+            if filled:
+                yield filled[0][0], [placed for _, placed in filled]
+    if len(blocks) < len(log_file.blocks):  # after a window there is often another
+        scratch[:] = [*arenas, *scratch][:2]
+
+
+def _runs(log_file: LogFile, blocks: Sequence[Block]) -> Iterator[list[Placed] | Block]:
+    """Blocks that share a buffer, with their places in it, or one that comes alone."""
+    run: list[Placed] = []
+    at, former = 0, None
+    for block in blocks:
+        shares = log_file.inflates(block, ARENA_SIZE)
+        only = next(iter(block.index_at)) if len(block.index_at) == 1 else None
+        most = ARENA_SIZE if only is None else min(SAME_SIZE, ARENA_SIZE)
+        if run and not (shares and only == former and at + block.size <= most):
+            yield run
+            run, at = [], 0
+        if shares:
+            run.append(Placed(block, at, at + block.size))
+            at, former = at + block.size, only
+        else:
+            yield block
+    if run:
+        yield run
+
+
+def _begun(
+    log_file: LogFile,
+    runs: Iterable[list[Placed] | Block],
+    arenas: Sequence[mmap.mmap],
+    pool: ThreadPoolExecutor | None,
+) -> Iterator[list[Piece[_Found]]]:
+    """The work on each run; it is offered to the helpers when it is taken from here."""
+    for run, arena in zip(runs, cycle(arenas), strict=False):
+        if isinstance(run, list):
+            yield [Piece(partial(_inflated, log_file, arena, placed), pool) for placed in run]
+        else:  # two at once that are larger than a buffer are too much
+            yield [Piece(partial(_alone, log_file, run), pool if run.size <= ARENA_SIZE else None)]
+
+
+def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
+    try:
+        with memoryview(arena) as whole, whole[placed.base : placed.stop] as room:
+            log_file.inflate_into(placed.block, room)
+    except LogError as error:
+        return error
+    return arena, placed
+
+
+def _alone(log_file: LogFile, block: Block) -> _Found:
+    try:
+        data, base, stop = log_file.payload_once(block)
+    except LogError as error:
+        return error
+    return data, Placed(block, base, stop)
+
+
+_START = struct.Struct("<BQ")  # of a record: opcode, length
+_START_KIND = np.dtype(f"V{_START.size}")
+_CHANNEL_START = struct.Struct("<BQH")  # of a message: opcode, length, channel
+_CHANNEL_START_KIND = np.dtype(f"V{_CHANNEL_START.size}")
+_LOG_TIME_AT = 15
+_LOG_TIME_KIND = np.dtype("<i8")
+_FAR = 1 << 62
+_LARGEST_COPIED = 2048
+"""Records up to this many bytes are copied whole, before anything of them is looked at: then they
+lie side by side in the cache."""
+
+Window = tuple[int | None, int | None]
+
+
+@dataclass(frozen=True)
+class Records:
+    """Message records of one topic in a buffer, in file order; all whole.
+
+    Attributes:
+        offsets: Where they start in the buffer, shape (n,).
+        log_ns: Their log times [Unix ns], shape (n,).
+        length: Bytes of each message, if all have as many; otherwise None.
+        bodies: Where the messages start, in the buffer or in a copy.
+    """
+
+    offsets: IntArray
+    log_ns: IntArray
+    length: int | None
+    bodies: Places
+
+
+def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
+    """The blocks that may hold messages of a window.
+
+    Args:
+        log_file: The file.
+        window_ns: Half-open window of log times [Unix ns]; None for open ends.
+
+    Returns:
+        Those that are not wholly outside, in file order.
+    """
+    start, stop = window_ns
+    first_ns, last_ns = log_file.spans
+    inside = np.ones(len(log_file.blocks), dtype=bool)
+    if start is not None:
+        inside &= last_ns >= start
+    if stop is not None:
+        inside &= first_ns < stop
+    return [log_file.blocks[k] for k in np.flatnonzero(inside).tolist()]
+
+
+def record_batches(
+    log_file: LogFile,
+    wanted: Sequence[Sequence[int]],
+    blocks: Sequence[Block],
+    warn: Callable[[str], None],
+    threads: int = 1,
+) -> Iterator[tuple[Buffer, list[Records]]]:
+    """The message records of some topics, many blocks at a time.
+
+    Args:
+        log_file: The file.
+        wanted: Channel ids, one sequence a topic.
+        blocks: Where to look.
+        warn: Takes one sentence for each block that couldn't be read.
+        threads: How many decompress the blocks.
+
+    Yields:
+        A buffer, which is overwritten when the next is asked for, and the records of each topic.
+    """
+    ids = list(itertools.chain.from_iterable(wanted))
+    for data, placed in filled_arenas(log_file, ids, _in_groups(blocks, wanted), warn, threads):
+        try:
+            found = _records(log_file, data, placed, wanted)
+        except LogError:  # which block is it? the others are read
+            for one in placed:
+                try:
+                    alone = _records(log_file, data, [one], wanted)
+                except LogError as error:
+                    warn(f"{error}; its messages are missing")
+                else:
+                    yield data, alone
+        else:
+            yield data, found
+
+
+def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequence[Block]:
+    """Blocks in an order that has those of one topic together, where topics don't share blocks.
+
+    Their records then come many at a time, and evenly spaced. The blocks of each topic stay in
+    file order.
+    """
+    topic_of = {channel_id: k for k, ids in enumerate(wanted) for channel_id in ids}
+    if not all(block.index_at for block in blocks):  # one without an index may have any of them
+        return blocks
+    had = [{topic_of[key] for key in block.index_at if key in topic_of} for block in blocks]
+    shared = set[int]().union(*(topics for topics in had if len(topics) > 1))
+    rows = [k for k, topics in enumerate(had) if topics]
+    rows.sort(key=lambda k: -1 if had[k] & shared else min(had[k]))
+    return [blocks[k] for k in rows]
+
+
+def _records(
+    log_file: LogFile, data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+) -> list[Records]:
+    """The checked records of each topic.
+
+    Raises:
+        LogError: If an index is damaged or points to something that is no message.
+    """
+    tiled = _tiled(data, placed, wanted)
+    if tiled is not None:
+        return tiled
+    found: list[Records] = []
+    for starts in _indexed(log_file, placed, wanted):
+        at = starts.offsets
+        records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
+        if records is None:
+            _check_each(log_file, data, starts)
+            log_ns = _readable(gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT))
+            records = Records(at, log_ns, None, Places(data, at + BODY_AT))
+        found.append(records)
+    return found
+
+
+def _tiled(
+    data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+) -> list[Records] | None:
+    """The records of a topic that has the blocks for itself, found without the index.
+
+    Returns:
+        None unless whole messages of one length and channel fill the blocks to the last byte.
+    """
+    only = {key for one in placed for key in one.block.index_at}
+    base, stop = placed[0].base, placed[-1].stop
+    filled = sum(one.stop - one.base for one in placed)
+    if len(only) != 1 or filled != stop - base or filled < BODY_AT:
+        return None
+    start = bytes(data[base : base + _CHANNEL_START.size])
+    opcode, length, channel_id = _CHANNEL_START.unpack(start)
+    size = PREFIX_SIZE + length
+    if opcode != Opcode.MESSAGE or length < FIXED_SIZE or channel_id not in only:
+        return None
+    if any((one.stop - one.base) % size for one in placed):
+        return None
+    places = Places(data, np.arange(base, stop, size, dtype=np.int64), size)
+    if places.field(_CHANNEL_START_KIND, 0).tobytes() != start * len(places):
+        return None
+    nothing = np.empty(0, dtype=np.int64)
+    none = Records(nothing, nothing, None, Places(data, nothing))
+    own = _records_at(places.at, places, length)
+    return [own if channel_id in channel_ids else none for channel_ids in wanted]
+
+
+def _records_at(offsets: IntArray, places: Places, length: int) -> Records:
+    """Records of whole messages of one length: where they are in the buffer, and in a copy."""
+    log_ns = _readable(places.field(_LOG_TIME_KIND, _LOG_TIME_AT).copy())
+    bodies = Places(places.data, places.at + BODY_AT, places.step)
+    return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
+
+
+def _readable(log_ns: IntArray) -> IntArray:
+    """Log times of 64 bits without a sign, as far as a signed number holds them."""
+    if log_ns.min(initial=0) < 0:
+        log_ns[log_ns < 0] = LAST_NS
+    return log_ns
+
+
+def _alike(data: Buffer, starts: _Starts) -> Records | None:
+    """Records that are whole messages of one length; None where something doesn't fit."""
+    offsets = starts.offsets
+    first = int(offsets[0])
+    start = bytes(data[first : first + _START.size])
+    opcode, length = _START.unpack(start)
+    if opcode != Opcode.MESSAGE or not FIXED_SIZE <= length <= starts.room - PREFIX_SIZE:
+        return None
+    size = PREFIX_SIZE + length
+    places = Places(data, offsets)
+    if size <= _LARGEST_COPIED:
+        copied = gather(data, offsets, f"V{size}").view(np.uint8)
+        places = Places(copied, np.arange(0, len(copied), size, dtype=np.int64), size)
+    if places.field(_START_KIND, 0).tobytes() != start * len(offsets):
+        return None
+    return _records_at(offsets, places, length)
+
+
+def _check_each(log_file: LogFile, data: Buffer, starts: _Starts) -> None:
+    """Raise LogError where a record is not a whole message."""
+    stop = np.repeat(starts.ends, starts.counts)
+    heads = gather(data, starts.offsets, HEAD)
+    lengths, room = heads["length"], (stop - starts.offsets - PREFIX_SIZE).astype(np.uint64)
+    whole = (heads["opcode"] == Opcode.MESSAGE) & (lengths >= FIXED_SIZE) & (lengths <= room)
+    if not whole.all():
+        raise LogError(log_file.path, "a message index points to something that is not a message")
+
+
+@dataclass(frozen=True)
+class _Starts:
+    """Where the records of a topic start in a buffer; all heads lie in their blocks.
+
+    Attributes:
+        offsets: The starts in file order, shape (n,).
+        room: Bytes from the last start in a block to the block's end, in the block with the least.
+        counts: How many records each piece of the index lists, shape (k,), in file order.
+        ends: Where the payload of that piece's block ends, shape (k,).
+    """
+
+    offsets: IntArray
+    room: int
+    counts: IntArray
+    ends: IntArray
+
+
+def _indexed(
+    log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
+) -> list[_Starts]:
+    """Where the records of each topic start, by the blocks' indexes.
+
+    Raises:
+        LogError: If an index is damaged or points outside its block.
+    """
+    ids = list(itertools.chain.from_iterable(wanted))
+    indexes = [log_file.indexed(one.block, ids) for one in placed]
+    pieces: list[IntArray] = []
+    blocks: list[int] = []
+    limits = [0]  # of the topics, in pieces
+    at = 0
+    for channel_ids in wanted:
+        for number, index in enumerate(indexes):
+            for piece in index[at : at + len(channel_ids)]:
+                if len(piece):
+                    pieces.append(piece)
+                    blocks.append(number)
+        at += len(channel_ids)
+        limits.append(len(pieces))
+    if not pieces:
+        nothing = np.empty(0, dtype=np.int64)
+        return [_Starts(nothing, 0, nothing, nothing) for _ in wanted]
+    bounds = np.array([(one.base, one.stop) for one in placed], dtype=np.int64)[blocks]
+    bases, ends = bounds[:, 0], bounds[:, 1]
+    counts = np.array([len(piece) for piece in pieces], dtype=np.int64)
+    offsets = np.concatenate(pieces)
+    offsets += np.repeat(bases, counts)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    room = ends - np.maximum.reduceat(offsets, starts[:-1])
+    outside = np.minimum.reduceat(offsets, starts[:-1]) < bases  # so are sums that are too large
+    if outside.any() or int(room.min()) < BODY_AT:
+        raise LogError(log_file.path, "a message index points outside its chunk")
+    cuts = starts[limits].tolist()
+    steps_back = offsets[1:] < offsets[:-1]
+    steps_back[[cut - 1 for cut in cuts[1:-1] if 0 < cut < len(offsets)]] = False
+    if steps_back.any():  # an index that is not in file order, or a topic of several channels
+        for a, b in itertools.pairwise(cuts):
+            offsets[a:b].sort()
+    return [
+        _Starts(offsets[a:b], int(room[p:q].min(initial=_FAR)), counts[p:q], ends[p:q])
+        for (a, b), (p, q) in zip(itertools.pairwise(cuts), itertools.pairwise(limits), strict=True)
+    ]

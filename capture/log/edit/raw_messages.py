@@ -1,0 +1,233 @@
+"""A log as messages of bytes: nothing is decoded, block after block, one chunk in memory.
+
+What can't be read is left out and said in the log's warnings.
+
+Format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata
+
+from ...common.errors import LogError
+from ...common.strict_table import read_toml
+from ..file.log_file import LogFile
+from ..mcap.chunk import PREFIX_SIZE, Block, Buffer
+
+_LENGTH = struct.Struct("<Q")
+_FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
+_BODY_AT = PREFIX_SIZE + _FIXED.size
+_PIECE = 1 << 20
+
+
+class RawMessage(NamedTuple):
+    """One message as it is stored.
+
+    Attributes:
+        log_time_ns: Log time [Unix ns].
+        channel_id: Channel in its own file.
+        sequence: As stored.
+        publish_time_ns: As stored [Unix ns].
+        data: Its bytes.
+    """
+
+    log_time_ns: int
+    channel_id: int
+    sequence: int
+    publish_time_ns: int
+    data: bytes
+
+
+class RawLog:
+    """A log opened for its bytes; ``with`` releases it."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a log and find what an edit must know of it.
+
+        Args:
+            path: The MCAP file; of a split session any part, or the folder.
+
+        Raises:
+            NotALogError: If it is not an MCAP file or nothing in it can be read.
+            LogError: If it can't be opened.
+        """
+        self.path = path
+        self.file = LogFile(path)
+        self.warnings = list(self.file.warnings)
+        self._said = set(self.warnings)
+        self.paths = [file.path for file in self.file.files]
+        self.sha256 = _hash(self.paths)
+        filled = [block for block in self.file.blocks if block.end_ns]
+        self.start_ns = min((block.start_ns for block in filled), default=0)
+        self.end_ns = max((block.end_ns for block in filled), default=0)
+        self.session_id = self.file.metadata.get("undulog", {}).get("session_id") or path.stem
+        self.robot = _robot_name(self.file)
+
+    def __enter__(self) -> RawLog:
+        """Nothing to do: the file is open."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the file."""
+        self.file.close()
+
+    @property
+    def metadata(self) -> list[Metadata]:
+        """The metadata records, in the order of the file; names may repeat."""
+        return [item for item in self.file.appendices if isinstance(item, Metadata)]
+
+    @property
+    def attachments(self) -> list[Attachment]:
+        """The attachments, in the order of the file; names may repeat."""
+        return [item for item in self.file.appendices if isinstance(item, Attachment)]
+
+    def warn(self, sentence: str) -> None:
+        """Note an irregularity, once.
+
+        Args:
+            sentence: What is missing or doubtful.
+        """
+        if sentence not in self._said:
+            self._said.add(sentence)
+            self.warnings.append(sentence)
+
+    def type_name(self, channel: Channel) -> str:
+        """A channel's message type.
+
+        Args:
+            channel: One of the file's channels.
+
+        Returns:
+            E.g. ``sensor_msgs/msg/Imu``; empty where the channel has no schema.
+        """
+        schema = self.file.schemas.get(channel.schema_id)
+        return schema.name if schema is not None else ""
+
+    def messages(
+        self, channel_ids: Collection[int], start_ns: int, stop_ns: int
+    ) -> Iterator[RawMessage]:
+        """Messages of some channels in a window, in the order of the file.
+
+        Args:
+            channel_ids: The channels.
+            start_ns: First log time [Unix ns].
+            stop_ns: One past the last log time [Unix ns].
+
+        Yields:
+            The messages.
+        """
+        for block in self.file.blocks:
+            outside = block.start_ns >= stop_ns or block.end_ns < start_ns
+            if not (block.end_ns and outside):
+                yield from self._block_messages(block, channel_ids, start_ns, stop_ns)
+
+    def last_messages(self, channel_ids: Collection[int], before_ns: int) -> list[RawMessage]:
+        """The last message of each channel before a time, in order of log time.
+
+        It looks backward, and no further than it must.
+
+        Args:
+            channel_ids: The channels.
+            before_ns: One past the last log time [Unix ns].
+
+        Returns:
+            At most one message a channel; of equal log times, the later in the file.
+        """
+        # With log time, and file and place of its block.
+        last: dict[int, tuple[tuple[int, int, int], RawMessage]] = {}
+        backward = sorted(self.file.blocks, key=lambda b: (b.end_ns, b.part, b.start))[::-1]
+        for block in backward:
+            if block.end_ns and block.start_ns >= before_ns:
+                continue
+            open_ids = {k for k in channel_ids if k not in last or last[k][0][0] <= block.end_ns}
+            if not open_ids:
+                break
+            for message in self._block_messages(block, open_ids, 0, before_ns):
+                place = (message.log_time_ns, block.part, block.start)
+                former = last.get(message.channel_id)
+                if former is None or place >= former[0]:
+                    last[message.channel_id] = (place, message)
+        return sorted((message for _, message in last.values()), key=lambda m: m.log_time_ns)
+
+    def _block_messages(
+        self, block: Block, channel_ids: Collection[int], start_ns: int, stop_ns: int
+    ) -> Iterator[RawMessage]:
+        if block.index_at and not any(key in channel_ids for key in block.index_at):
+            return
+        try:
+            data, start, stop = self.file.payload_once(block)
+        except LogError as error:
+            self.warn(f"{error}; its messages are missing")
+            return
+        loose = not block.start  # the unchunked messages lie between other records
+        places = _loose_places(block) if loose else self._places(block, data, start, stop)
+        unknown = 0
+        for at in places:
+            (length,) = _LENGTH.unpack_from(data, at + 1)
+            end = at + PREFIX_SIZE + length
+            if at + _BODY_AT > end:
+                self.warn(f"{self.path}: the message at byte {at} is too short: left out")
+                continue
+            channel_id, sequence, log_ns, publish_ns = _FIXED.unpack_from(data, at + PREFIX_SIZE)
+            if channel_id in channel_ids:
+                if start_ns <= log_ns < stop_ns:
+                    message = bytes(data[at + _BODY_AT : end])
+                    yield RawMessage(log_ns, channel_id, sequence, publish_ns, message)
+            elif channel_id not in self.file.channels:
+                unknown += 1
+        if unknown:
+            self.warn(
+                f"{self.path}: {unknown} messages from byte {block.start} on are of channels that "
+                "the file doesn't describe: left out"
+            )
+
+    def _places(self, block: Block, data: Buffer, start: int, stop: int) -> Iterator[int]:
+        """Where the whole message records of a chunk begin."""
+        at = start
+        while at + PREFIX_SIZE <= stop and data[at]:
+            (length,) = _LENGTH.unpack_from(data, at + 1)
+            end = at + PREFIX_SIZE + length
+            if end > stop:
+                break
+            if data[at] == Opcode.MESSAGE:
+                yield at
+            at = end
+        if block.complete and at != stop:
+            self.warn(
+                f"{self.path}: the last {stop - at} bytes of the chunk at byte {block.start} "
+                "are no whole record: left out"
+            )
+
+
+def _loose_places(block: Block) -> Iterator[int]:
+    yield from sorted(at for found in (block.offsets or {}).values() for at in found.tolist())
+
+
+def _hash(paths: list[Path]) -> str:
+    """SHA-256 of one file, or of all parts one after the other."""
+    total = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as stream:
+            while piece := stream.read(_PIECE):
+                total.update(piece)
+    return total.hexdigest()
+
+
+def _robot_name(log_file: LogFile) -> str:
+    """The robot that a log is of; empty where it doesn't say."""
+    stated = log_file.metadata.get("undulog", {}).get("robot")
+    if stated:
+        return stated
+    attached = log_file.attachments.get("robot.toml")
+    if attached is not None:
+        with suppress(ValueError):
+            return str(read_toml(attached.data.decode()).get("name", ""))
+    return ""

@@ -1,0 +1,467 @@
+"""A session as blocks of messages: one file, the parts of a split one, or what a crash left.
+
+Naming any part opens the whole. What only the write-ahead log of a recorder has follows the
+files' blocks as one more block, in memory; nothing on the disk is changed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import sys
+import tempfile
+import weakref
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from numpy.typing import NDArray
+
+from ...common.arrays import IntArray
+from ...common.errors import LogError, NotALogError
+from ..mcap.chunk import LAST_NS, Block, Buffer
+from ..mcap.file import McapFile
+from ..mcap.records import BlockSource, read_heads
+from ..wal.tail import MessageKey, WalContents, WalTail, beyond, read_wal
+from .parts import PART_RECORD, PartFiles, first_part, open_parts
+
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+"""glibc's (malloc_trim(3)); other allocators have none."""
+
+
+def new_pages(size: int) -> mmap.mmap:
+    """Memory of small pages, each of which comes when it is first written.
+
+    numpy would ask for huge pages, and in a virtual machine a new one costs milliseconds; a
+    bytearray would write all of it at once.
+
+    Args:
+        size: How much [byte], more than 0.
+
+    Returns:
+        Zeros, given back when nothing refers to them any more.
+
+    Raises:
+        MemoryError: If there is not as much.
+    """
+    try:
+        return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    except OSError as error:
+        raise MemoryError(f"{size} bytes for what is read") from error
+
+
+def keep_freed(size: int) -> None:
+    """Have pieces of memory that come and go use the same pages again.
+
+    glibc gives a large piece back to the system as soon as it is freed, up to the size of the
+    largest that it has seen freed: from then on it keeps them (mallopt(3), M_MMAP_THRESHOLD). Other
+    allocators take no notice.
+
+    Args:
+        size: Of the largest such piece [byte].
+    """
+    np.empty(size, dtype=np.uint8)  # freed at once, never written
+
+
+class FilePages:
+    """Memory that lies in a file, so that what is not looked at need not be in memory.
+
+    The file has no name and is gone with what refers to it. What was written stays when its pages
+    are let go of: the system writes it to the disk when it needs the room, and not before.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Choose where the files go.
+
+        Args:
+            folder: On a disk; in a file system in memory nothing is gained.
+        """
+        self._folder = folder
+        self._held: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+        self._used = False
+
+    def new(self, size: int) -> mmap.mmap:
+        """Memory in a file of its own; where there is no room for one, memory as it usually is.
+
+        Args:
+            size: How much [byte], more than 0.
+
+        Returns:
+            Zeros, given back when nothing refers to them any more.
+
+        Raises:
+            MemoryError: If there is not as much, neither on the disk nor in memory.
+        """
+        if sys.platform != "linux":
+            return new_pages(size)
+        try:
+            with tempfile.TemporaryFile(dir=self._folder) as file:
+                # A hole in a mapped file ends the process when the disk is full: reserve it all.
+                os.posix_fallocate(file.fileno(), 0, size)
+                found = mmap.mmap(file.fileno(), size)
+        except OSError:
+            return new_pages(size)
+        self._held.add(found)
+        self._used = True
+        return found
+
+    def release(self) -> None:
+        """Let go of the pages, and of memory that was freed but kept.
+
+        What the pages hold is read again when it is looked at.
+        """
+        held = list(self._held)
+        for each in held:
+            each.madvise(mmap.MADV_DONTNEED)
+        if self._used and _TRIM is not None:
+            _TRIM(0)
+        self._used = bool(held)  # once more when all are gone: it takes milliseconds
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What was put together of a session that was not finalised.
+
+    Attributes:
+        folder: Its write-ahead log.
+        live: Whether its recorder is still writing.
+        in_files: Messages that the files have.
+        from_wal: Messages that only the write-ahead log has.
+        accepted: Messages that the recorder accepted; None where nothing tells.
+        looked: Whether all was read to count them; else summaries were believed, or something of
+            the write-ahead log can't be read.
+    """
+
+    folder: Path
+    live: bool
+    in_files: int
+    from_wal: int
+    accepted: int | None
+    looked: bool
+
+    @property
+    def missing(self) -> int | None:
+        """Messages that were accepted and are in neither; None where nothing tells."""
+        if self.accepted is None:
+            return None
+        return max(0, self.accepted - self.in_files - self.from_wal)
+
+    @property
+    def warning(self) -> str:
+        """One sentence, and what to do."""
+        advice = "" if self.live else "; 'undulog log recover' writes a whole file"
+        return f"{self}{advice}"
+
+    def __str__(self) -> str:
+        """One sentence."""
+        total = self.in_files + self.from_wal
+        if self.live:
+            return (
+                f"this recording is running: its first {total} messages are read, "
+                f"{self.from_wal} of them from its write-ahead log"
+            )
+        if self.missing is None:
+            missing = "how many are missing can't be told"
+        elif self.missing:
+            missing = f"{self.missing} of {self.accepted} are missing"
+        elif self.looked:
+            missing = "none is missing"
+        else:
+            missing = "none is missing as far as can be told"
+        return (
+            f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
+            f"from its write-ahead log; {missing}"
+        )
+
+
+class LogFile:
+    """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
+
+    def __init__(self, path: Path, column_folder: Path | None = None) -> None:
+        """Open a session and find what it holds.
+
+        Args:
+            path: Its file, any of its parts, or a folder that holds it and no other.
+            column_folder: Where large columns lie in files; None for memory.
+
+        Raises:
+            NotALogError: If it is empty, not MCAP, or nothing in it can be read.
+            LogError: If the operating system can't open it, or a folder holds several sessions.
+        """
+        self.path = path
+        self.warnings: list[str] = []
+        self.profile = ""
+        self.library = ""
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.blocks: list[Block] = []
+        self.counts: dict[int, int] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, Attachment] = {}
+        self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
+        self.recovered: Recovered | None = None
+        self.foreign_wal = ""  # what to say of a write-ahead log of another session
+        self._sources: list[BlockSource] = []
+        self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
+        self.pages = None if column_folder is None else FilePages(column_folder)
+        first = first_part(path)
+        wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
+        self.parts: PartFiles = open_parts(first, bare=wal is not None)
+        try:
+            for file in self.files:
+                self._join(file)
+            if wal is not None:
+                self._leave_foreign(wal)
+            if wal is not None and not self.foreign_wal:
+                self._join_wal(wal)
+            self.warnings += self.parts.missing
+            if any(block.end_ns > LAST_NS for block in self.blocks):
+                self.warnings.append(
+                    "log times lie beyond the year 2262, which no clock shows: they are read as "
+                    "its April 11"
+                )
+            self._require_channels()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def files(self) -> list[McapFile]:
+        """The files that were opened, in order; a block's ``part`` counts them from 0."""
+        return list(self.parts.files.values())
+
+    @cached_property
+    def spans(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """Earliest and latest log time of each block [ns], shape (n,) each."""
+        times = [(block.start_ns, block.end_ns) for block in self.blocks]
+        first, last = np.array(times, dtype=np.uint64).reshape(-1, 2).T.copy()
+        return first, last
+
+    @cached_property
+    def limits(self) -> tuple[int, int]:
+        """Log times of the first and the last message [Unix ns]; 0 and 0 without messages."""
+        filled = [block for block in self.blocks if block.end_ns]
+        if not filled:
+            return 0, 0
+        first, last = min(each.start_ns for each in filled), max(each.end_ns for each in filled)
+        return min(first, LAST_NS), min(last, LAST_NS)
+
+    def close(self) -> None:
+        """Release everything."""
+        self.scratch.clear()
+        self.parts.close()
+
+    def forget(self) -> None:
+        """Let go of what was read; it is read again when needed."""
+        for file in self.files:
+            file.forget()
+        if self.pages is not None:
+            self.pages.release()
+
+    def payload(self, block: Block) -> tuple[Buffer, int]:
+        """See :meth:`BlockSource.payload`."""
+        return self._sources[block.part].payload(block)
+
+    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
+        """See :meth:`BlockSource.payload_once`."""
+        return self._sources[block.part].payload_once(block)
+
+    def offsets(self, block: Block, channel_id: int) -> IntArray:
+        """See :meth:`BlockSource.offsets`."""
+        return self._sources[block.part].offsets(block, channel_id)
+
+    def inflates(self, block: Block, limit: int) -> bool:
+        """See :meth:`BlockSource.inflates`."""
+        return self._sources[block.part].inflates(block, limit)
+
+    def inflate_into(self, block: Block, room: memoryview) -> None:
+        """See :meth:`BlockSource.inflate_into`."""
+        self._sources[block.part].inflate_into(block, room)
+
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """See :meth:`BlockSource.indexed`."""
+        return self._sources[block.part].indexed(block, channel_ids)
+
+    # -- putting together ------------------------------------------------------------------
+
+    def _require_channels(self) -> None:
+        if not self.channels:
+            raise NotALogError(self.path, "an MCAP file without any channel that could be read")
+
+    def _join(self, file: McapFile) -> None:
+        several = len(self.parts.files) > 1
+        self.warnings += [
+            f"{file.path.name}: {text}" if several else text for text in file.warnings
+        ]
+        self.profile = self.profile or file.profile
+        self.library = self.library or file.library
+        self.schemas |= file.schemas
+        self.channels |= file.channels
+        for item in file.appendices:
+            self._keep(item)
+        self._add(file, file.blocks, file.counts)
+
+    def _add(self, source: BlockSource, blocks: list[Block], counts: dict[int, int]) -> None:
+        for block in blocks:
+            block.part = len(self._sources)
+        self._sources.append(source)
+        self.blocks += blocks
+        for channel_id, count in counts.items():
+            self.counts[channel_id] = self.counts.get(channel_id, 0) + count
+
+    def _keep(self, item: Attachment | Metadata) -> None:
+        """Note a metadata record or attachment; each part repeats those of the session."""
+        if item.name == PART_RECORD or (len(self._sources) and item in self.appendices):
+            return
+        self.appendices.append(item)
+        if isinstance(item, Attachment):
+            self.attachments[item.name] = item
+        else:
+            self.metadata.setdefault(item.name, {}).update(item.metadata)
+
+    def _leave_foreign(self, wal: WalContents) -> None:
+        """Find out whether a write-ahead log belongs to another session: a copy left it behind."""
+        facts = [i for i in wal.definitions if isinstance(i, Metadata) and i.name == "undulog"]
+        ids = {item.metadata["session_id"] for item in facts if "session_id" in item.metadata}
+        own = self.metadata.get("undulog", {}).get("session_id")
+        if own is None or not ids or own in ids:
+            return
+        self.foreign_wal = (
+            f"{wal.folder.name} is the write-ahead log of another session ({min(ids)}) and isn't "
+            f"read; move it to NAME.mcap{wal.folder.suffix}, then 'undulog log recover NAME.mcap'"
+        )
+        self.warnings.append(self.foreign_wal)
+
+    def _join_wal(self, wal: WalContents) -> None:
+        self._define(wal)
+        self._leave_cut_chunk(wal)
+        # The log may begin before the files' end, and they may have grown beyond its own since.
+        # What it let go of while it was being read is a hole in it, of channels it can't tell.
+        grown = max(0, sum(self.counts.values()) - wal.accepted)
+        hole = wal.accepted - wal.before - len(wal.messages)
+        listed = Counter(message.channel_id for message in wal.messages)
+        keys, looked = self._last_keys({key: n + hole + grown for key, n in listed.items()})
+        in_files = sum(self.counts.values())
+        rest = beyond(wal.messages, keys)
+        if rest:
+            tail = WalTail(rest)
+            self._add(tail, tail.blocks, tail.counts)
+        if not (rest or wal.live) and self.parts.finalised and wal.accepted <= in_files:
+            return  # the recorder died when all was done but the tidying up
+        accepted = wal.accepted if wal.messages else None
+        looked = looked and not wal.damaged
+        self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
+        told = list(wal.warnings)
+        if self.recovered.missing == 0:  # then what was only begun held nothing
+            gone = [text for text in self.parts.missing if "can't be read" in text]
+            self.parts.missing = [text for text in self.parts.missing if text not in gone]
+            told = [text for text in told if "no readable header" not in text]
+        self.warnings += [self.recovered.warning, *told]
+
+    def _define(self, wal: WalContents) -> None:
+        """Take from a write-ahead log what the files don't explain themselves."""
+        for item in wal.definitions:
+            if isinstance(item, Header):
+                self.profile = self.profile or item.profile
+                self.library = self.library or item.library
+            elif isinstance(item, Schema):
+                self.schemas.setdefault(item.id, item)
+            elif isinstance(item, Channel):
+                self.channels.setdefault(item.id, item)
+            elif item not in self.appendices:
+                self._keep(item)
+
+    def _leave_cut_chunk(self, wal: WalContents) -> None:
+        """Leave out a chunk that the file's end cuts short where the log has all of it, whole."""
+        last = self.files[-1] if self.files else None
+        if last is None or not last.cut:
+            return
+        expected = [text for text in last.warnings if _is_of_the_end(text)]
+        several = len(self.files) > 1
+        dropped = {f"{last.path.name}: {text}" if several else text for text in expected}
+        self.warnings = [text for text in self.warnings if text not in dropped]
+        block = self.blocks[-1] if self.blocks else None
+        if block is None or block.complete or not wal.messages:
+            return
+        if wal.before <= sum(self.counts.values()) - sum(map(len, (block.offsets or {}).values())):
+            self._leave_out(block)
+
+    def _last_keys(self, least: Mapping[int, int]) -> tuple[set[MessageKey], bool]:
+        """The keys of the files' last messages of some channels.
+
+        A channel's messages are in the files in the order they came, while those of others may be
+        in a later chunk though they came before. A chunk that can't be read is left out: the
+        write-ahead log may have its messages.
+
+        Args:
+            least: Channel id to how many of its messages are wanted, if there are as many.
+
+        Returns:
+            The keys, and whether all of the files was read to count their messages.
+        """
+        keys: set[MessageKey] = set()
+        left = dict(least)
+        trusted = {part for part, file in enumerate(self.files) if not file.cut}
+        unread = {id(block) for block in self.blocks if block.part in trusted}
+        for block in reversed(self.blocks.copy()):
+            if not left:
+                break
+            ids = block.offsets if block.offsets is not None else block.index_at
+            if ids and left.keys().isdisjoint(ids):
+                continue
+            try:
+                heads = self._heads(block)
+            except LogError as error:
+                self._leave_out(block)
+                self.warnings.append(
+                    f"{error}; of its messages only the write-ahead log's are read"
+                )
+                continue
+            columns = (heads[name].tolist() for name in ("channel", "sequence", "log"))
+            keys.update(zip(*columns, strict=True))
+            unread.discard(id(block))
+            ids, counts = np.unique(heads["channel"], return_counts=True)
+            passed = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+            left = {key: count - passed.get(key, 0) for key, count in left.items()}
+            left = {key: count for key, count in left.items() if count > 0}
+        return keys, not unread
+
+    def _heads(self, block: Block) -> NDArray[np.void]:
+        """The heads of all messages of a block.
+
+        Raises:
+            LogError: If it can't be read.
+        """
+        ids = block.offsets if block.offsets is not None else block.index_at
+        offsets = [self.offsets(block, channel_id) for channel_id in ids]
+        data, base = self.payload(block)
+        stop = len(data) if block.compression else block.stop
+        places = np.concatenate([np.empty(0, dtype=np.int64), *offsets])
+        heads = read_heads(data, places + base, stop)
+        if heads is None:
+            where = f"the message index of the chunk at byte {block.start}"
+            raise LogError(self.files[block.part].path, f"{where} does not list its messages")
+        return heads
+
+    def _leave_out(self, block: Block) -> None:
+        """Forget a block; its messages are no longer counted, as far as its index tells them."""
+        self.blocks = [other for other in self.blocks if other is not block]
+        for channel_id in block.offsets if block.offsets is not None else block.index_at:
+            try:
+                count = len(self.offsets(block, channel_id))
+            except LogError:  # then the sum stays too high, and is not called sure
+                continue
+            self.counts[channel_id] = max(0, self.counts.get(channel_id, 0) - count)
+
+
+def _is_of_the_end(warning: str) -> bool:
+    """Whether a warning only says that a file was not finalised."""
+    return (
+        warning.startswith(("the file is cut short", "the last ", "nothing of the last"))
+        or "cut record" in warning
+    )

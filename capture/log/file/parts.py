@@ -1,0 +1,322 @@
+"""The files of a session, from any of its parts or their folder.
+
+Names of the parts of a split session: ``run.mcap``, ``run_0002.mcap``, ``run_0003.mcap``, ...
+
+The first part has the name that was asked for, so that a session need not know beforehand whether
+it will be split.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ...common.errors import LogError, NotALogError
+from ..mcap.file import McapFile
+from ..wal.writer import wal_folder
+
+PART_RECORD = "undulog.part"
+"""Metadata record of a part: ``part`` (its number), ``previous`` and ``previous_sha256`` (file
+name and hash of the one before), ``next`` (file name of the one after) or, in the last one,
+``parts`` (their number). A session that was never split has none."""
+
+_NUMBERED = re.compile(r"(.+)_(\d{4,})")
+
+
+def part_path(first: Path, number: int) -> Path:
+    """The file of a part.
+
+    Args:
+        first: The first part, e.g. ``run.mcap``.
+        number: The part, from 1.
+
+    Returns:
+        E.g. ``run_0002.mcap``.
+    """
+    if number == 1:
+        return first
+    return first.with_name(f"{first.stem}_{number:04d}{first.suffix}")
+
+
+def split_part_path(path: Path) -> tuple[Path, int]:
+    """What the name of a file says of its place, if it is a part.
+
+    Args:
+        path: E.g. ``run_0002.mcap``.
+
+    Returns:
+        The first part and the number, e.g. ``run.mcap`` and 2; the path itself and 1 where the
+        name has no number. Only the file's own record tells whether it is a part at all.
+    """
+    match = _NUMBERED.fullmatch(path.stem)
+    if match is None or int(match[2]) < 2:
+        return path, 1
+    return path.with_name(match[1] + path.suffix), int(match[2])
+
+
+def later_parts(first: Path) -> list[Path]:
+    """Files that have the name of a later part.
+
+    Args:
+        first: The first part; it need not be there.
+
+    Returns:
+        Those beside it, by number.
+
+    Raises:
+        OSError: If the folder can't be listed.
+    """
+    found: list[tuple[int, Path]] = []
+    for path in first.parent.iterdir():
+        head, number = split_part_path(path)
+        if number > 1 and head == first:
+            found.append((number, path))
+    return [path for _, path in sorted(found)]
+
+
+_MOST_LISTED = 20
+
+
+@dataclass
+class PartFiles:
+    """The files of a session that are there, opened, in order.
+
+    Attributes:
+        files: By number of the part.
+        missing: What is missing or left out, one sentence each.
+        paths: All files that were looked at, those that held nothing too.
+    """
+
+    files: dict[int, McapFile] = field(default_factory=dict[int, McapFile])
+    missing: list[str] = field(default_factory=list[str])
+    paths: list[Path] = field(default_factory=list[Path])
+
+    @property
+    def finalised(self) -> bool:
+        """Whether the last file has its end and says of no other to follow."""
+        if not self.files:
+            return False
+        last = self.files[max(self.files)]
+        return not last.cut and "next" not in _part_record(last)
+
+    def close(self) -> None:
+        """Release all files."""
+        for file in self.files.values():
+            file.close()
+
+
+def first_part(path: Path) -> Path:
+    """The first part of the session that a path names.
+
+    Args:
+        path: Any part, or the folder of one session.
+
+    Returns:
+        The first part's file, which need not be there.
+
+    Raises:
+        LogError: If a folder holds no session, or several.
+    """
+    if path.is_dir():
+        return _session_in(path)
+    head, number = split_part_path(path)
+    if number == 1:
+        return path
+    return head if _is_part(path, head) else path
+
+
+def open_parts(first: Path, *, bare: bool) -> PartFiles:
+    """Open the files of a session.
+
+    Args:
+        first: Its first part.
+        bare: Whether a write-ahead log can explain files that don't explain themselves, and
+            stand in for one that is missing.
+
+    Returns:
+        The files.
+
+    Raises:
+        NotALogError: If the only file is no log.
+        LogError: If the only file can't be opened.
+    """
+    found = PartFiles()
+    try:
+        _open_parts(found, first, bare=bare)
+    except BaseException:
+        found.close()
+        raise
+    return found
+
+
+def check_chain(parts: PartFiles) -> list[str]:
+    """Hold each part against the hash that the next one has of it.
+
+    Args:
+        parts: The files of a session.
+
+    Returns:
+        What doesn't fit, one sentence each.
+    """
+    wrong: list[str] = []
+    for number, file in parts.files.items():
+        stated = _part_record(file).get("previous_sha256")
+        former = parts.files.get(number - 1)
+        if stated is None or former is None:
+            continue
+        with former.path.open("rb") as stream:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+        if found != stated:
+            wrong.append(
+                f"{former.path.name} is not the file that {file.path.name} was recorded after: "
+                "its hash is another"
+            )
+    return wrong
+
+
+def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
+    paths = {1: first}
+    if part_path(first, 2).exists() or not first.exists():
+        paths |= _later(first)
+    opened: dict[int, McapFile] = {}
+    try:
+        _open_all(opened, paths, found.missing, bare=bare)
+        if len(paths) == 1 and 1 in opened and "next" in _part_record(opened[1]):
+            paths |= _later(first)
+            rest = {number: path for number, path in paths.items() if number > 1}
+            _open_all(opened, rest, found.missing, bare=True)
+    finally:
+        found.files |= sorted(opened.items())
+        found.paths += paths.values()
+    for number, file in sorted(opened.items()):
+        begun = bare and file.cut and not file.blocks  # died before anything of worth was in it
+        reason = "" if begun else _stranger(opened, number)
+        if reason:
+            found.missing.append(f"{file.path.name} {reason}: left out")
+        if reason or (begun and number > 1):
+            del opened[number], found.files[number]
+            file.close()
+    found.missing += _gaps(found, first, {*paths} if 1 in opened else {*paths} - {1}, bare=bare)
+
+
+def _open_all(
+    opened: dict[int, McapFile], paths: dict[int, Path], missing: list[str], *, bare: bool
+) -> None:
+    """Open files, the last first.
+
+    Of a recording that runs, what is written meanwhile leaves no gap before a part then.
+    """
+    alone = not bare and len(paths) == 1
+    for number, path in reversed(paths.items()):
+        try:
+            opened[number] = McapFile(path, bare=not alone)
+        except LogError as error:
+            if alone:
+                raise
+            if number > 1 or path.exists():
+                missing.insert(0, f"part {number} can't be read: {error}")
+
+
+def _later(first: Path) -> dict[int, Path]:
+    """The files that have the name of a later part, by number."""
+    if not first.parent.is_dir():
+        return {}
+    try:
+        return {split_part_path(path)[1]: path for path in later_parts(first)}
+    except OSError as error:
+        raise LogError(first, f"its folder can't be listed: {error.strerror}") from error
+
+
+def _stranger(opened: dict[int, McapFile], number: int) -> str:
+    """Why a file does not belong to those before it; empty if it does."""
+    file = opened[number]
+    if number > 1 and _part_record(file).get("part") != str(number):
+        return f"does not say that it is part {number}"
+    before = [opened[other] for other in opened if other < number]
+    if any(_session_id(file) != _session_id(other) for other in before):
+        return "is of another session"
+    if _redefines(file, before):
+        return "describes its channels differently"
+    return ""
+
+
+def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list[str]:
+    """The parts that must have been and are not there."""
+    if not found.files:
+        return []
+    last = max(found.files)
+    end = _part_record(found.files[last])
+    gone = [number for number in range(1, last) if number not in there]
+    told = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
+    if bare:  # the write-ahead log knows how much was recorded after the last file
+        return told
+    if "next" in end and last + 1 not in there:
+        name = part_path(first, last + 1).name
+        told.append(f"part {last + 1} ({name}) is missing; whether more followed it can't be told")
+    elif "next" not in end and "parts" not in end and last > 1:
+        told.append(f"part {last} does not say that it is the last: more may have followed")
+    return told
+
+
+def _redefines(file: McapFile, others: list[McapFile]) -> bool:
+    known = {key: kind for other in others for key, kind in _kinds(other)}
+    return any(known.get(key, kind) != kind for key, kind in _kinds(file))
+
+
+def _kinds(file: McapFile) -> list[tuple[int, tuple[str, str, bytes]]]:
+    kinds: list[tuple[int, tuple[str, str, bytes]]] = []
+    for key, channel in file.channels.items():
+        schema = file.schemas.get(channel.schema_id)
+        kind = (channel.topic, schema.name, schema.data) if schema else (channel.topic, "", b"")
+        kinds.append((key, kind))
+    return kinds
+
+
+def _part_record(file: McapFile) -> dict[str, str]:
+    return file.metadata.get(PART_RECORD, {})
+
+
+def _session_id(file: McapFile) -> str:
+    return file.metadata.get("undulog", {}).get("session_id", "")
+
+
+def _is_part(path: Path, head: Path) -> bool:
+    """Whether a file with the name of a later part is one: it says so, or it says nothing."""
+    known = head.exists() or wal_folder(head).is_dir()
+    try:
+        file = McapFile(path, bare=True)
+    except LogError:
+        return known or not path.exists()
+    try:
+        return PART_RECORD in file.metadata or (known and not file.channels)
+    finally:
+        file.close()
+
+
+def _session_in(folder: Path) -> Path:
+    """The first part of the only session in a folder."""
+    try:
+        names = sorted(folder.iterdir())
+    except OSError as error:
+        raise LogError(folder, f"can't be listed: {error.strerror}") from error
+    heads: dict[Path, None] = {}
+    for path in names:
+        if path.suffix == ".mcap" and path.is_file():
+            heads[first_part(path)] = None
+        elif path.name.endswith(".mcap.wal") and path.is_dir():
+            heads[path.with_name(path.name.removesuffix(".wal"))] = None
+    bag = folder / "metadata.yaml" in names  # as rosbag2 writes it
+    if not heads and bag:
+        why = "a rosbag2 folder without .mcap; convert it: ros2 bag convert, storage_id: mcap"
+        raise NotALogError(folder, why)
+    if not heads:
+        raise NotALogError(folder, "no session (.mcap) is in this folder; name a session's file")
+    if len(heads) > 1:
+        listed = ", ".join([path.name for path in heads][:_MOST_LISTED])
+        more = f" and {len(heads) - _MOST_LISTED} more" if len(heads) > _MOST_LISTED else ""
+        fix = "join them with undulog log merge" if bag else "name one"
+        what = "files of a rosbag2 folder" if bag else "sessions"
+        raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}{more}")
+    return next(iter(heads))

@@ -1,0 +1,370 @@
+"""The health of a recorded session: measures in, a verdict with its reasons out.
+
+The measures come from :mod:`.health.tallies`, so the same rules judge a file or the last
+seconds of a live recording. Every threshold stands here by name, with why it is what it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from ...following.fault import Fault as JointFault
+from ..edit.edited_log import Fault, Finding
+from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
+from .freeze import FROZEN_SAMPLES
+from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
+from .tallies import NS, PAUSE_PERIODS, PAUSE_S
+
+GOOD_LOSS = 1e-3
+"""Up to one sample in a thousand may be missing, not finite or repeated in a good session: less
+than one in a gait cycle of ten seconds at 100 Hz."""
+
+BAD_LOSS = 0.1
+"""From a tenth on the losses are seldom random: they follow bus load and hence the motion, and
+what is left is a biased picture of it."""
+
+LONG_GAP_S = 0.1
+"""A gap that a good session doesn't have. Linear interpolation across T misses up to
+1 - cos(pi f T) of the amplitude: 5 % for 0.1 s at 1 Hz, the quickest gaits of such robots."""
+
+BAD_PAUSE = 0.5
+"""With pauses over half of the time a session has more holes than data."""
+
+MAX_JITTER = 0.25
+"""Standard deviation of the intervals against their median: a quarter means that one sample in
+twenty is half an interval off, so the rhythm of the source is disturbed."""
+
+FROZEN_SECONDS = 2
+"""Consecutive seconds that make a frozen joint; one alone may be a slow start of the motion."""
+
+LIMIT_RAD = 1e-3
+"""Nearer to a limit than this is at it: below one step of a 12-bit encoder (1.5 mrad)."""
+
+MAX_AT_LIMIT = 0.1
+"""A sine that just touches both limits of 30 degrees is within 1 mrad of them for
+2 / pi arccos(1 - 1e-3 / 0.52) = 4 % of the time; beyond a tenth the joint is held there."""
+
+MAX_BUS_LOAD = 0.8
+"""From this part of the bitrate on, frames of low priority wait for many others."""
+
+BAD_JOINTS = 0.5
+"""With half of the joints dead the session no longer shows the robot's motion."""
+
+VERDICTS = ("good", "degraded", "bad")
+VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
+"""Never analysed, so never judged."""
+
+RECORDER_TOPICS = ("/rosout", "/diagnostics", "/clock/")
+"""What a recorder says of itself, many voices on one topic: an event may be told late, and a clock
+that was not read again repeats its last stamp. It has no rhythm that could be disturbed."""
+
+
+def judge_file(health: FileHealth) -> list[Finding]:
+    """Findings on the container.
+
+    Args:
+        health: Its measures.
+
+    Returns:
+        The findings.
+    """
+    found = [Finding(2, sentence) for sentence in health.damage]
+    if health.unfinished:
+        found.append(Finding(0 if health.running else 1, health.unfinished))
+    elif health.truncated:
+        found.append(Finding(1, "the file is cut short: what came after the cut is lost"))
+    elif not health.indexed:
+        found.append(Finding(1, "the file has no usable index and can only be read from the start"))
+    found += [Finding(0, sentence) for sentence in health.notes]
+    if health.without_crc:
+        found.append(
+            Finding(
+                0,
+                f"{health.without_crc} of {health.chunks} chunks carry no CRC: damage in them "
+                "can't be excluded",
+            )
+        )
+    return found
+
+
+def judge_channel(health: ChannelHealth) -> list[Fault]:
+    """Return what is wrong with one channel.
+
+    Args:
+        health: Its measures.
+
+    Returns:
+        The faults.
+    """
+    found: list[Fault] = []
+
+    def add(weight: int, text: str) -> None:
+        found.append(Fault(weight, health.topic, "", text))
+
+    expected = health.count + (health.sequence.dropped or 0)
+    if health.sequence.dropped:
+        part = health.sequence.dropped / expected
+        add(
+            2 if part >= BAD_LOSS else 1,
+            f"{health.sequence.dropped} of {expected} messages were dropped ({part:.2%}), as its "
+            "sequence numbers prove",
+        )
+    if health.sequence.reordered:
+        add(0, f"{health.sequence.reordered} messages are out of sequence")
+    if health.unread:
+        weight = 2 if health.unread >= BAD_LOSS * health.count else 1
+        add(weight, f"{health.unread} of {health.count} messages can't be decoded")
+    return found
+
+
+def has_rhythm(topic: str) -> bool:
+    """Whether a topic is one whose rhythm is judged.
+
+    Args:
+        topic: Its name.
+    """
+    return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
+
+
+def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault]:
+    """Return what is wrong with the rhythm of one series.
+
+    Args:
+        health: Its measures.
+        start_ns: Log time of the session's first message [Unix ns].
+        end_ns: Log time of its last message [Unix ns].
+
+    Returns:
+        The faults; none for view aids and for what a recorder says of itself.
+    """
+    timing = health.timing
+    if timing.median_s is None or not has_rhythm(health.topic):
+        return []
+    found: list[Fault] = []
+
+    def add(weight: int, text: str) -> None:
+        found.append(Fault(weight, health.label, "", text))
+
+    when = _at(timing.longest_at_ns, timing.first_ns)
+    joints = health.type_name.endswith("/JointState")
+    span_s = (timing.last_ns - timing.first_ns) / NS
+    mostly_paused = joints and timing.paused_s >= BAD_PAUSE * span_s
+    if timing.gaps:
+        found.append(_gaps(health, when, mostly_paused=mostly_paused))
+    elif joints and timing.paused_s:
+        text = f"silent for {timing.paused_s:.3g} s in all; the longest pause is "
+        add(1 + mostly_paused, f"{text}{timing.longest_s:.3g} s, {when}")
+    if timing.regular:
+        for text in _edges_and_jitter(health, start_ns, end_ns):
+            add(1, text)
+    elif joints and timing.count > FROZEN_SAMPLES:
+        add(0, "no steady rhythm, so single gaps can't be told")
+    if timing.backward:
+        add(1, f"{timing.backward} stamps go back in time")
+    if timing.duplicates:
+        weight = int(timing.duplicates > GOOD_LOSS * timing.count)
+        add(weight, f"{timing.duplicates} stamps are repeated")
+    if health.nan and not joints:
+        weight = int(health.nan > GOOD_LOSS * health.numbers)
+        add(weight, f"{health.nan} of {health.numbers} numbers are not a number")
+    return found
+
+
+def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
+    """The gaps of a series."""
+    timing = health.timing
+    long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * (timing.median_s or 0.0)
+    scattered = timing.scattered / (timing.count + timing.scattered)
+    lost = scattered >= BAD_LOSS or mostly_paused
+    return Fault(
+        2 if lost else int(timing.missing_part > GOOD_LOSS or long),
+        health.label,
+        "",
+        f"{timing.gaps} gaps, {timing.missing} samples missing ({timing.missing_part:.2%}); "
+        f"the longest is {timing.longest_s:.3g} s, {when}",
+        timing.gaps,
+        (timing.longest_at_ns, timing.longest_at_ns + round(timing.longest_s * NS)),
+        timing.missing_part,
+    )
+
+
+def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[str]:
+    """What is wrong with the beginning, the end and the intervals of a regular series."""
+    timing, median_s = health.timing, health.timing.median_s or 0.0
+    edge_s = max(PAUSE_S, PAUSE_PERIODS * median_s)
+    late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
+    if late_s > edge_s:
+        yield f"starts {late_s:.3g} s after the session"
+    if early_s > edge_s:
+        yield f"ends {early_s:.3g} s before the session"
+    if timing.std_s is not None and timing.std_s > MAX_JITTER * median_s:
+        yield f"the intervals jitter by {timing.std_s / median_s:.0%} of their median"
+
+
+def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
+    """Return what is wrong with the joints, each by itself.
+
+    Args:
+        joints: Measures of all joints of all topics.
+        start_ns: Start of the session [Unix ns].
+
+    Returns:
+        The faults.
+    """
+    found: list[Fault] = []
+    for joint in joints:
+
+        def add(weight: int, text: str, joint: JointHealth = joint) -> None:
+            found.append(Fault(weight, joint.topic, joint.name, text))
+
+        if joint.nan:
+            weight = int(joint.nan > GOOD_LOSS * joint.samples)
+            add(weight, f"{joint.nan} of {joint.samples} samples are not a number")
+        if _is_frozen(joint):
+            when = _at(joint.frozen_at_ns, start_ns)
+            add(1, f"frozen for {joint.frozen_s} s while its command moved, {when}")
+        if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
+            add(1, f"at the robot's limits in {joint.at_limit:.0%} of the samples")
+    return found
+
+
+def judge_body(joints: Sequence[JointHealth]) -> list[Finding]:
+    """Findings on the joints together.
+
+    Args:
+        joints: Measures of all joints of all topics.
+
+    Returns:
+        The findings.
+    """
+    measured = [joint for joint in joints if joint.topic == "/joint_states"]
+    names = {joint.name for joint in measured}
+    dead = {
+        joint.name
+        for joint in measured
+        if _is_frozen(joint) or joint.nan > BAD_LOSS * joint.samples
+    }
+    if len(names) > 1 and len(dead) >= BAD_JOINTS * len(names):
+        return [Finding(2, f"{len(dead)} of {len(names)} joints are frozen or missing")]
+    return []
+
+
+def _is_frozen(joint: JointHealth) -> bool:
+    return (joint.frozen_s or 0) >= FROZEN_SECONDS
+
+
+def judge_following(fault: JointFault) -> Finding:
+    """Finding on a joint that does not follow its command.
+
+    Args:
+        fault: The fault, times from the session's start.
+
+    Returns:
+        The finding, with the kinds that fit.
+    """
+    when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
+    when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
+    kinds = " or ".join(fault.kinds)
+    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {kinds}")
+
+
+def judge_bus(health: BusHealth) -> list[Finding]:
+    """Findings on a bus.
+
+    Args:
+        health: Its measures.
+
+    Returns:
+        The findings.
+    """
+    found: list[Finding] = []
+    if health.error_frames:
+        part = health.error_frames / health.frames
+        weight = 2 if part >= BAD_LOSS else int(part > GOOD_LOSS)
+        sentence = f"{health.topic}: {health.error_frames} of {health.frames} are error frames"
+        found.append(Finding(weight, sentence))
+    if health.peak_load is not None and health.peak_load[0] > MAX_BUS_LOAD:
+        sentence = f"{health.topic}: {health.peak_load[0]:.0%} of the bitrate in the busiest second"
+        found.append(Finding(1, sentence))
+    return found
+
+
+def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
+    """Findings on times without any frame of a bus, classic or CAN FD.
+
+    Of a bus that has both kinds, the longest silences of the two are held against each other.
+
+    Args:
+        buses: Measures of all topics of frames.
+        start_ns: Start of the session [Unix ns].
+
+    Returns:
+        The findings.
+    """
+    silences: dict[str, tuple[str, int, int]] = {}
+    for bus in buses:
+        begin, end = bus.longest_at_ns, bus.longest_at_ns + round(bus.longest_s * NS)
+        topic, earlier, later = silences.get(bus_of(bus.topic), (bus.topic, begin, end))
+        silences[bus_of(bus.topic)] = topic, max(begin, earlier), min(end, later)
+    found: list[Finding] = []
+    for topic, begin, end in silences.values():
+        if (silent_s := (end - begin) / NS) > PAUSE_S:
+            when = _at(begin, start_ns)
+            found.append(Finding(1, f"{topic}: silent for {silent_s:.3g} s, {when}"))
+    return found
+
+
+def judge_topics(
+    types: dict[str, str],
+    joints: Sequence[str],
+    seen: Iterable[str],
+    undecoded: str | None = None,
+) -> list[Finding]:
+    """Findings on what the log contract asks for and the session lacks.
+
+    Args:
+        types: Topic with messages to type.
+        joints: The robot's joints; empty without a robot.
+        seen: Joints that ``/joint_states`` carries.
+        undecoded: Why the raw CAN frames brought nothing, or hardly anything; None if they did.
+
+    Returns:
+        The findings; where frames brought nothing, that is the one reason for what is missing.
+    """
+    found = [] if undecoded is None else [Finding(1, undecoded)]
+    framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
+    others = sorted(topic for topic, kind in types.items() if kind.endswith("/JointState"))
+    for topic in ("/joint_states", "/joint_commands"):
+        if topic in types:
+            continue
+        if others:
+            sentence = f"{topic} is missing; JointStates are on {', '.join(others)}"
+        elif undecoded is not None:
+            continue
+        elif framed:
+            sentence = f"{topic} is missing; there are raw CAN frames"
+        else:
+            sentence = f"{topic} is missing, and no other topic has joints"
+        nothing = not others and not framed
+        found.append(Finding(2 if nothing else 1, sentence))
+    present = set(seen)
+    missing = [name for name in joints if name not in present]
+    if present and missing:
+        found.append(Finding(1, f"/joint_states never carries {', '.join(missing)}"))
+    return found
+
+
+def verdict_of(findings: Iterable[Finding]) -> str:
+    """The verdict: that of the heaviest finding, ``good`` without any.
+
+    Args:
+        findings: All findings.
+
+    Returns:
+        One of :data:`VERDICTS`.
+    """
+    return VERDICTS[max((finding.weight for finding in findings), default=0)]
+
+
+def _at(t_ns: int, start_ns: int) -> str:
+    return f"at {(t_ns - start_ns) / NS:.3f} s"

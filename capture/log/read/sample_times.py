@@ -1,0 +1,287 @@
+"""Sampling times of joints that a bus asks in turn: message stamps plus logged offsets.
+
+Which clock the header stamps of a log are on.
+
+A log recorded from a simulation may carry simulated time in its headers and wall time in the
+container. Windows, plots and alignment need one clock, so such stamps are shifted to the log's.
+
+Where a session was recorded without a break.
+
+A clock that jumps (set by NTP when the network comes, or by hand) leaves a hole of hours or years
+in the stamps, and nothing tells how the motion before it joins that after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ...common.arrays import FloatArray, IntArray
+from ...common.errors import DataError
+from ..columns.layouts import stamps_of
+from ..columns.topics import Topics
+from ..messages.cdr import layout_of
+
+BREAK_S = 10.0
+"""A session breaks where none of its channels has a sample for longer than this [s]; shorter gaps
+are losses, which the estimators stand."""
+
+BREAK_INTERVALS = 10
+"""Median intervals that a break has at least: slow channels sample less often than that."""
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Unbroken:
+    """The longest stretch without a break.
+
+    Attributes:
+        start_ns: Its first sample [Unix ns].
+        last_ns: Its last sample [Unix ns].
+        others: How many stretches are left out.
+        left_s: Their length together, without the gaps [s].
+        gap_s: The longest gap between stretches [s]; 0 where there is none.
+    """
+
+    start_ns: int
+    last_ns: int
+    others: int = 0
+    left_s: float = 0.0
+    gap_s: float = 0.0
+
+    def __str__(self) -> str:
+        """One sentence; what is left out, and why."""
+        stretches = "1 other stretch" if self.others == 1 else f"{self.others} other stretches"
+        return (
+            f"the recording has a gap of {_length(self.gap_s)}: its longest unbroken stretch, "
+            f"{(self.last_ns - self.start_ns) / _NS:.1f} s, is analysed, {stretches} of "
+            f"{self.left_s:.1f} s altogether left out (choose with --start and --stop)"
+        )
+
+
+def longest_unbroken(
+    times_ns: Iterable[IntArray], start_ns: int | None = None, stop_ns: int | None = None
+) -> Unbroken | None:
+    """Find the longest stretch in which the samples of some channels follow each other.
+
+    Args:
+        times_ns: Sampling times of each channel [Unix ns], not decreasing.
+        start_ns: First time to look at [Unix ns], or None.
+        stop_ns: One past the last time [Unix ns], or None.
+
+    Returns:
+        The stretch; of equal ones the first; None without samples.
+    """
+    runs = [
+        run
+        for t_ns in {id(each): each for each in times_ns}.values()
+        for run in _runs(_within(t_ns, start_ns, stop_ns))
+    ]
+    joined: list[tuple[int, int]] = []
+    for first, last in sorted(runs):
+        if joined and first - joined[-1][1] <= BREAK_S * _NS:
+            joined[-1] = joined[-1][0], max(joined[-1][1], last)
+        else:
+            joined.append((first, last))
+    if not joined:
+        return None
+    longest = max(joined, key=lambda run: run[1] - run[0])
+    gaps = [after[0] - before[1] for before, after in pairwise(joined)]
+    left = sum(last - first for first, last in joined) - (longest[1] - longest[0])
+    return Unbroken(*longest, len(joined) - 1, left / _NS, max(gaps, default=0) / _NS)
+
+
+def _within(t_ns: IntArray, start_ns: int | None, stop_ns: int | None) -> IntArray:
+    first = 0 if start_ns is None else int(np.searchsorted(t_ns, start_ns))
+    stop = t_ns.size if stop_ns is None else int(np.searchsorted(t_ns, stop_ns))
+    return t_ns[first:stop]
+
+
+def _runs(t_ns: IntArray) -> list[tuple[int, int]]:
+    """First and last time of each stretch of one channel."""
+    if not t_ns.size:
+        return []
+    step = np.diff(t_ns)
+    breaks = np.flatnonzero(step > BREAK_S * _NS)
+    if breaks.size:
+        least = BREAK_INTERVALS * float(np.median(step))
+        breaks = breaks[step[breaks] > least]
+    firsts = t_ns[np.concatenate([[0], breaks + 1])]
+    lasts = t_ns[np.concatenate([breaks, [t_ns.size - 1]])]
+    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
+
+
+def _length(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.1f} s"
+
+
+_FAR_STAMP_NS = 3600 * _NS
+"""Stamps further than this from the log time are on another clock."""
+
+_NEVER_NS = 2**62
+"""No log time lies beyond this [Unix ns], the year 2116: such a one is damage."""
+
+
+class StampClock:
+    """The shift from header stamps to the log's clock, found once for a session."""
+
+    def __init__(self, topics: Topics, warn: Callable[[str], None]) -> None:
+        """Look at nothing yet.
+
+        Args:
+            topics: The log's topics.
+            warn: Takes one sentence if the stamps are on another clock.
+        """
+        self._topics = topics
+        self._warn = warn
+        self._shift_ns: int | None = None
+
+    def shift_ns(self, topic: str) -> int:
+        """What must be added to the header stamps of the log [ns]; 0 on the log's own clock.
+
+        Args:
+            topic: Where to look if the shift isn't known yet: its first message decides for all
+                topics, in whole seconds, so that they stay aligned.
+
+        Returns:
+            The shift [ns].
+
+        Raises:
+            MissingChannelError: If the log has no such topic.
+            DataError: If the topic's type can't be read.
+        """
+        if self._shift_ns is None:
+            self._shift_ns = self._look(topic)
+        return self._shift_ns or 0
+
+    def _look(self, topic: str) -> int | None:
+        first = self._topics.first(topic)
+        if first is None:
+            return None
+        log_ns, message, kind = first
+        try:
+            layout = layout_of(kind, message)
+        except DataError:
+            return None
+        stamps = stamps_of(layout, np.frombuffer(message, np.uint8)[None])
+        if stamps is None or "header.stamp.sec" not in layout.leaves:
+            return None
+        stamp_ns = int(stamps[0])
+        if not stamp_ns or not 0 <= log_ns < _NEVER_NS:
+            return None
+        shift_ns = clock_shift_ns(stamp_ns, log_ns)
+        if shift_ns:
+            self._warn(
+                f"header stamps lie {-shift_ns // _NS} s from the log times (another clock, such "
+                "as simulated time); they are shifted by that"
+            )
+        return shift_ns
+
+
+def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
+    """Return what must be added to a stamp [ns], in whole seconds, if it is on another clock."""
+    apart_ns = log_ns - stamp_ns
+    return round(apart_ns / _NS) * _NS if abs(apart_ns) > _FAR_STAMP_NS else 0
+
+
+_FAR_NS = 2.0**60
+
+
+@dataclass(frozen=True)
+class Series:
+    """Samples of some joints.
+
+    Attributes:
+        names: The joints.
+        t_ns: Message stamps [Unix ns], not decreasing, one array a joint; joints that were
+            sampled together share one array.
+        values: One array of shape (n_j,) a joint.
+    """
+
+    names: tuple[str, ...]
+    t_ns: Sequence[IntArray]
+    values: Sequence[FloatArray]
+
+
+def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]]:
+    """Sampling times of several series whose joints have the same offsets.
+
+    Args:
+        stamped: The series.
+        offsets: Sample time minus stamp [s]. Its memory may be used for the times: don't look at
+            it afterwards.
+
+    Returns:
+        For each series one array a joint [Unix ns]: its stamps plus the offset that was logged
+        with each stamp, or last before it (the first offset for stamps before that). Series that
+        were stamped alike share them, and so do joints without offsets. Joints that ``offsets``
+        doesn't have keep their stamps.
+    """
+    if all(_stamped_alike(series, offsets) for series in stamped):  # the usual case
+        own = [
+            np.add(t_ns, _steps(values), out=values.view(np.int64))
+            for t_ns, values in zip(offsets.t_ns, offsets.values, strict=True)
+        ]
+        return [own for _ in stamped]
+    found: list[list[IntArray]] = []
+    for i, series in enumerate(stamped):
+        for earlier, known in zip(stamped[:i], found, strict=True):
+            if _stamped_alike(series, earlier):
+                found.append(known)
+                break
+        else:
+            found.append(_each_own(series, offsets))
+    return found
+
+
+def _each_own(series: Series, offsets: Series) -> list[IntArray]:
+    place = {name: j for j, name in enumerate(offsets.names)}
+    own: list[IntArray] = []
+    for name, t_ns in zip(series.names, series.t_ns, strict=True):
+        j = place.get(name)
+        if j is None or not len(offsets.t_ns[j]):
+            own.append(t_ns)
+            continue
+        own.append(moved(t_ns, offsets.t_ns[j], offsets.values[j]))
+    return own
+
+
+def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
+    """Return times plus the offset that was logged with each, or last before it.
+
+    Args:
+        t_ns: Times [ns], shape (n,).
+        stamp_ns: When the offsets were logged [ns], not decreasing, shape (k,), at least one.
+        offset_s: The offsets [s], shape (k,).
+
+    Returns:
+        Shape (n,) [ns]; before the first offset, it is used.
+    """
+    last = np.searchsorted(stamp_ns, t_ns, side="right") - 1
+    return t_ns + _steps(offset_s[np.maximum(last, 0)])
+
+
+def _steps(offset_s: FloatArray) -> IntArray:
+    """Offsets [ns]; those that are not finite, or beyond all reason, count as zero."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = offset_s * _NS
+        np.rint(steps, out=steps)
+        usable = np.abs(steps) < _FAR_NS
+    if not usable.all():
+        steps[~usable] = 0.0
+    return steps.astype(np.int64)
+
+
+def _stamped_alike(one: Series, other: Series) -> bool:
+    if one.names != other.names or len({id(t_ns) for t_ns in (*one.t_ns, *other.t_ns)}) > 2:
+        return False
+    return all(
+        a is b or np.array_equal(a, b) for a, b in zip(one.t_ns[:1], other.t_ns[:1], strict=True)
+    )

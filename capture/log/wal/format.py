@@ -1,0 +1,266 @@
+"""Layout of a write-ahead log: segment files of length- and CRC-framed records.
+
+A log is a folder beside its MCAP file, ``X.mcap.wal/``. Messages are in ``000001.seg``,
+``000002.seg``, ...; definitions (schemas, channels, metadata, attachments) in
+``def-000001.seg``, ... . All numbers are little-endian.
+
+::
+
+    segment = header (64 bytes), records, zeros, header again
+    header  = magic (8), stream u32, salt u32, number u64, size u64, log id (16), CRC-32, pad (12)
+    record  = CRC-32, length u32, position u64, kind u8, mark u8, channel u16, sequence u32,
+              log time u64, publish time u64, payload (length bytes), zeros to a multiple of 8
+
+The header stands at either end, since all hangs on it. ``position`` counts the records of a
+stream from 1, so that a gap says how many are missing. ``kind`` is the opcode of the MCAP record
+that it becomes, and the payload of a definition is that record's body (https://mcap.dev/spec).
+A record's CRC covers all that follows it and starts from the segment's random salt, so that
+bytes of another log, inside a payload or on a disk block used before, are never taken for records.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import struct
+import zlib
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple, Self
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
+
+from ...common.errors import LogWriteError
+
+LOCK_NAME = "recorder.lock"
+
+
+class WalLock:
+    """Held by a recorder from the creation of its log to the end."""
+
+    def __init__(self, folder: Path) -> None:
+        """Take the lock.
+
+        Args:
+            folder: The log.
+
+        Raises:
+            LogWriteError: If another recorder holds it, or the folder can't be written.
+        """
+        self._path = folder / LOCK_NAME
+        try:
+            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise LogWriteError(folder, f"can't be written: {error.strerror}") from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(self._file)
+            if isinstance(error, BlockingIOError):
+                raise LogWriteError(folder, "another recorder is writing it") from error
+            raise LogWriteError(folder, f"can't be locked: {error.strerror}") from error
+
+    def release(self) -> None:
+        """Give the lock back."""
+        with suppress(OSError):  # someone else may have tidied up
+            self._path.unlink()
+        os.close(self._file)
+
+
+def is_live(folder: Path) -> bool:
+    """Whether a recorder is writing a log at the moment.
+
+    Args:
+        folder: The log.
+
+    Returns:
+        True while the recorder lives; on a file system without locks, False.
+    """
+    try:
+        opened = os.open(folder / LOCK_NAME, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(opened)
+    return False
+
+
+Definition = Header | Schema | Channel | Metadata | Attachment
+"""What explains a file, as the MCAP library has it."""
+
+MAGIC = b"\x89UWAL1\r\n"
+MARK = 0xA5
+"""Stands in every record, so that a search for the next whole record is quick."""
+
+HEADER_SIZE = 64
+RECORD_SIZE = 40
+"""Bytes of a record before its payload."""
+
+MAX_PAYLOAD = 256 << 20
+"""Longest payload [byte]; a length beyond it is damage."""
+
+RECORD_CRC = struct.Struct("<I")
+RECORD_BODY = struct.Struct("<IQBBHIQQ")
+_HEADER_BODY = struct.Struct("<8sIIQQ16s")
+
+RecordFields = tuple[int, int, int, int, int, int, int]
+"""Position, kind, mark, channel id, sequence, log time, publish time: :class:`RecordHead` without
+its length, as a plain tuple, for the hot path."""
+
+_KINDS: dict[type[Definition], int] = {
+    Header: Opcode.HEADER,
+    Schema: Opcode.SCHEMA,
+    Channel: Opcode.CHANNEL,
+    Metadata: Opcode.METADATA,
+    Attachment: Opcode.ATTACHMENT,
+}
+_TYPES = {kind: record for record, kind in _KINDS.items()}
+_MCAP_PREFIX = 9  # opcode and length, which the record has already
+
+MESSAGES, DEFINITIONS = 0, 1
+"""The two streams of a log."""
+
+STREAM_KINDS = {MESSAGES: frozenset({int(Opcode.MESSAGE)}), DEFINITIONS: frozenset(_TYPES)}
+"""The kinds of record that a stream has."""
+
+_NAME = re.compile(r"(def-)?(\d{6,19})\.seg")
+
+
+class RecordHead(NamedTuple):
+    """What stands before a payload.
+
+    Attributes:
+        length: Bytes of payload.
+        position: Running number in its stream, from 1.
+        kind: MCAP opcode.
+        mark: :data:`MARK`.
+        channel_id: MCAP channel; 0 for a definition.
+        sequence: The message's own counter.
+        log_time_ns: When it was recorded [Unix ns].
+        publish_time_ns: When it was sampled [Unix ns].
+    """
+
+    length: int
+    position: int
+    kind: int
+    mark: int
+    channel_id: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+
+
+@dataclass(frozen=True)
+class SegmentHeader:
+    """What a segment says of itself.
+
+    Attributes:
+        stream: :data:`MESSAGES` or :data:`DEFINITIONS`.
+        salt: Where the CRC of its records starts.
+        number: Its place in the stream, from 1; in its name too.
+        size: Bytes reserved for it, both headers included.
+        log_id: The same 16 random bytes in all segments of a log.
+    """
+
+    stream: int
+    salt: int
+    number: int
+    size: int
+    log_id: bytes
+
+    def pack(self) -> bytes:
+        """Its 64 bytes."""
+        body = _HEADER_BODY.pack(MAGIC, self.stream, self.salt, self.number, self.size, self.log_id)
+        return (body + RECORD_CRC.pack(zlib.crc32(body))).ljust(HEADER_SIZE, b"\0")
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Self | None:
+        """Read a header.
+
+        Args:
+            data: The bytes where it should be.
+
+        Returns:
+            The header, or None where there is no whole one.
+        """
+        if len(data) != HEADER_SIZE:
+            return None
+        body, rest = data[: _HEADER_BODY.size], data[_HEADER_BODY.size :]
+        if zlib.crc32(body) != RECORD_CRC.unpack_from(rest)[0]:
+            return None
+        magic, stream, salt, number, size, log_id = _HEADER_BODY.unpack(body)
+        return cls(stream, salt, number, size, log_id) if magic == MAGIC else None
+
+
+def segment_name(stream: int, number: int) -> str:
+    """File name of a segment.
+
+    Args:
+        stream: :data:`MESSAGES` or :data:`DEFINITIONS`.
+        number: Its place in the stream, from 1.
+
+    Returns:
+        E.g. ``000001.seg`` or ``def-000001.seg``.
+    """
+    return f"{'def-' if stream == DEFINITIONS else ''}{number:06d}.seg"
+
+
+def segment_files(folder: Path) -> list[tuple[int, int, Path]]:
+    """The segments in a folder.
+
+    Args:
+        folder: The log.
+
+    Returns:
+        Stream, number and path of each, sorted by stream and number.
+
+    Raises:
+        OSError: If the folder can't be listed.
+    """
+    found: list[tuple[int, int, Path]] = []
+    for path in folder.iterdir():
+        match = _NAME.fullmatch(path.name)
+        if match is not None:
+            found.append((DEFINITIONS if match[1] else MESSAGES, int(match[2]), path))
+    return sorted(found)
+
+
+def pack_definition(record: Definition) -> tuple[int, bytes]:
+    """A definition as kind and payload.
+
+    Args:
+        record: E.g. a channel.
+
+    Returns:
+        The MCAP opcode and the body of the MCAP record.
+    """
+    builder = RecordBuilder()
+    record.write(builder)
+    return _KINDS[type(record)], builder.end()[_MCAP_PREFIX:]
+
+
+def unpack_definition(kind: int, payload: bytes) -> Definition:
+    """Read a definition.
+
+    Args:
+        kind: Its MCAP opcode.
+        payload: The body of the MCAP record.
+
+    Returns:
+        The record.
+
+    Raises:
+        McapError: If the body ends too early.
+        ValueError: If a text in it is not UTF-8.
+        OverflowError: If a length in it is beyond all memory.
+    """
+    return _TYPES[kind].read(ReadDataStream(BytesIO(payload)))

@@ -1,0 +1,376 @@
+"""What a write-ahead log still holds: read-only, and tolerant of whatever a crash left.
+
+Records are taken only where length, CRC and running number fit; from damage on, the next whole
+record is searched for. What is missing in between is counted by the running numbers. What was
+torn off at the end can only be told in bytes: after a kill it is at most the one record that was
+being written, and was not accepted yet.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Channel
+
+from ...common.errors import LogError, NotALogError
+from .format import (
+    DEFINITIONS,
+    HEADER_SIZE,
+    MARK,
+    MAX_PAYLOAD,
+    MESSAGES,
+    RECORD_BODY,
+    RECORD_CRC,
+    RECORD_SIZE,
+    STREAM_KINDS,
+    Definition,
+    RecordHead,
+    SegmentHeader,
+    segment_files,
+    unpack_definition,
+)
+
+_PIECE = 1 << 20  # the most that is read at once before a CRC vouches for a length
+_FIRST_LOOK = 1 << 12
+_ZEROS = bytes(_PIECE + RECORD_SIZE)
+
+
+class WalMessage(NamedTuple):
+    """A message as it was accepted.
+
+    Attributes:
+        position: Its place among all messages of the session, from 1.
+        channel_id: Its MCAP channel.
+        sequence: Its own counter.
+        log_time_ns: When it was recorded [Unix ns].
+        publish_time_ns: When it was sampled [Unix ns].
+        payload: Its bytes.
+    """
+
+    position: int
+    channel_id: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A segment with a readable header; records end before byte ``end``."""
+
+    path: Path
+    header: SegmentHeader
+    end: int
+
+
+class Recovery(Iterator[WalMessage]):
+    """Iterates over the messages of a log, in order.
+
+    Attributes:
+        definitions: Headers, schemas, channels, metadata, attachments, in the order given.
+        found: Messages given out so far.
+        before: Messages before the first one found: released to the MCAP, or lost with their
+            segment; the MCAP tells which.
+        missing: Messages missing between those found.
+        warnings: What was damaged, one sentence each; complete when the iteration has ended.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Open a log; :func:`recover` does.
+
+        Args:
+            folder: The log.
+
+        Raises:
+            NotALogError: If there is no segment, or no header of one can be read.
+            LogError: If the folder can't be listed.
+        """
+        self.folder = folder
+        self.found = 0
+        self.before = 0
+        self.missing = 0
+        self.warnings: list[str] = []
+        segments = self._open()
+        self._segments = [item for item in segments if item.header.stream == MESSAGES]
+        self.definitions = tuple(
+            self._define([item for item in segments if item.header.stream == DEFINITIONS])
+        )
+        self._messages = self._read_messages()
+
+    def __iter__(self) -> Iterator[WalMessage]:
+        """The same, once: a second loop goes on where the first one stopped."""
+        return self
+
+    def __next__(self) -> WalMessage:
+        """The next whole message.
+
+        Raises:
+            StopIteration: At the end.
+        """
+        return next(self._messages)
+
+    def _open(self) -> list[_Found]:
+        try:
+            files = segment_files(self.folder)
+        except OSError as error:
+            raise LogError(
+                self.folder, f"no write-ahead log can be read here: {error.strerror}"
+            ) from error
+        if not files:
+            raise NotALogError(self.folder, "no segment of a write-ahead log is in this folder")
+        found: list[_Found] = []
+        for stream, number, path in files:
+            opened = self._read_header(stream, number, path)
+            if opened is not None and found and opened.header.log_id != found[0].header.log_id:
+                self.warnings.append(f"{path.name} is of another log; left out")
+            elif opened is not None:
+                found.append(opened)
+        if not found:
+            reasons = "; ".join(self.warnings) or "all segments vanished while they were read"
+            raise NotALogError(self.folder, reasons)
+        return found
+
+    def _read_header(self, stream: int, number: int, path: Path) -> _Found | None:
+        try:
+            with path.open("rb") as file:
+                size = file.seek(0, os.SEEK_END)
+                for at in (0, max(0, size - HEADER_SIZE)):
+                    file.seek(at)
+                    header = SegmentHeader.unpack(file.read(HEADER_SIZE))
+                    if header is not None:
+                        break
+                else:
+                    self.warnings.append(f"{path.name} has no readable header; left out")
+                    return None
+        except FileNotFoundError:  # a log in use: released since it was listed
+            return None
+        except OSError as error:
+            self.warnings.append(f"{path.name} can't be read: {error.strerror}; left out")
+            return None
+        if (header.stream, header.number) != (stream, number):
+            self.warnings.append(f"{path.name} is a renamed segment; left out")
+            return None
+        if size < header.size:
+            self.warnings.append(f"{path.name} is cut short: {size} of {header.size} bytes")
+        return _Found(path, header, min(size, header.size - HEADER_SIZE))
+
+    def _define(self, segments: list[_Found]) -> Iterator[Definition]:
+        last = 0
+        for head, payload in self._records(segments):
+            if head.position > last + 1:
+                self.warnings.append(f"{head.position - last - 1} definitions are missing")
+            last = head.position
+            try:
+                yield unpack_definition(head.kind, payload)
+            except (McapError, struct.error, ValueError, OverflowError) as error:
+                self.warnings.append(f"definition {head.position} can't be read: {error}")
+
+    def _read_messages(self) -> Iterator[WalMessage]:
+        known = {item.id for item in self.definitions if isinstance(item, Channel)}
+        unknown: set[int] = set()
+        last = 0
+        for head, payload in self._records(self._segments):
+            gap = head.position - last - 1
+            if last:
+                self.missing += gap
+            else:
+                self.before = gap
+            last = head.position
+            self.found += 1
+            if head.channel_id not in known:
+                unknown.add(head.channel_id)
+            yield WalMessage(
+                head.position,
+                head.channel_id,
+                head.sequence,
+                head.log_time_ns,
+                head.publish_time_ns,
+                payload,
+            )
+        if self.missing:
+            self.warnings.append(f"{self.missing} messages are missing between those found")
+        if unknown:
+            listed = ", ".join(map(str, sorted(unknown)))
+            self.warnings.append(f"messages of channels that are not defined: {listed}")
+
+    def _records(self, segments: list[_Found]) -> Iterator[tuple[RecordHead, bytes]]:
+        former: _SegmentReader | None = None
+        reader: _SegmentReader | None = None
+        last = 0
+        try:
+            for segment in segments:
+                try:
+                    reader = _SegmentReader(segment, segment.path.open("rb"), last)
+                    for head, payload in reader.records():
+                        if former is not None and head.position > last + 1:
+                            # Of a log in use: it went on in the former while that was read.
+                            yield from former.later()
+                        last = head.position
+                        former = _closed(former)
+                        yield head, payload
+                except FileNotFoundError:  # a log in use: released since it was listed
+                    continue
+                except OSError as error:
+                    told = f"{segment.path.name} can't be read to its end: {error.strerror}"
+                    self.warnings.append(told)
+                    reader = _closed(reader)
+                    continue
+                _closed(former)
+                former = reader
+                if reader.damaged:
+                    self.warnings.append(
+                        f"{segment.path.name}: {reader.damaged} bytes are no whole records, "
+                        f"the first at byte {reader.first_damage}"
+                    )
+        finally:
+            _closed(former)
+            _closed(reader)
+
+
+class _SegmentReader:
+    """Goes through one segment.
+
+    ``damaged`` counts the bytes from a place where a record should start to the next whole
+    record, or to the last byte that isn't zero.
+    """
+
+    def __init__(self, segment: _Found, file: BinaryIO, last: int) -> None:
+        self.last = last
+        self.damaged = 0
+        self.first_damage = 0
+        self._file = file
+        self._at = HEADER_SIZE
+        self._end = segment.end
+        self._salt = segment.header.salt
+        self._kinds = STREAM_KINDS[segment.header.stream]
+
+    def records(self) -> Iterator[tuple[RecordHead, bytes]]:
+        while (at := self._at) < self._end:
+            head = self._whole(at)
+            if head is None:
+                following, stop = self._search(at)
+                # Of a log in use, this one was being written when it was looked at: a later one
+                # is there, so now it is whole.
+                head = self._again(at) if following is not None else None
+                if head is not None:
+                    following, stop = (at, head), at
+                if stop > at:
+                    self.first_damage = self.first_damage or at
+                    self.damaged += stop - at
+                if following is None:
+                    return
+                at, head = following
+            self.last = head.position
+            self._file.seek(at + RECORD_SIZE)
+            payload = self._file.read(head.length)
+            self._at = (at + RECORD_SIZE + head.length + 7) & -8
+            yield head, payload
+
+    def later(self) -> Iterator[tuple[RecordHead, bytes]]:
+        """Records that were put since the end was reached; damage isn't counted again."""
+        damage = self.damaged, self.first_damage
+        self._file.seek(0, os.SEEK_END)  # what was read ahead is old
+        yield from self.records()
+        self.damaged, self.first_damage = damage
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _again(self, at: int) -> RecordHead | None:
+        self._file.seek(0, os.SEEK_END)  # what was read ahead is old
+        return self._whole(at)
+
+    def _whole(self, at: int) -> RecordHead | None:
+        """The head of the record at a place, if one is there and its CRC fits.
+
+        The CRC is taken piece by piece: no memory is given to a length before it is vouched for.
+        """
+        left = self._end - at - RECORD_SIZE
+        if left < 0:
+            return None
+        self._file.seek(at)
+        raw = self._file.read(RECORD_SIZE)
+        if len(raw) < RECORD_SIZE:
+            return None
+        head = RecordHead._make(RECORD_BODY.unpack_from(raw, RECORD_CRC.size))
+        fits = head.length <= min(left, MAX_PAYLOAD) and head.position > self.last
+        if head.mark != MARK or head.kind not in self._kinds or not fits:
+            return None
+        crc = zlib.crc32(raw[RECORD_CRC.size :], self._salt)
+        for start in range(0, head.length, _PIECE):
+            crc = zlib.crc32(self._file.read(min(_PIECE, head.length - start)), crc)
+        return head if crc == RECORD_CRC.unpack_from(raw)[0] else None
+
+    def _search(self, at: int) -> tuple[tuple[int, RecordHead] | None, int]:
+        """The next whole record behind a place where none is.
+
+        Returns:
+            Its place and head, or None; and where the damage ends: there, or one past the last
+            byte that isn't zero (``at`` itself where nothing but zeros follow).
+        """
+        damage_stop = at
+        start, size = at, _FIRST_LOOK
+        while start < self._end:
+            self._file.seek(start)
+            # A look reaches a head's length into the next one, so that none falls between two.
+            data = self._file.read(min(size + RECORD_SIZE, self._end - start))
+            if not data:
+                break
+            if not _ZEROS.startswith(data):  # the usual case, at the speed of memcmp
+                for offset in self._candidates(data):
+                    head = self._whole(start + offset) if start + offset > at else None
+                    if head is not None:
+                        return (start + offset, head), start + offset
+                damage_stop = start + len(data.rstrip(b"\0"))
+            start += size
+            size = min(2 * size, _PIECE)
+        return None, damage_stop
+
+    def _candidates(self, data: bytes) -> list[int]:
+        """Offsets, multiples of 8, where kind, mark and running number may be a record's."""
+        words = np.frombuffer(data[: len(data) & -8], dtype="<u8")
+        if words.size < RECORD_SIZE // 8:
+            return []
+        marked = np.zeros(words.size - 2, dtype=bool)
+        for kind in self._kinds:
+            marked |= words[2:] & np.uint64(0xFFFF) == kind | MARK << 8
+        marked &= words[1:-1] > np.uint64(self.last)
+        return [int(index) * 8 for index in np.flatnonzero(marked)]
+
+
+def _closed(reader: _SegmentReader | None) -> None:
+    if reader is not None:
+        reader.close()
+
+
+def recover(folder: Path | str) -> Recovery:
+    """Read what a write-ahead log holds, without changing it.
+
+    ::
+
+        recovery = recover("run.mcap.wal")
+        for message in recovery:
+            ...
+        print(recovery.found, recovery.missing, recovery.warnings)
+
+    Args:
+        folder: The log, see :func:`.capture.log.wal.writer.wal_folder`.
+
+    Returns:
+        The messages, with the definitions and a count of what is missing. One message is in
+        memory at a time.
+
+    Raises:
+        NotALogError: If there is no segment in it, or none that can be read.
+        LogError: If the folder can't be listed.
+    """
+    return Recovery(Path(folder))

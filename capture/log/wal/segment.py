@@ -1,0 +1,463 @@
+"""One segment of a write-ahead log: a reserved, memory-mapped file.
+
+A store to a mapped page is in the kernel's page cache at once, so a process that is killed loses
+nothing of it; only power loss does, until :meth:`Segment.sync`.
+
+The first store to a page, and the first after a sync has protected it, is a page fault that the
+file system may hold up for as long as the disk is busy: a journal's commit, 60 ms and more beside
+other writers. So another thread takes the faults ahead of the writing (:meth:`Segment.hold`), and a
+sync of a busy segment leaves out the page that is being written.
+
+Files that another program cuts short while they are mapped here.
+
+A store behind the end of such a file is SIGBUS, which ends the process: everything that is only in
+its memory would be lost to somebody's ``truncate``. So the signal's handler puts ordinary memory in
+the place of the pages that are gone and notes it; the store then succeeds, and whoever writes the
+file ends in good order.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import mmap
+import os
+import secrets
+import signal
+import struct
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from zlib import crc32
+
+from ...common.errors import DataError, LogWriteError
+from .format import (
+    HEADER_SIZE,
+    RECORD_BODY,
+    RECORD_CRC,
+    RECORD_SIZE,
+    RecordFields,
+    RecordHead,
+    SegmentHeader,
+)
+
+_LIBC_MAPPING = ctypes.CDLL(None, use_errno=True)
+_LIBC_MAPPING.mmap.restype = ctypes.c_void_p
+_LIBC_MAPPING.mmap.argtypes = (
+    ctypes.c_void_p,
+    ctypes.c_size_t,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.c_long,
+)
+_MAP_FIXED = 0x10
+_SA_SIGINFO = 4
+_BUS_ADRERR = 2  # beyond the end of a mapped file
+_ADDRESS_AT = 16  # of si_addr in siginfo_t, on 64-bit systems
+
+
+class _Action(ctypes.Structure):
+    """``struct sigaction`` of glibc and musl."""
+
+    _fields_ = (
+        ("handler", ctypes.c_void_p),
+        ("mask", ctypes.c_ulong * 16),
+        ("flags", ctypes.c_int),
+        ("restorer", ctypes.c_void_p),
+    )
+
+
+_HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+
+
+@dataclass
+class _Mapping:
+    """One mapped file.
+
+    Attributes:
+        address: Where it begins.
+        size: Its bytes.
+        cut: Called when a store found it cut short; must not store to the mapping.
+    """
+
+    address: int
+    size: int
+    cut: Callable[[], None]
+
+
+class _Watch:
+    """The process's handler of SIGBUS, set with the first mapping."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._mappings: tuple[_Mapping, ...] = ()
+        self._handler: object = None
+
+    def add(self, mapping: _Mapping) -> None:
+        with self._lock:
+            self._mappings = (*self._mappings, mapping)
+            if self._handler is None:
+                self._set_handler()
+
+    def remove(self, mapping: _Mapping) -> None:
+        with self._lock:
+            self._mappings = tuple(each for each in self._mappings if each is not mapping)
+
+    def _set_handler(self) -> None:
+        """Where the system allows no callbacks from C, SIGBUS ends the process as it always did."""
+        if sys.platform != "linux" or sys.maxsize < 2**32:
+            return
+        try:
+            handler = _HANDLER(self._on_signal)
+        except MemoryError:
+            return
+        action = _Action(ctypes.cast(handler, ctypes.c_void_p), flags=_SA_SIGINFO)
+        if not _LIBC_MAPPING.sigaction(int(signal.SIGBUS), ctypes.byref(action), None):
+            self._handler = handler
+
+    def _on_signal(self, number: int, info: int, context: int) -> None:
+        """Runs in the thread whose store failed, in the middle of that store."""
+        del context
+        code = ctypes.c_int.from_address(info + 8).value
+        address = ctypes.c_size_t.from_address(info + _ADDRESS_AT).value
+        for mapping in self._mappings:
+            within = address - mapping.address
+            if code == _BUS_ADRERR and 0 <= within < mapping.size:
+                page = address & -mmap.PAGESIZE
+                left = mapping.address + mapping.size - page
+                access = mmap.PROT_READ | mmap.PROT_WRITE
+                kind = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _MAP_FIXED
+                if _LIBC_MAPPING.mmap(page, left, access, kind, -1, 0) == page:
+                    mapping.cut()
+                    return
+        default = _Action(None)
+        _LIBC_MAPPING.sigaction(
+            number, ctypes.byref(default), None
+        )  # the store fails again, and ends us
+        if code != _BUS_ADRERR:
+            signal.raise_signal(number)
+
+
+_WATCH = _Watch()
+
+
+def watch_mapping(address: int, size: int, cut: Callable[[], None]) -> Callable[[], None]:
+    """Keep a mapped file's process alive when the file is cut short.
+
+    Args:
+        address: Where the mapping begins.
+        size: Its bytes.
+        cut: Called, in the thread that stored, when a store found the file too short; must not
+            store to the mapping. What is stored there from then on is only in memory.
+
+    Returns:
+        Ends the watch; to be called before the mapping goes.
+    """
+    mapping = _Mapping(address, size, cut)
+    _WATCH.add(mapping)
+    return lambda: _WATCH.remove(mapping)
+
+
+SEGMENT_OVERHEAD = 2 * HEADER_SIZE
+"""Bytes of a segment that hold no records."""
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_MS_SYNC = 4
+_MADV_POPULATE_WRITE = 23  # Linux 5.14; Python's mmap.madvise() keeps the interpreter's lock
+_PAGE = mmap.PAGESIZE
+_BUSY = 8 * _PAGE  # so many bytes between two syncs: the last page is young enough to wait
+
+
+def free_bytes(path: Path) -> int:
+    """Space left for ordinary users on a file's disk.
+
+    Args:
+        path: The file or folder; where it isn't there yet, its nearest parent counts.
+
+    Returns:
+        Free space [byte].
+
+    Raises:
+        OSError: If the file system doesn't answer.
+    """
+    place = path.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    found = os.statvfs(place)
+    return found.f_bavail * found.f_frsize
+
+
+def require_space(path: Path, needed: int) -> None:
+    """Refuse to start what the disk has no room for.
+
+    Args:
+        path: The file or folder to be written.
+        needed: How much it will take [byte].
+
+    Raises:
+        LogWriteError: If less is free; names the file and the missing bytes.
+    """
+    try:
+        free = free_bytes(path)
+    except OSError as error:
+        raise LogWriteError(path, f"can't tell the free space: {error.strerror}") from error
+    if free < needed:
+        raise LogWriteError(path, _shortage(needed, free))
+
+
+class Segment:
+    """A segment that is being written. One thread puts records, another may sync."""
+
+    def __init__(self, path: Path, header: SegmentHeader) -> None:
+        """Create the file, all its blocks reserved.
+
+        A sparse mapping would do until the disk is full, and then end the process with SIGBUS.
+
+        Args:
+            path: The file to create.
+            header: What it says of itself; ``size`` is a multiple of 8.
+
+        Raises:
+            LogWriteError: If it can't be created or reserved; then no file is left.
+        """
+        self.path = path
+        self.size = header.size
+        self.last = 0
+        self.cut = False
+        """Whether somebody cut the file short: what was put since is not in it."""
+        self._at = HEADER_SIZE
+        self._end = header.size - HEADER_SIZE
+        self._salt = header.salt
+        self._synced_at = 0
+        self._durable = 0
+        self._page_end = _PAGE
+        self._whole = 0, 0  # where the page begins that is written, last record wholly before it
+        try:
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+            self._file = os.open(path, flags, 0o666)
+        except OSError as error:
+            raise LogWriteError(path, f"can't be created: {error.strerror}") from error
+        try:
+            os.posix_fallocate(self._file, 0, header.size)
+            self._view = mmap.mmap(self._file, header.size)
+            self._address = ctypes.addressof(ctypes.c_char.from_buffer(self._view))
+            self._unwatch = watch_mapping(self._address, header.size, self._note_cut)
+        except OSError as error:
+            os.close(self._file)
+            path.unlink(missing_ok=True)
+            raise _reservation_error(path, header.size, error) from error
+        packed = header.pack()
+        self._view[:HEADER_SIZE] = packed
+        self._view[self._end :] = packed
+
+    def put(self, fields: RecordFields, payload: bytes) -> bool:
+        """Write one record, if it fits.
+
+        Args:
+            fields: What stands before the payload, from the running number on.
+            payload: Its bytes.
+
+        Returns:
+            Whether there was room; where there wasn't, nothing is written.
+
+        Raises:
+            DataError: If a number doesn't fit its field; nothing is written.
+        """
+        start = self._at
+        length = len(payload)
+        stop = start + RECORD_SIZE + length
+        if stop > self._end:
+            return False  # nor after the file was cut short
+        try:
+            body = RECORD_BODY.pack(length, *fields) + payload
+        except struct.error as error:
+            head = RecordHead(length, *fields)
+            raise DataError(
+                f"{self.path}: channel_id (16 bits), sequence (32) or a time (64, not negative) "
+                f"is out of range: {head}"
+            ) from error
+        view = self._view
+        view[start + RECORD_CRC.size : stop] = body
+        RECORD_CRC.pack_into(view, start, crc32(body, self._salt))
+        self._at = (stop + 7) & -8
+        if stop > self._page_end:
+            page = self._at & -_PAGE
+            self._whole, self._page_end = (page, self.last), page + _PAGE
+        self.last = fields[0]
+        return True
+
+    @property
+    def synced(self) -> bool:
+        """Whether it ever was; before, the folder has to be synced too, for its name."""
+        return self._synced_at > 0
+
+    def sync(self, *, whole: bool = True) -> int:
+        """Bring what was put so far to the disk; nothing to do if nothing was put since.
+
+        Lets other threads run.
+
+        Args:
+            whole: With the page that is being written, even where much was put since the last
+                sync. The next store to it is a page fault.
+
+        Returns:
+            Number of the last record that is on the disk; 0 for none.
+
+        Raises:
+            OSError: If the disk fails.
+        """
+        last, at = self.last, self._at
+        page, before = self._whole
+        if at == self._synced_at:
+            return self._durable
+        if not self._synced_at:
+            os.fsync(self._file)
+        elif whole or page - self._synced_at < _BUSY:
+            os.fdatasync(self._file)
+        else:
+            start = self._synced_at & -_PAGE
+            _call(_LIBC.msync, self._address + start, page - start, _MS_SYNC)
+            last, at = before, page
+        self._synced_at, self._durable = at, last
+        return last
+
+    def hold(self, ahead: int) -> int:
+        """Take the page faults of what is written next; lets other threads run.
+
+        Args:
+            ahead: Bytes from where the next record goes.
+
+        Returns:
+            How many of these bytes are beyond this segment.
+
+        Raises:
+            OSError: If the kernel can't (before Linux 5.14), or the file was cut short.
+        """
+        start = self._at & -_PAGE
+        stop = min(start + ahead, self.size)
+        _call(_LIBC.madvise, self._address + start, stop - start, _MADV_POPULATE_WRITE)
+        return start + ahead - stop
+
+    def close(self, *, remove: bool) -> None:
+        """Release the mapping.
+
+        Args:
+            remove: Delete the file too.
+        """
+        self._end = 0
+        self._unwatch()
+        self._view.close()
+        os.close(self._file)
+        if remove:
+            with suppress(OSError):  # someone else may have tidied up
+                self.path.unlink()
+
+    def _note_cut(self) -> None:
+        """Take no more records."""
+        self.cut, self._end = True, 0
+
+
+def _call(function: Callable[..., int], address: int, size: int, flag: int) -> None:
+    """Call a function of the C library on mapped memory, the interpreter's lock released."""
+    if function(ctypes.c_void_p(address), ctypes.c_size_t(size), ctypes.c_int(flag)):
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+def new_header(stream: int, number: int, size: int, log_id: bytes) -> SegmentHeader:
+    """Header of a new segment, with a salt of its own.
+
+    Args:
+        stream: ``MESSAGES`` or ``DEFINITIONS``.
+        number: Its place in the stream, from 1.
+        size: Bytes wanted; rounded up to a multiple of 8.
+        log_id: The log's 16 bytes.
+
+    Returns:
+        The header.
+    """
+    return SegmentHeader(stream, secrets.randbits(32), number, (size + 7) & -8, log_id)
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring a folder's entries to the disk, so that a new file's name survives power loss.
+
+    Args:
+        folder: The folder.
+
+    Raises:
+        OSError: If the disk fails.
+    """
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def _shortage(needed: int, free: int) -> str:
+    return (
+        f"needs {needed} bytes and the disk has {free} free: {needed - free} bytes are missing; "
+        "free some space or write elsewhere"
+    )
+
+
+def _reservation_error(path: Path, size: int, error: OSError) -> LogWriteError:
+    with suppress(OSError):
+        free = free_bytes(path)
+        if error.errno == errno.ENOSPC and free < size:
+            return LogWriteError(path, _shortage(size, free))
+    return LogWriteError(path, f"{size} bytes can't be reserved: {error.strerror}")
+
+
+BALLAST_NAME = "ballast"
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Error numbers that more free space would mend."""
+
+
+class Ballast:
+    """A file that is there only to be deleted."""
+
+    def __init__(self, folder: Path, size: int) -> None:
+        """Reserve the space.
+
+        Args:
+            folder: Where to; an old one is replaced.
+            size: How much [byte]; nothing is reserved for 0.
+
+        Raises:
+            LogWriteError: If there is no room; no file is left then.
+        """
+        self.path = folder / BALLAST_NAME
+        self._there = size > 0
+        if not size:
+            return
+        require_space(self.path, size)
+        try:
+            opened = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+            try:
+                os.posix_fallocate(opened, 0, size)
+            finally:
+                os.close(opened)
+        except OSError as error:
+            self.free()
+            raise LogWriteError(
+                self.path, f"{size} bytes can't be reserved: {error.strerror}"
+            ) from error
+
+    def free(self) -> bool:
+        """Give the space back.
+
+        Returns:
+            Whether there was any.
+        """
+        there, self._there = self._there, False
+        if there:
+            with suppress(OSError):  # someone else may have tidied up
+                self.path.unlink()
+        return there

@@ -1,0 +1,307 @@
+"""The health of a running recording, by the very rules that ``undulog log check`` goes by.
+
+Every message that was accepted is offered here; once a second those of the last second go through
+the same scan as the chunks of a file, one channel a tick, so the verdict at the end is the one that
+the file's data give. Memory is bounded: what is over for a minute is summed up.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from ..common.errors import DataError
+from ..log.health.measures import BusHealth, JointHealth
+from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
+from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
+from ..log.mcap.records import BODY_AT, FIXED_SIZE, HEAD
+from ..log.messages.definitions import parse_message_type
+from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES
+from ..log.sinks.mcap_sink import Description
+from ..robot.model import Robot
+from ..sources.contract import Source
+from .source_clock import SourceClock
+from .status import SourceSnapshot, TopicSnapshot
+
+HORIZON_S = 60
+"""How far the stamps of a running recording may go back [s]: what is older is summed up."""
+
+PIECE = 1 << 17
+"""Bytes of messages that are looked at in one go, about: raw frames come in hundreds of kB."""
+
+ROUND_NS = 1_000_000_000
+"""How often all channels are looked at [ns]."""
+
+MEASURE_EVERY = 4
+"""Rounds between two looks at the same channel; what it has gathered meanwhile waits."""
+
+RECENT = 6
+"""Rounds that a rate of the last seconds spans."""
+
+_NS = 1_000_000_000
+
+_Message = tuple[int, int, bytes]  # log time, sequence number, payload
+
+
+@dataclass
+class _Topic:
+    """What a topic's rate is made of."""
+
+    name: str
+    last_ns: int = 0
+    count: int = 0
+    recent: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=RECENT))
+
+    def rate_hz(self) -> float | None:
+        """Over the updates that are remembered."""
+        if len(self.recent) < 2:
+            return None
+        (began, had), (ended, has) = self.recent[0], self.recent[-1]
+        return (has - had) * _NS / (ended - began) if ended > began else None
+
+
+class LiveHealth:
+    """Judges a recording while it runs; hears of its records as a listener of its sink."""
+
+    def __init__(self, robot: Robot | None) -> None:
+        """Start with nothing heard.
+
+        Args:
+            robot: The robot that is recorded: its limits, joints and bitrate.
+        """
+        self._scan = SessionScan(robot, horizon_s=HORIZON_S)
+        self._schemas: dict[int, Schema] = {}
+        self._topics: dict[int, _Topic] = {}
+        self._frames: dict[str, deque[tuple[int, int]]] = {}
+        self._measured: dict[int, ChannelMeasures] = {}
+        self._heard: set[int] = set()
+        self._unmeasured: dict[int, int] = {}  # log time up to which a channel's measure goes
+        self._round_end_ns = 0
+        self._round_keys = frozenset[int]()
+        self._rounds = 0
+        self._pending: defaultdict[int, list[_Message]] = defaultdict(list)
+        self._round: list[tuple[int, list[_Message]]] = []
+        self._in_round = False
+        self._due_ns = 0
+        self._span: tuple[int, int] | None = None
+        self._now_ns = 0
+        self._latest: SessionMeasures | None = None
+
+    def define(self, record: Description) -> None:
+        """Hear of what explains later messages.
+
+        Args:
+            record: Schemas and channels count, the rest is of no concern.
+        """
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        if not isinstance(record, Channel) or record.id in self._topics:
+            return  # every part of a split session defines its channels again
+        schema = self._schemas.get(record.schema_id)
+        kind = None
+        if schema is not None and (schema.encoding, record.message_encoding) == ("ros2msg", "cdr"):
+            try:
+                kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
+            except DataError:  # then only times are looked at, as in a file
+                kind = None
+        name = schema.name if schema is not None else ""
+        self._topics[record.id] = _Topic(record.topic)
+        self._scan.define(record.id, record.topic, name, kind, record.metadata)
+
+    def offer(
+        self,
+        channel_id: int,
+        log_time_ns: int,
+        publish_time_ns: int,  # noqa: ARG002 - a listener is told all
+        sequence: int,
+        payload: bytes,
+    ) -> None:
+        """Hear of a message; it is looked at when the next update comes.
+
+        Args:
+            channel_id: Its channel.
+            log_time_ns: When it was recorded [Unix ns].
+            publish_time_ns: When it was sampled [Unix ns].
+            sequence: The channel's own counter.
+            payload: Its bytes.
+        """
+        self._pending[channel_id].append((log_time_ns, sequence, payload))
+
+    def step(self, now_ns: int) -> None:
+        """Look at messages of one channel, if a second has gone by since all were looked at.
+
+        To be called every tick: a second's work is spread over about as many ticks as there are
+        channels.
+
+        Args:
+            now_ns: The session's clock [Unix ns].
+        """
+        if self._round:
+            key, messages = self._round.pop()
+            self._add(key, messages)
+            if key not in self._measured or key % MEASURE_EVERY == self._rounds % MEASURE_EVERY:
+                self._measured[key] = self._scan.measure(key)
+                self._unmeasured.pop(key, None)
+            else:
+                self._unmeasured.setdefault(key, self._round_end_ns)
+        elif self._in_round:
+            self._end_round(now_ns)
+        elif now_ns >= self._due_ns:
+            self._due_ns = now_ns + ROUND_NS
+            self._begin_round()
+
+    def update(self, now_ns: int | None = None) -> None:
+        """Look at all messages that came so far.
+
+        Args:
+            now_ns: The session's clock [Unix ns]; the latest log time by default.
+        """
+        while self._round:
+            self._add(*self._round.pop())
+        self._begin_round()
+        while self._round:
+            self._add(*self._round.pop())
+        for key in self._heard:
+            self._measured[key] = self._scan.measure(key)
+        self._unmeasured.clear()
+        self._end_round(now_ns)
+
+    def _begin_round(self) -> None:
+        self._round = [
+            (key, part) for key, messages in self._pending.items() for part in _pieces(messages)
+        ]
+        self._round.reverse()  # they are taken from the end
+        self._round_keys = frozenset(self._pending)
+        self._pending = defaultdict(list)
+        self._in_round = True
+
+    def _end_round(self, now_ns: int | None) -> None:
+        self._in_round = False
+        self._rounds += 1
+        for key in [key for key in self._unmeasured if key not in self._round_keys]:
+            self._measured[key] = self._scan.measure(key)  # it has fallen silent
+            del self._unmeasured[key]
+        latest = self._round_end_ns = self._span[1] if self._span is not None else 0
+        self._now_ns = max(self._now_ns, latest if now_ns is None else now_ns)
+        for topic in self._topics.values():
+            topic.recent.append((self._now_ns, topic.count))
+        self._latest = None
+        self.result()  # it sums up what is over; the snapshot of this second shows it
+
+    def _add(self, key: int, messages: list[_Message]) -> None:
+        log_ns, sequence, payloads = zip(*messages, strict=True)
+        heads = np.empty(len(messages), HEAD)
+        lengths = np.fromiter(map(len, payloads), np.int64, len(messages))
+        heads["opcode"] = Opcode.MESSAGE
+        heads["length"] = lengths + FIXED_SIZE
+        heads["channel"], heads["sequence"], heads["log"] = key, sequence, log_ns
+        self._scan.add(key, b"".join(payloads), np.cumsum(lengths) - lengths - BODY_AT, heads)
+        self._heard.add(key)
+        low, high = min(log_ns), max(log_ns)
+        topic = self._topics[key]
+        topic.count += len(messages)
+        topic.last_ns = max(topic.last_ns, high)
+        if self._span is not None:
+            low, high = min(low, self._span[0]), max(high, self._span[1])
+        self._span = low, high
+
+    def result(self) -> SessionMeasures:
+        """The verdict on what was looked at so far, with its reasons and all measures."""
+        if self._latest is None:
+            start_ns, end_ns = self._span or (0, 0)
+            # A channel that was not measured lately is not a channel that ended early.
+            end_ns = min(self._unmeasured.values(), default=end_ns)
+            self._latest = self._scan.result(start_ns, end_ns, measured=self._measured)
+        return self._latest
+
+    def final(self) -> SessionMeasures:
+        """The verdict on all that came: what is stored when the session is closed.
+
+        ``undulog log check`` says the same of the finished file, its container apart, as long as
+        no stamp goes back by more than :data:`HORIZON_S`.
+        """
+        self.update()
+        return self.result()
+
+    def topics(self) -> tuple[TopicSnapshot, ...]:
+        """Every topic with messages, when all were last looked at, by name."""
+        joints: dict[str, list[JointHealth]] = {}
+        for joint in self.result().joints:
+            joints.setdefault(joint.topic, []).append(joint)
+        found = [
+            self._topic(topic, self._measured[key], joints.get(topic.name, []))
+            for key, topic in self._topics.items()
+            if key in self._measured
+        ]
+        return tuple(sorted(found, key=lambda topic: topic.topic))
+
+    def _topic(
+        self, topic: _Topic, measured: ChannelMeasures, joints: list[JointHealth]
+    ) -> TopicSnapshot:
+        # Frames come when a batch is full: their messages have no rhythm of their own.
+        framed = topic.name.startswith(FRAME_TOPIC_PREFIXES)
+        timings = [] if framed else [series.timing for series in measured.series]
+        steady = [timing for timing in timings if timing.regular]
+        jitters = [(timing.std_s or 0.0) / timing.median_s for timing in steady if timing.median_s]
+        whole = bool(steady) and len(steady) == len(timings)
+        return TopicSnapshot(
+            topic=topic.name,
+            count=topic.count,
+            rate_hz=topic.rate_hz(),
+            age_s=max(self._now_ns - topic.last_ns, 0) / _NS,
+            gaps=sum(timing.gaps for timing in timings) if whole else None,
+            missing=sum(timing.missing for timing in timings) if whole else None,
+            jitter=max(jitters) if whole and jitters else None,
+            dropped=measured.channel.sequence.dropped,
+            at_limit=tuple(j.name for j in joints if (j.at_limit or 0.0) > MAX_AT_LIMIT),
+            frozen=tuple(j.name for j in joints if (j.frozen_s or 0) >= FROZEN_SECONDS),
+            nan=sum(series.nan for series in measured.series),
+        )
+
+    def source(self, source: Source, address: str, clock: SourceClock | None) -> SourceSnapshot:
+        """A source when all were last looked at.
+
+        Args:
+            source: The source.
+            address: As the command line named it.
+            clock: Maps its times; None for a source that writes its own channels.
+
+        Returns:
+            What it and its frames say.
+        """
+        counts = source.counts
+        topics = [prefix + source.name for prefix in FRAME_TOPIC_PREFIXES]
+        buses: list[BusHealth] = [bus for bus in self.result().buses if bus.topic in topics]
+        rates = [
+            _Topic(topic, recent=self._frames[topic]).rate_hz()
+            for topic in topics
+            if self._frames.get(topic)
+        ]
+        rates = [rate for rate in rates if rate is not None]
+        last = max((t.last_ns for t in self._topics.values() if t.name in topics), default=0)
+        return SourceSnapshot(
+            name=source.name,
+            address=address,
+            connected=source.connected,
+            finished=source.finished,
+            frames=None if source.robot is not None and not counts.frames else counts.frames,
+            rate_hz=sum(rates) if rates else None,
+            age_s=max(self._now_ns - last, 0) / _NS if last else None,
+            dropped=counts.dropped,
+            malformed=counts.malformed,
+            error_frames=counts.error_frames,
+            reconnects=counts.reconnects,
+            load=self._scan.last_load(FRAME_TOPIC_PREFIX + source.name) if buses else None,
+            clock=clock.result() if clock is not None and clock.pair() is not None else None,
+        )
+
+
+def _pieces(messages: list[_Message]) -> list[list[_Message]]:
+    """Messages in their order, in pieces of about equal numbers."""
+    count = -(-sum(len(payload) for _, _, payload in messages) // PIECE) or 1
+    size = -(-len(messages) // count)
+    return [messages[start : start + size] for start in range(0, len(messages), size)]

@@ -1,0 +1,444 @@
+"""The recorder's loop: one thread, a tick every 10 ms, and nothing in it that waits.
+
+Each tick takes what has come from every source and writes the raw frames; decoding follows in
+slices. What is due once a second is spread over the second's ticks, so that no tick is long.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from select import select
+
+import numpy as np
+
+from ..common.errors import LogWriteError, SourceError, UndulogError
+from ..common.process import Priority, StopRequest, raised_priority
+from ..log.messages.frames import FD_FRAME_DTYPE, FRAME_DTYPE, FrameArray
+from ..log.write.channels import TimeReferenceChannel
+from ..log.write.writer import SessionWriter
+from ..robot.model import Robot
+from ..sources.contract import EndingSource, Polled, Source, SourceContext
+from .bus_recorder import BusRecorder
+from .source_clock import SourceClock
+from .status import EachSecond, SessionClock, TickTally
+
+TICK_NS = 10_000_000
+"""Sources are asked this often, and what they have is safe then [ns]."""
+
+DECODE_TICKS = 10
+"""Frames are decoded every so many ticks, what was left over in the next one."""
+
+WATCHED_TICKS = 4
+"""The same while somebody watches."""
+
+_PRESSED = 1000
+"""After so many frames in a tick the next one follows at once, and decoding waits: the kernel's
+buffers hold only milliseconds of a burst."""
+
+_BREATH_NS = 1_000_000
+_DRAIN_NS = 500_000_000
+_MOST_WAITING = 2_000_000
+"""So many frames may wait to be decoded, 64 MB; then the burst is no burst."""
+
+_DECODE_BUDGET_NS = 4_000_000
+_NS = 1_000_000_000
+_LONGEST_NS = 2**31 * _NS  # what a TimeReference can hold
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Why a recording ended.
+
+    Attributes:
+        reason: One sentence.
+        failed: Whether it had to end.
+    """
+
+    reason: str
+    failed: bool = False
+
+
+class Recorder:
+    """Records sources into a session until something ends it.
+
+    Attributes:
+        ticks: How long the ticks took.
+        overruns: Ticks that were left out because the one before took too long.
+        ending: Set to end the recording, from within one of the ``each_tick`` or ``each_second``.
+        watched: Whether somebody looks at what is decoded as it comes.
+        priority: What the recorder's threads have got.
+    """
+
+    def __init__(
+        self,
+        *,
+        writer: SessionWriter,
+        clock: SessionClock,
+        sources: Sequence[Source],
+        context: SourceContext,
+        robot: Robot | None,
+        decoded: str | None,
+        each_tick: Sequence[Callable[[], None]] = (),
+        each_second: Sequence[Callable[[], object]] = (),
+    ) -> None:
+        """Put a recording together; nothing is opened yet.
+
+        Args:
+            writer: The session; the recorder doesn't close it.
+            clock: The session's clock.
+            sources: What to record.
+            context: What the sources are given.
+            robot: The robot that is recorded, or None.
+            decoded: The source that is the robot's bus; None to keep all frames raw.
+            each_tick: Called at the end of every tick.
+            each_second: Called once a second, in different ticks.
+        """
+        self.ticks = TickTally()
+        self.overruns = 0
+        self.ending: Ending | None = None
+        self.watched = False
+        self.priority = Priority("not asked for")
+        self.clocks: dict[str, SourceClock] = {source.name: SourceClock() for source in sources}
+        self.buses: dict[str, BusRecorder] = {}
+        self._writer, self._clock, self._context = writer, clock, context
+        self._sources = tuple(sources)
+        self._robot, self._decoded = robot, decoded
+        self._each_tick = tuple(each_tick)
+        tasks = (self._write_clocks, self._tell_odd_frames, _tidy, *each_second)
+        self._each_second = EachSecond(tasks, time.monotonic_ns())
+        self._events = writer.log("/rosout")
+        self._clock_channels: dict[str, TimeReferenceChannel] = {}
+        self._came = 0  # frames in the last poll
+        self._failed: set[str] = set()
+        self._end_ns: int | None = None  # when the recording ended [Unix ns]
+        self._later: set[str] = set()  # sources of which frames came after it
+        self._odd_clocks: set[str] = set()
+        self._told: dict[str, set[str]] = {source.name: set() for source in self._sources}
+        self._on_event: Callable[[int, str, str, str], None] | None = None
+
+    def on_event(self, listener: Callable[[int, str, str, str], None]) -> None:
+        """Have events told to someone as well: time [Unix ns], level, who, text.
+
+        Args:
+            listener: Called after the event was written.
+        """
+        self._on_event = listener
+
+    def say(self, level: str, name: str, text: str, t_ns: int | None = None) -> None:
+        """Write an event.
+
+        Args:
+            level: ``info``, ``warn`` or ``error``.
+            name: Who says it.
+            text: One sentence.
+            t_ns: When [Unix ns]; now by default.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        now_ns = self._clock.now_ns()
+        at_ns = now_ns if t_ns is None else t_ns
+        self._events.write(at_ns, level, name, text, log_time_ns=now_ns)
+        if self._on_event is not None:
+            self._on_event(at_ns, level, name, text)
+
+    @property
+    def backlog(self) -> int:
+        """Frames that are safe and wait to be decoded."""
+        return sum(bus.backlog for bus in self.buses.values())
+
+    def run(self, stop: StopRequest, duration_s: float | None = None) -> Ending:
+        """Record until something ends it.
+
+        Args:
+            stop: Looked at every tick.
+            duration_s: Ends by itself after this time [s].
+
+        Returns:
+            Why it ended. The session is whole then, but not closed.
+
+        Raises:
+            SourceError: If a source can never work, or fails to start.
+            LogWriteError: If the session can't be written; the sources are stopped then.
+        """
+        try:
+            with _tidied_by_hand():  # first: it takes long, and sources that listen want to be read
+                self._start()
+                with self._urgent():
+                    self._loop(stop, duration_s)
+                    self._drain()
+            self._finish()
+        finally:
+            for source in self._sources:
+                self._stop_source(source)
+        assert self.ending is not None  # noqa: S101 - the loop ends with one
+        return self.ending
+
+    # -- inside ----------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        # Last those that listen: to connect may take half a second, and senders wait for nobody.
+        for source in sorted(self._sources, key=lambda each: isinstance(each, EndingSource)):
+            try:
+                source.start(self._context)
+            except UndulogError:
+                raise
+            except Exception as error:
+                fault = f"its kind of source failed to start: {error!r}"
+                raise SourceError(source.name, fault) from error
+        listed = ", ".join(source.name for source in self._sources)
+        self.say("info", "recorder", f"recording {listed}")
+
+    @contextmanager
+    def _urgent(self) -> Generator[None]:
+        """Ask for priority; not beside a twin, whose physics would have it, too."""
+        if any(source.robot is not None for source in self._sources):
+            yield
+            return
+        with raised_priority() as self.priority:
+            if self.priority.refused:
+                self.say(
+                    "info",
+                    "recorder",
+                    "priority was refused: while other programs hold the processors, frames may be "
+                    "refused or stamped late; CAP_SYS_NICE allows it, and so does a service "
+                    "('undulog record unit')",
+                )
+            yield
+
+    def _loop(self, stop: StopRequest, duration_s: float | None) -> None:
+        begun_ns = due_ns = time.monotonic_ns()
+        end_ns = None if duration_s is None else begun_ns + round(duration_s * _NS)
+        tick = 0
+        while self.ending is None:
+            now_ns = time.monotonic_ns()
+            self._tick(tick, now_ns)
+            if stop.signal is not None:
+                self.ending = Ending(f"{stop.signal.name} was received")
+            elif end_ns is not None and now_ns >= end_ns:
+                self.ending = Ending(f"{duration_s:g} s are over")
+            elif all(source.finished or source.name in self._failed for source in self._sources):
+                self.ending = Ending("all sources have ended", failed=bool(self._failed))
+            after_ns = time.monotonic_ns()
+            self.ticks.add(after_ns - now_ns)
+            tick += 1
+            due_ns = after_ns + _BREATH_NS if self._came >= _PRESSED else due_ns + TICK_NS
+            if after_ns < due_ns:
+                select([], [], [], (due_ns - after_ns) / _NS)
+            elif after_ns > due_ns + _NS:  # stopped for a while: ticks are not made up for
+                self.overruns += (after_ns - due_ns) // TICK_NS
+                due_ns = after_ns
+
+    def _tick(self, tick: int, now_ns: int) -> None:
+        self._poll()
+        for bus in self.buses.values():
+            bus.write_raw(self._clock.now_ns)
+        waits = self.backlog
+        pressed = self._came >= _PRESSED and waits < _MOST_WAITING
+        every = WATCHED_TICKS if self.watched else DECODE_TICKS
+        due = tick % every == 1
+        if not pressed and (due or any(bus.behind for bus in self.buses.values())):
+            until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
+            for name, bus in self.buses.items():
+                self._decode(name, bus, until_ns, rest=due)
+        self._each_second.run(now_ns)
+        for each in self._each_tick:
+            each()
+
+    def _drain(self) -> None:
+        """End at this instant: what came before is kept, what came later is left out.
+
+        A source that can refuses from now on what its senders have. Of the others a frame that came
+        later proves that all before are here; as none takes so long, half a second does, too.
+        """
+        self._end_ns = self._clock.now_ns()
+        for source in self._sources:
+            if source.name not in self._failed:
+                self._end_source(source)
+        until_ns = self._end_ns + _DRAIN_NS
+        while True:
+            self._poll()
+            for bus in self.buses.values():
+                bus.write_raw(self._clock.now_ns)
+            late = self._clock.now_ns() >= until_ns
+            if late or not any(self._has_more(source) for source in self._sources):
+                return
+            select([], [], [], _BREATH_NS / _NS)
+
+    def _has_more(self, source: Source) -> bool:
+        """Whether frames from before the end may still come."""
+        if source.finished or source.name in self._failed or source.robot is not None:
+            return False
+        return isinstance(source, EndingSource) or (
+            source.connected and source.name not in self._later
+        )
+
+    def _poll(self) -> None:
+        self._came = 0
+        for source in self._sources:
+            polled = self._asked(source)
+            arrays = (*polled.frames, *polled.fd_frames)
+            if self._end_ns is not None and not isinstance(source, EndingSource):
+                kept = (self._before_end(source, frames) for frames in arrays)
+                arrays = tuple(frames for frames in kept if len(frames))
+            self._came += sum(map(len, arrays))
+            for event in polled.events:
+                self.say(event.level, source.name, event.text, event.t_ns)
+            for frames in arrays:
+                bus = self.buses.get(source.name)
+                if bus is None:
+                    bus = self.buses[source.name] = self._open_bus(source)
+                bus.add(frames)
+
+    def _before_end(self, source: Source, frames: FrameArray) -> FrameArray:
+        """Those of a source's frames that came before the end; a twin's are of its own time."""
+        if self._end_ns is None or source.robot is not None:
+            return frames
+        before = frames["t_host_ns"] <= np.uint64(self._end_ns)
+        if before.all():
+            return frames
+        self._later.add(source.name)
+        return frames[before]
+
+    @property
+    def given_up(self) -> list[str]:
+        """Names of the sources that failed in a way nobody foresaw."""
+        return sorted(self._failed)
+
+    def _asked(self, source: Source) -> Polled:
+        """What a source has; one that fails in a way nobody foresaw doesn't end the others."""
+        if source.name in self._failed:
+            return Polled()
+        try:
+            polled = source.poll()
+            _check(polled)
+        except LogWriteError:
+            raise
+        except Exception as error:  # noqa: BLE001 - the other sources go on
+            self._failed.add(source.name)
+            self.say("error", source.name, f"this source is given up: it failed with {error!r}")
+            self._stop_source(source)
+            return Polled()
+        return polled
+
+    def _end_source(self, source: Source) -> None:
+        """End a source that can refuse what comes later; one that fails in that is given up."""
+        try:
+            if isinstance(source, EndingSource):
+                source.end()
+        except Exception as error:  # noqa: BLE001 - the other sources are drained
+            self._failed.add(source.name)
+            self.say("error", source.name, f"this source can't be ended: {error!r}")
+
+    def _stop_source(self, source: Source) -> None:
+        """Release a source; one that fails in that doesn't keep the others open."""
+        try:
+            source.stop()
+        except Exception as error:  # noqa: BLE001 - the other sources are released
+            self._failed.add(source.name)
+            with suppress(LogWriteError):  # a full disk is reported by what ended the recording
+                self.say("error", source.name, f"this source can't be released: {error!r}")
+
+    def _decode(self, name: str, bus: BusRecorder, until_ns: int, *, rest: bool) -> None:
+        bus.decode(self._clock.now_ns, until_ns, rest=rest)
+        self._tell_clock(name)
+
+    def _open_bus(self, source: Source) -> BusRecorder:
+        robot = self._robot if source.name == self._decoded else None
+        return BusRecorder(
+            source.name,
+            self._writer,
+            self.clocks[source.name],
+            robot,
+            directions=source.directions,
+        )
+
+    def _write_clocks(self) -> None:
+        now_ns = self._clock.now_ns()
+        for name, clock in self.clocks.items():
+            pair = clock.pair()
+            if pair is None:
+                continue
+            device_ns, host_ns = pair
+            if name not in self._clock_channels:
+                topic = f"/clock/{name}"
+                self._clock_channels[name] = self._writer.time_reference(topic, source=name)
+            if 0 <= device_ns < _LONGEST_NS:
+                self._clock_channels[name].write(host_ns, device_ns, log_time_ns=now_ns)
+            elif name not in self._odd_clocks:
+                self._odd_clocks.add(name)
+                text = f"the device's time, {device_ns} ns, doesn't fit /clock/{name}"
+                self.say("warn", name, text)
+
+    def _tell_clock(self, name: str) -> None:
+        for text in self.clocks[name].take_events():
+            self.say("warn", name, text)
+
+    def _tell_odd_frames(self) -> None:
+        """Say once what nobody knows and what is too short; the counts come at the end."""
+        for name, bus in self.buses.items():
+            for text in bus.take_faults():
+                self.say("error", name, text)
+            if not bus.decodes:
+                continue
+            for level, what, found in (
+                ("info", "identifiers that no database knows", bus.tally.unknown),
+                ("warn", "frames too short for", bus.tally.short),
+            ):
+                fresh = set(found) - self._told[name]
+                if fresh:
+                    self._told[name] |= fresh
+                    listed = ", ".join(sorted(fresh)[:8])
+                    more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
+                    self.say(level, name, f"{what}: {listed}{more}")
+
+    def _finish(self) -> None:
+        """Decode what waits, and say what became of the frames."""
+        for name, bus in self.buses.items():
+            bus.finish(self._clock.now_ns)
+            self._tell_clock(name)
+            if bus.decodes:
+                for text in bus.tally.problems():
+                    self.say("warn", name, text)
+                for text in bus.tally.notes():
+                    self.say("info", name, text)
+        self._write_clocks()
+        self._tell_odd_frames()
+        ending = self.ending
+        assert ending is not None  # noqa: S101 - set by the loop
+        self.say("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
+
+
+def _check(polled: Polled) -> None:
+    """Refuse what a plug-in may give and no source gives.
+
+    Raises:
+        TypeError: If it isn't what :class:`Polled` says.
+    """
+    for frames in (*polled.frames, *polled.fd_frames):
+        if frames.dtype not in (FRAME_DTYPE, FD_FRAME_DTYPE):
+            raise TypeError(f"poll() gave frames of the type {frames.dtype}")
+
+
+@contextmanager
+def _tidied_by_hand() -> Generator[None]:
+    """No collection of garbage at a moment of the interpreter's choosing: a full one takes long.
+
+    What is there by now stays; the young generations are looked at once a second.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
+def _tidy() -> None:
+    gc.collect(1)

@@ -1,0 +1,481 @@
+"""A recording from its settings: sources, sink, health, control and live view put together."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import shutil
+import uuid
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..common.errors import LogWriteError, SocketInUseError, SourceError, UsageError
+from ..common.process import StopRequest
+from ..log.write.writer import SessionWriter
+from ..sources.address import open_sources
+from ..sources.contract import SourceContext
+from .bus_recorder import decoded_source, robot_of
+from .control import ControlServer
+from .control_client import default_sockets
+from .control_requests import OperatorLog, request_handler
+from .health import LiveHealth
+from .live_feed import LiveFeed
+from .loop import Ending, Recorder
+from .screen import plain_line
+from .settings import RecordSettings
+from .status import EventLine, RecorderSnapshot, SessionClock, statuses
+from .storage import TappedSink, open_storage
+from .systemd import Notifier
+
+
+def machine_facts() -> Mapping[str, str]:
+    """Host, kernel and versions, for the session's metadata."""
+    system = platform.uname()
+    return {
+        "host": system.node,
+        "kernel": f"{system.system} {system.release} {system.machine}",
+        "python": platform.python_version(),
+    }
+
+
+def free_space(path: Path) -> int:
+    """Bytes that are free for us where a file is.
+
+    Args:
+        path: The file, which need not be there yet.
+
+    Returns:
+        Free bytes.
+
+    Raises:
+        LogWriteError: If the folder can't be asked.
+    """
+    try:
+        return shutil.disk_usage(path.parent).free
+    except OSError as error:
+        raise LogWriteError(
+            path, f"its folder can't be used: {os.strerror(error.errno or 0)}"
+        ) from error
+
+
+@dataclass(frozen=True)
+class RecordReport:
+    """What was recorded.
+
+    Attributes:
+        files: The session's files, in order.
+        session_id: Its id.
+        robot: Name of the robot, or None.
+        duration_s: Time from start to end [s].
+        messages: Messages accepted.
+        size: Bytes of the files.
+        verdict: ``good``, ``degraded`` or ``bad``.
+        reasons: Why it is not better.
+        ending: Why it ended.
+        sources: By name: what became of the frames.
+        recorder: Of the recorder itself: ticks and so on.
+    """
+
+    files: tuple[Path, ...]
+    session_id: str
+    robot: str | None
+    duration_s: float
+    messages: int
+    size: int
+    verdict: str
+    reasons: tuple[str, ...]
+    ending: Ending
+    sources: Mapping[str, Mapping[str, Any]]
+    recorder: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return {
+            "files": [str(file) for file in self.files],
+            "session_id": self.session_id,
+            "robot": self.robot,
+            "duration_s": self.duration_s,
+            "messages": self.messages,
+            "size_bytes": self.size,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "ended": self.ending.reason,
+            "failed": self.ending.failed,
+            "sources": {name: dict(facts) for name, facts in self.sources.items()},
+            "recorder": dict(self.recorder),
+        }
+
+
+_NS = 1_000_000_000
+_EVENTS_SHOWN = 8
+_VIEW, _HEALTH = "live view", "live health"
+_NOT_JUDGED = "the recorder could not judge all of it: 'undulog log check' does"
+_RATE_UPDATES = 10
+
+
+class Recording:
+    """One recording at work; what the control socket can ask of it."""
+
+    def __init__(
+        self,
+        settings: RecordSettings,
+        stop: StopRequest,
+        *,
+        notifier: Notifier | None = None,
+    ) -> None:
+        """Open everything that must be there before the first sample.
+
+        Args:
+            settings: What to record, and how.
+            stop: Ends the recording.
+            notifier: Is told that it has begun, and then that it is alive.
+
+        Raises:
+            UsageError: If the settings don't fit together, or the output is there.
+            SourceError: If a source can never work.
+            LogWriteError: If the session can't be created, or too little space is free.
+            ControlError: If the control socket can't be made.
+        """
+        self._settings, self._stop = settings, stop
+        self._useless = False
+        self._show: Callable[[RecorderSnapshot], None] | None = None
+        self._notifier = notifier or Notifier({})
+        self._sources = open_sources(settings.sources)
+        robot = self._robot = robot_of(settings, self._sources)
+        decoded = decoded_source(settings, self._sources, robot)
+        if settings.fast and any(source.robot is None for source in self._sources):
+            raise UsageError("--fast is for a twin alone; a bus has its own time")
+        free = free_space(settings.output)
+        if free < settings.floor:
+            raise LogWriteError(
+                settings.output,
+                f"only {free / 1e6:.0f} MB are free there, less than the floor of "
+                f"{settings.floor / 1e6:.0f} MB (--floor)",
+            )
+        self._clock = SessionClock()
+        self._session_id = uuid.uuid4().hex
+        self._health = LiveHealth(robot)
+        self._events: deque[EventLine] = deque(maxlen=_EVENTS_SHOWN)
+        self._sizes: deque[tuple[int, int]] = deque(maxlen=_RATE_UPDATES)
+        self._snapshot: RecorderSnapshot | None = None
+        with ExitStack() as opened:  # what is open is closed again if the next thing fails
+            self._control = _control_of(settings)  # first: two recorders never share one
+            opened.callback(self._control.close)
+            self._feed = LiveFeed(self._control.path.with_suffix(".live"))
+            opened.callback(self._feed.close)
+            self._storage = open_storage(settings)
+            self._writer = SessionWriter(
+                settings.output,
+                session_id=self._session_id,
+                epoch_ns=self._clock.epoch_ns,
+                robot=robot,
+                clock={source.name: source.clock for source in self._sources},
+                metadata=self._facts(),
+                sink=TappedSink(self._storage.sink, (self._health, self._feed)),
+            )
+            opened.callback(self._writer.close)
+            self._diagnostics = self._writer.diagnostics()
+            self._recorder = Recorder(
+                writer=self._writer,
+                clock=self._clock,
+                sources=self._sources,
+                context=SourceContext(self._clock.now_ns, self._writer, _wishes(settings)),
+                robot=robot,
+                decoded=decoded,
+                each_tick=(self._each_tick,),
+                each_second=(self._look, self._diagnose, self._tell, self._look_at_disk),
+            )
+            self._recorder.on_event(self._note_event)
+            log = OperatorLog(self._writer, self._recorder.say, self._clock.now_ns)
+            self._control.serve(request_handler(self, log))
+            opened.pop_all()
+        # What a recording can do without; each is given up where it fails.
+        self._asides: dict[str, Callable[[], None]] = {
+            _VIEW: self._feed.pump,
+            _HEALTH: lambda: self._health.step(self._clock.now_ns()),
+        }
+
+    @property
+    def live_socket(self) -> Path:
+        """Where a live view may listen."""
+        return self._feed.path
+
+    def warn(self, name: str, text: str) -> None:
+        """Write a warning into the session; for what happens beside the recording.
+
+        Args:
+            name: Who says it.
+            text: One sentence.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        self._recorder.say("warn", name, text)
+
+    def run(self, show: Callable[[RecorderSnapshot], None] | None = None) -> RecordReport:
+        """Record until something ends it, and finalise.
+
+        Args:
+            show: Is shown the recording once a second.
+
+        Returns:
+            What was recorded; its ending says whether it had to end.
+
+        Raises:
+            SourceError: If a source can never work; no file is left then.
+        """
+        ending = Ending("an error", failed=True)
+        report: RecordReport | None = None
+        self._show = show
+        try:
+            self._notifier.ready(f"recording {self._settings.output}")
+            ending = self._recorded()
+        except SourceError:
+            self._useless = True
+            raise
+        finally:
+            self._notifier.stopping()
+            ending = self._finalised(ending)
+            self._feed.close()
+            report = self._report(ending)
+            self._control.close(report.as_json())
+            if self._useless:  # nothing was recorded: the name is free for another try
+                for file in report.files:
+                    file.unlink(missing_ok=True)
+        return report
+
+    # -- what the control socket asks ---------------------------------------------------------
+
+    def status(self) -> Mapping[str, Any]:
+        """How the recording goes, as plain JSON values."""
+        snapshot = self._snapshot or self._look()
+        facts = dataclasses.asdict(snapshot)
+        path = facts.pop("path")
+        return {"output": path, "bytes": facts.pop("size"), **facts}
+
+    def mark(self, text: str) -> Mapping[str, Any]:
+        """Mark this moment; a ring writes what it has.
+
+        Args:
+            text: What the operator says of it.
+
+        Returns:
+            The file that a ring writes.
+
+        Raises:
+            LogWriteError: If that file can't be created.
+        """
+        return self._storage.mark(text)
+
+    def split(self) -> Mapping[str, Any]:
+        """Begin a new part.
+
+        Returns:
+            Its number and file.
+
+        Raises:
+            UsageError: If a ring is kept.
+            LogWriteError: If the file can't be created; the recording goes on.
+        """
+        return self._storage.split()
+
+    def stop(self) -> None:
+        """End the recording after this tick."""
+        self._recorder.ending = Ending("it was asked to stop")
+
+    # -- in the loop -------------------------------------------------------------------------
+
+    def _each_tick(self) -> None:
+        self._control.poll()
+        for name in tuple(self._asides):
+            try:
+                self._asides[name]()
+            except LogWriteError:
+                raise
+            except Exception as error:  # noqa: BLE001 - the recording goes on without it
+                del self._asides[name]
+                text = f"the {name} is given up: it failed with {error!r}"
+                self._recorder.say("error", "recorder", text)
+        self._notifier.alive()
+
+    def _look(self) -> RecorderSnapshot:
+        """Take a new snapshot."""
+        self._storage.tick()
+        for level, text in self._storage.take_events():
+            self._recorder.say(level, "recorder", text)
+        for text in self._control.take_faults():
+            self._recorder.say("error", "recorder", text)
+        self._snapshot = self._new_snapshot("recording")
+        return self._snapshot
+
+    def _diagnose(self) -> None:
+        if self._snapshot is not None:
+            self._diagnostics.write(self._clock.now_ns(), statuses(self._snapshot))
+
+    def _tell(self) -> None:
+        if self._snapshot is None:
+            return
+        self._notifier.status(plain_line(self._snapshot))
+        self._recorder.watched = self._feed.connected
+        if self._show is not None:
+            self._show(self._snapshot)
+
+    def _look_at_disk(self) -> None:
+        shortage = self._storage.shortage
+        if shortage is not None:
+            raise shortage
+        free = free_space(self._settings.output)
+        if free < self._settings.floor and self._recorder.ending is None:
+            self._recorder.ending = Ending(
+                f"only {free / 1e6:.0f} MB are left on the disk, less than the floor of "
+                f"{self._settings.floor / 1e6:.0f} MB; nothing later is recorded",
+                failed=True,
+            )
+
+    def _note_event(self, t_ns: int, level: str, name: str, text: str) -> None:
+        self._events.append(EventLine(t_ns, level, name, text))
+
+    # -- the end -----------------------------------------------------------------------------
+
+    def _recorded(self) -> Ending:
+        try:
+            # A twin's time is its own: it gets the duration, and ends by itself.
+            twins = all(source.robot is not None for source in self._sources)
+            duration_s = None if twins else self._settings.duration_s
+            return self._recorder.run(self._stop, duration_s)
+        except LogWriteError as error:
+            return Ending(str(error), failed=True)
+
+    def _finalised(self, ending: Ending) -> Ending:
+        """Verdict and summary into the file; the ending, or what went wrong with it."""
+        try:
+            self._writer.note_at_end("undulog.clock", self._clock_facts())
+            self._writer.note_at_end("undulog.recorder", self._recorder_facts(ending))
+            self._diagnose_last(ending)
+            if _HEALTH in self._asides:
+                verdict = self._health.final()
+                self._writer.set_verdict(verdict.verdict, verdict.reasons)
+            else:
+                self._writer.set_verdict("degraded", [_NOT_JUDGED])
+        finally:
+            try:
+                self._writer.close()
+            except LogWriteError as error:
+                said = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
+                ending = Ending(said if ending.failed else str(error), failed=True)
+        return ending
+
+    def _diagnose_last(self, ending: Ending) -> None:
+        """The last state of the sources: a check of the file judges by it."""
+        if ending.failed and self._storage.shortage is not None:
+            return  # the disk takes no more; the last second's state is in the file
+        self._look()
+        self._diagnose()
+
+    def _clock_facts(self) -> dict[str, str]:
+        facts: dict[str, str] = {}
+        for name, clock in self._recorder.clocks.items():
+            if clock.pair() is not None:
+                facts |= clock.result().as_metadata(name)
+        return facts
+
+    def _recorder_facts(self, ending: Ending) -> dict[str, str]:
+        times = self._recorder.ticks.result()
+        return {
+            "ended": ending.reason,
+            "priority": self._recorder.priority.text,
+            "ticks": str(times.count),
+            "tick_p50_s": f"{times.p50_s:.3g}",
+            "tick_p99_s": f"{times.p99_s:.3g}",
+            "tick_max_s": f"{times.max_s:.3g}",
+            "ticks_left_out": str(self._recorder.overruns),
+        }
+
+    # -- facts -------------------------------------------------------------------------------
+
+    def _facts(self) -> dict[str, str]:
+        facts = dict(machine_facts())
+        for key in ("operator", "notes"):
+            if value := getattr(self._settings, key):
+                facts[key] = value
+        for text, source in zip(self._settings.sources, self._sources, strict=True):
+            facts[f"source.{source.name}"] = text
+            facts |= {f"source.{source.name}.{k}": v for k, v in source.facts.items()}
+        return facts | dict(self._settings.metadata)
+
+    def _new_snapshot(self, state: str) -> RecorderSnapshot:
+        now_ns = self._clock.now_ns()
+        self._sizes.append((now_ns, self._storage.size))
+        (began, had), (ended, has) = self._sizes[0], self._sizes[-1]
+        measures, times = self._health.result(), self._recorder.ticks.result()
+        clocks = self._recorder.clocks
+        return RecorderSnapshot(
+            session_id=self._session_id,
+            path=str(self._storage.path),
+            robot=self._robot.name if self._robot is not None else None,
+            state=state,
+            now_ns=now_ns,
+            elapsed_s=(now_ns - self._clock.epoch_ns) / _NS,
+            messages=self._storage.messages,
+            size=self._storage.size,
+            byte_rate=(has - had) * _NS / (ended - began) if ended > began else None,
+            free=free_space(self._settings.output),
+            part=self._storage.part,
+            verdict=measures.verdict,
+            reasons=measures.reasons,
+            notes=measures.notes,
+            sources=tuple(
+                self._health.source(source, text, clocks.get(source.name))
+                for text, source in zip(self._settings.sources, self._sources, strict=True)
+            ),
+            topics=self._health.topics(),
+            events=tuple(self._events),
+            tick_p99_s=times.p99_s,
+            tick_max_s=times.max_s,
+            backlog=self._recorder.backlog,
+            unsynced=self._storage.unsynced,
+        )
+
+    def _report(self, ending: Ending) -> RecordReport:
+        measures = self._health.result()
+        files = self._storage.files()
+        if (lost := self._recorder.given_up) and not ending.failed:
+            what = f"{ending.reason}; given up before, see /rosout: {', '.join(lost)}"
+            ending = Ending(what, failed=True)
+        return RecordReport(
+            files=files,
+            session_id=self._session_id,
+            robot=self._robot.name if self._robot is not None else None,
+            duration_s=(self._clock.now_ns() - self._clock.epoch_ns) / _NS,
+            messages=self._storage.messages,
+            size=sum(file.stat().st_size for file in files if file.exists()),
+            verdict=measures.verdict,
+            reasons=measures.reasons,
+            ending=ending,
+            sources={s.name: dataclasses.asdict(s.counts) for s in self._sources},
+            recorder=self._recorder_facts(ending),
+        )
+
+
+def _control_of(settings: RecordSettings) -> ControlServer:
+    """The control socket: the one that was named, or the first usual one that is free."""
+    if settings.socket is not None:
+        return ControlServer(settings.socket)
+    usual, other = default_sockets(settings.output, os.environ)
+    try:
+        return ControlServer(usual)
+    except SocketInUseError:
+        return ControlServer(other)
+
+
+def _wishes(settings: RecordSettings) -> dict[str, str]:
+    """What a scenario is told."""
+    wishes = {"fast": str(settings.fast).lower()}
+    if settings.duration_s is not None:
+        wishes["duration_s"] = repr(settings.duration_s)
+    return wishes

@@ -1,0 +1,487 @@
+"""Sources with the scheme ``can``: ``can:INTERFACE:CHANNEL[?KEY=VALUE&...]``.
+
+slcan adapters, socketcand servers and the kernel's own interfaces are read in bulk; every other
+interface through python-can.
+
+What python-can's interfaces offer a recorder: listening only, and times of their own.
+
+Looked up in python-can 4.6.1; an interface that isn't named here is opened as it comes.
+
+Any interface of python-can, read by a thread.
+
+python-can offers one frame at a time, by a call that waits; so a thread waits, and the recorder
+takes what has gathered.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import cast
+
+import can
+import numpy as np
+from can.interfaces import BACKENDS
+from can.util import cast_from_string
+
+from ..common.errors import SourceError, UsageError
+from ..common.strict_table import listed
+from ..log.messages.frames import (
+    DIR_RX,
+    DIR_TX,
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    REMOTE_FLAG,
+    FrameArray,
+    empty_fd_frames,
+    empty_frames,
+)
+from ..robot.model import ClockDomain
+from .address import flag, number, only
+from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress
+from .events import ODD_TIME, Tally
+from .link import LinkedSource
+from .slcan import SlcanSettings, slcan_source
+from .socketcan import socketcan_source
+from .socketcand import server_of, socketcand_source
+
+_WAIT_S = 0.1
+_JOIN_S = 1.0
+_MOST_HELD = 1_000_000
+_TIMES_END_S = DEVICE_TIMES_END_NS / 1e9
+
+
+def bus_class(text: str, interface: str) -> type[can.BusABC]:
+    """The class of an interface.
+
+    Args:
+        text: The address, for messages.
+        interface: E.g. ``pcan``; one that is known.
+
+    Returns:
+        The class.
+
+    Raises:
+        SourceError: If what it needs is not installed.
+    """
+    module, name = BACKENDS[interface]
+    try:
+        return cast("type[can.BusABC]", getattr(importlib.import_module(module), name))
+    except (ImportError, OSError, AttributeError) as error:
+        raise SourceError(text, f"python-can can't load {interface}: {error}") from error
+
+
+class PythonCanLink:
+    """An open bus and the thread that reads it."""
+
+    def __init__(self, bus: can.BusABC, tally: Tally, *, device_time: bool, detail: str) -> None:
+        """Take over a bus.
+
+        Args:
+            bus: Open.
+            tally: Where to count.
+            device_time: Whether the messages' times are the device's.
+            detail: What is worth telling of it.
+        """
+        self.detail = detail
+        self._bus = bus
+        self._tally = tally
+        self._device_time = device_time
+        self._held: deque[tuple[int, can.Message]] = deque()
+        self._lost = 0
+        self._told = 0
+        self._error: OSError | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="undulog-can", daemon=True)
+        self._thread.start()
+
+    def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
+        """See :meth:`Link.read`."""
+        error = self._error  # before the frames: none comes after it
+        count = len(self._held)
+        if not count and error is not None:
+            raise error
+        if self._lost > self._told:
+            lost, self._told = self._lost - self._told, self._lost
+            self._tally.counts.dropped = (self._tally.counts.dropped or 0) + lost
+            self._tally.events.say("warn", "frame dropped, as nobody fetched it", lost)
+        if not count:
+            return ()
+        held = [self._held.popleft() for _ in range(count)]
+        if self._device_time:
+            odd = sum(not 0.0 <= message.timestamp < _TIMES_END_S for _, message in held)
+            self._tally.malformed(ODD_TIME, odd)
+        classic = [pair for pair in held if not _is_fd(pair[1])]
+        fd = [pair for pair in held if _is_fd(pair[1])] if len(classic) < count else []
+        return (
+            frames_of(classic, device_time=self._device_time),
+            fd_frames_of(fd, device_time=self._device_time),
+        )
+
+    def close(self) -> None:
+        """End the thread, which closes the bus."""
+        self._stop.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_JOIN_S)
+
+    def _run(self) -> None:
+        found: OSError | None = None
+        try:
+            while not self._stop.is_set():
+                message = self._bus.recv(_WAIT_S)
+                if message is None:
+                    continue
+                if len(self._held) < _MOST_HELD:
+                    self._held.append((self._tally.now_ns(), message))
+                else:
+                    self._lost += 1
+        except Exception as error:  # noqa: BLE001 (a driver's fault is the end of its connection)
+            found = failure(error)
+        try:
+            self._bus.shutdown()
+        except Exception as error:  # noqa: BLE001 (a dead device can't be closed: it is lost)
+            found = found or failure(error)
+        self._error = found  # last, so that nobody who sees it has to wait for the driver
+
+
+def _is_fd(message: can.Message) -> bool:
+    """Whether it is a CAN FD frame, also from a driver that doesn't say so."""
+    return (message.is_fd or len(message.data) > 8) and not message.is_error_frame
+
+
+def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:
+    """Turn python-can's messages of classic frames into frames.
+
+    Args:
+        messages: Arrival [Unix ns] and message, of at most 8 bytes.
+        device_time: Whether to take the messages' times, to the microsecond, as the device's; those
+            that are negative, not finite or out of range are replaced by the arrival's.
+
+    Returns:
+        The frames.
+    """
+    frames = empty_frames(len(messages))
+    _fill(frames, messages, device_time=device_time)
+    frames["dlc"] = [m.dlc for _, m in messages]
+    return frames
+
+
+def fd_frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:
+    """Turn python-can's messages of CAN FD frames into frames.
+
+    Args:
+        messages: Arrival [Unix ns] and message, of at most 64 bytes.
+        device_time: Whether to take the messages' times, to the microsecond, as the device's.
+
+    Returns:
+        The CAN FD frames.
+    """
+    frames = empty_fd_frames(len(messages))
+    _fill(frames, messages, device_time=device_time)
+    frames["len"] = [len(m.data) for _, m in messages]
+    frames["fd_flags"] = [
+        (FD_BRS if m.bitrate_switch else 0) | (FD_ESI if m.error_state_indicator else 0)
+        for _, m in messages
+    ]
+    return frames
+
+
+def _fill(
+    frames: FrameArray, messages: Sequence[tuple[int, can.Message]], *, device_time: bool
+) -> None:
+    """What both kinds have."""
+    host = np.array([t_ns for t_ns, _ in messages], dtype=np.uint64)
+    frames["t_host_ns"] = host
+    frames["t_device_ns"] = host
+    if device_time:
+        stamps = np.array([m.timestamp for _, m in messages], dtype=np.float64)
+        given = (stamps > 0.0) & (stamps < _TIMES_END_S)  # a driver without times says 0
+        micros = np.rint(stamps[given] * 1e6).astype(np.uint64)
+        frames["t_device_ns"][given] = micros * np.uint64(1000)
+    frames["id_flags"] = [
+        m.arbitration_id
+        | (EXTENDED_FLAG if m.is_extended_id and not m.is_error_frame else 0)
+        | (REMOTE_FLAG if m.is_remote_frame else 0)
+        | (ERROR_FLAG if m.is_error_frame else 0)
+        for _, m in messages
+    ]
+    frames["dir"] = [DIR_RX if m.is_rx else DIR_TX for _, m in messages]
+    cells = frames["data"]
+    data = b"".join(bytes(m.data).ljust(cells.shape[1], b"\0") for _, m in messages)
+    frames["data"] = np.frombuffer(data, dtype=np.uint8).reshape(cells.shape)
+
+
+def failure(error: Exception) -> OSError:
+    """An error of a driver as the loss of a connection.
+
+    Args:
+        error: What was raised.
+
+    Returns:
+        The same, as OSError.
+    """
+    if isinstance(error, OSError):
+        return error
+    code = getattr(error, "error_code", None)
+    text = str(error) or type(error).__name__
+    return OSError(code if isinstance(code, int) else 0, text)
+
+
+def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) -> can.BusABC:
+    """Open a bus.
+
+    Args:
+        text: The address, for messages.
+        bus: Its class.
+        options: What to give it, the channel among them.
+
+    Returns:
+        The open bus.
+
+    Raises:
+        OSError: If it can't be opened now.
+        SourceError: If it never can: a driver missing, an option that it doesn't know.
+    """
+    try:
+        return bus(**options)  # type: ignore[arg-type]
+    except (can.CanInterfaceNotImplementedError, ImportError, NotImplementedError) as error:
+        raise SourceError(text, str(error)) from error
+    except can.CanInitializationError as error:
+        raise failure(error) from error
+    except (TypeError, ValueError, KeyError) as error:
+        raise SourceError(text, f"python-can refuses the options: {error}") from error
+    except (can.CanError, OSError) as error:
+        raise failure(error) from error
+    except Exception as error:  # python-can's own fault, e.g. a name that its driver should bring
+        kind = type(error).__name__
+        raise SourceError(text, f"python-can can't open it: {kind}: {error}") from error
+
+
+def python_can_source(
+    address: SourceAddress,
+    interface: str,
+    options: Mapping[str, object],
+    facts: Mapping[str, str],
+    *,
+    device_time: bool,
+    detail: str,
+) -> LinkedSource:
+    """Make the source of a python-can interface.
+
+    Args:
+        address: What was asked for.
+        interface: E.g. ``pcan``; one that is known.
+        options: What to give it, the channel among them.
+        facts: For the session's metadata.
+        device_time: Whether its messages' times are the device's.
+        detail: What is worth telling of it.
+
+    Returns:
+        The source; nothing is opened.
+
+    Raises:
+        SourceError: If what it needs is not installed.
+    """
+    bus = bus_class(address.text, interface)
+    return LinkedSource(
+        address,
+        lambda tally: PythonCanLink(
+            open_bus(address.text, bus, options), tally, device_time=device_time, detail=detail
+        ),
+        place=f"{interface} {options['channel']}",
+        clock=ClockDomain.DEVICE if device_time else ClockDomain.HOST,
+        facts=facts,
+    )
+
+
+LISTEN_ONLY: Mapping[str, Mapping[str, object]] = {
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},  # DRIVER_MODE_SILENT
+    "nixnet": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "seeedstudio": {"operation_mode": "silent"},
+    "systec": {"state": can.BusState.PASSIVE},
+    "vector": {"listen_only": True},
+}
+"""Interface to the options that make its controller listen only (slcan: its L command)."""
+
+NO_CONTROLLER = frozenset({"virtual", "udp_multicast", "socketcan", "socketcand"})
+"""Interfaces that open no controller: there is nothing to make listen only."""
+
+DEVICE_TIME = frozenset(
+    {
+        "canalystii",
+        "etas",
+        "ixxat",
+        "kvaser",
+        "neovi",
+        "nican",
+        "nixnet",
+        "pcan",
+        "serial",
+        "systec",
+        "vector",
+    }
+)
+"""Interfaces whose messages carry the device's own time, in seconds.
+
+The others stamp with the computer's wall clock, with a counter that starts again within the hour
+(gs_usb, cantact), or in another unit (usb2can): the recorder's own time of arrival is better.
+"""
+
+_TIMING = {"f_clock", "brp", "tseg1", "tseg2", "sjw", "nof_samples"}
+_COMMON = {"bitrate", "fd", "data_bitrate"}
+_PARAM = re.compile(r":param\s+(?:[^:\n]*?\s)?(\w+):")
+
+
+def check_interface(text: str, interface: str) -> None:
+    """See that python-can knows an interface.
+
+    Args:
+        text: The address, for the message.
+        interface: E.g. ``pcan``.
+
+    Raises:
+        UsageError: If not; lists those that it knows.
+    """
+    if interface not in BACKENDS:
+        valid = listed(sorted(BACKENDS), interface)
+        raise UsageError(f"{text!r}: no CAN interface {interface!r}; valid: {valid}")
+
+
+def known_options(bus: type[can.BusABC]) -> set[str]:
+    """The options that an interface's class names in its signature or its documentation.
+
+    Args:
+        bus: The class.
+
+    Returns:
+        Their names, without the channel.
+    """
+    names = set(inspect.signature(bus.__init__).parameters)
+    for documented in (bus, bus.__init__):
+        names |= set(_PARAM.findall(documented.__doc__ or ""))
+    return (names | _TIMING | _COMMON) - {"self", "channel", "args", "kwargs", "config"}
+
+
+def open_can(address: SourceAddress) -> Source:
+    """Make the source that a ``can:`` address names.
+
+    Args:
+        address: E.g. of ``can:slcan:/dev/ttyACM0?bitrate=1000000``.
+
+    Returns:
+        The source; nothing is opened.
+
+    Raises:
+        UsageError: If there is no such interface, or an option is unknown or has no valid value.
+        SourceError: If it can never work here.
+    """
+    interface, _, channel = address.rest.partition(":")
+    check_interface(address.text, interface)
+    if not channel:
+        raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+    return _OPENERS.get(interface, _open_other)(address, interface, channel)
+
+
+def _open_slcan(address: SourceAddress, interface: str, channel: str) -> Source:
+    valid = ("bitrate", "listen_only", "timestamps", "tty_baud", "rtscts")
+    only(address, valid)
+    settings = SlcanSettings(
+        bitrate=number(address, "bitrate", 0) or None,
+        listen_only=flag(address, "listen_only", default=True),
+        timestamps=flag(address, "timestamps", default=False),
+        tty_baud=number(address, "tty_baud", SlcanSettings.tty_baud),
+        rtscts=flag(address, "rtscts", default=False),
+    )
+    facts = _facts(interface, channel, settings.listen_only)
+    if settings.bitrate is not None:
+        facts["bitrate"] = str(settings.bitrate)
+    facts["timestamps"] = "adapter, 1 ms" if settings.timestamps else "host"
+    return slcan_source(address, channel, settings, facts)
+
+
+def _open_socketcand(address: SourceAddress, interface: str, channel: str) -> Source:
+    host, port = server_of(address)
+    facts = _facts(interface, channel, None) | {"host": host, "port": str(port)}
+    return socketcand_source(address, host, port, channel, facts)
+
+
+def _open_socketcan(address: SourceAddress, interface: str, channel: str) -> Source:
+    if "bitrate" in address.options:
+        raise UsageError(
+            f"{address.text!r}: the bit rate of a kernel interface is set when it is brought up: "
+            f"ip link set {channel} up type can bitrate {address.options['bitrate']} listen-only on"
+        )
+    only(address, ("directions",))
+    return socketcan_source(
+        address,
+        channel,
+        _facts(interface, channel, None),
+        directions=flag(address, "directions", default=False),
+    )
+
+
+def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
+    bus = bus_class(address.text, interface)
+    own = ("listen_only", "device_time")
+    given = {key: value for key, value in address.options.items() if key not in own}
+    if bus.__module__.startswith("can."):  # others' classes may take what they don't name
+        only(address, {*own, *known_options(bus)})
+    offered = interface in LISTEN_ONLY
+    listen_only = flag(address, "listen_only", default=offered)
+    if listen_only and not offered:
+        raise UsageError(
+            f"{address.text!r}: python-can offers no listen-only for {interface}; it does for "
+            f"{', '.join(sorted(['slcan', *LISTEN_ONLY]))}"
+        )
+    options: dict[str, object] = {"channel": cast_from_string(channel)}
+    options |= {key: _converted(address, key, value) for key, value in given.items()}
+    if listen_only:
+        options |= LISTEN_ONLY[interface]
+    if interface in NO_CONTROLLER:
+        detail = "never transmits"
+        facts = _facts(interface, channel, None)
+    else:
+        detail = "listen-only" if listen_only else "acknowledges frames"
+        facts = _facts(interface, channel, listen_only)
+    facts |= given
+    device_time = flag(address, "device_time", default=interface in DEVICE_TIME)
+    return python_can_source(
+        address, interface, options, facts, device_time=device_time, detail=detail
+    )
+
+
+_OPENERS: Mapping[str, Callable[[SourceAddress, str, str], Source]] = {
+    "slcan": _open_slcan,
+    "socketcand": _open_socketcand,
+    "socketcan": _open_socketcan,
+}
+
+
+def _facts(interface: str, channel: str, listen_only: bool | None) -> dict[str, str]:
+    facts = {"interface": interface, "channel": channel}
+    if listen_only is not None:
+        facts["listen_only"] = "yes" if listen_only else "no"
+    return facts
+
+
+def _converted(address: SourceAddress, key: str, value: str) -> object:
+    """An option's value as python-can converts those of its configuration files."""
+    if key == "fd":
+        return flag(address, key, default=False)
+    if key == "state":
+        try:
+            return can.BusState[value]
+        except KeyError:
+            valid = listed((state.name for state in can.BusState), value)
+            raise UsageError(
+                f"{address.text!r}: state {value} is not valid; valid: {valid}"
+            ) from None
+    return cast_from_string(value)

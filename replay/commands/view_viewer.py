@@ -1,0 +1,152 @@
+"""The verb ``view`` with one session and a viewer: the picture comes while it is converted."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from undulog.capture import Session, SessionView
+from undulog.capture.common.console import complain, emit_json, progress, say
+from undulog.capture.common.process import interruptible
+
+from ..samples.content import Layer
+from ..viewer import viewer
+from .view_single import SingleOptions
+
+if TYPE_CHECKING:
+    from ..live.relay import RelayReport
+
+
+_LIVE_NICENESS = 10
+
+
+def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, json: bool) -> None:
+    """Show what a recorder on this machine records, until it is closed or interrupted.
+
+    Args:
+        path: The socket that the recorder sends to.
+        save: Write one session to this file instead.
+        web: Serve the viewer to a browser on this machine instead of opening a window.
+        connect: Address of a viewer that runs already.
+        json: Print the report as one JSON object.
+
+    Raises:
+        UsageError: If the socket can't be made, or there is no display for a window.
+        UndulogError: If the viewer or the drawing fails.
+    """
+    from ..live.relay import open_server, open_window, relay_to_file, relay_to_viewer
+    from ..viewer import viewer
+
+    if not (web or connect or save):
+        viewer.require_display()
+    os.nice(max(_LIVE_NICENESS - os.nice(0), 0))  # it never competes with the recorder
+    if save is not None:
+        report = relay_to_file(path, save)
+    elif connect is not None:
+        report = relay_to_viewer(path, None, connect)
+    elif web:
+        with open_server(say) as server:
+            report = relay_to_viewer(path, server, server.address)
+    else:
+        with open_window() as window:
+            report = relay_to_viewer(path, window, window.address)
+    if json:
+        emit_json(_facts(report, save))
+    else:
+        _tell(report, save)
+    if connect is not None and report.complaint:
+        _leave(report.complaint)
+
+
+def _leave(complaint: str) -> NoReturn:
+    """End the process at once: Rerun would wait at its end for a viewer that takes nothing."""
+    complain(f"error: {complaint}")
+    os._exit(1)
+
+
+def _tell(report: RelayReport, save: Path | None) -> None:
+    where = f"{save}: " if save is not None else ""
+    late = "" if report.lag_s is None else f", {report.lag_s[0] * 1e3:.0f} ms late (median)"
+    say(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")
+    if report.unread:
+        say(f"note: {report.unread} messages could not be read")
+
+
+def _facts(report: RelayReport, save: Path | None) -> dict[str, Any]:
+    lag = report.lag_s
+    return {
+        "path": None if save is None else str(save),
+        "sessions": list(report.sessions),
+        "shown": report.shown,
+        "dropped": report.dropped,
+        "unread": report.unread,
+        "lag_s": None if lag is None else dict(zip(("p50", "p99", "max"), lag, strict=True)),
+    }
+
+
+_FIRST = "the beginning"
+_NICENESS = 5
+
+
+def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
+    """Show a session until the viewer is closed or an end is asked for.
+
+    Args:
+        file: The session.
+        single: How it is shown.
+        web: Serve the viewer to browsers on this machine instead of opening a window.
+
+    Raises:
+        UsageError: If there is no display for a window.
+        LogError: If the session or a result can't be read.
+        DataError: If it holds nothing that can be drawn.
+        UndulogError: If the viewer fails.
+    """
+    if not web:
+        viewer.require_display()
+    with ExitStack() as stack:
+        stop = stack.enter_context(interruptible())
+        session = single.view(stack.enter_context(Session.open(file)))
+        known = _known(session, single)
+        if web:
+            process, page = viewer.open_server(viewer.WHOLE_IN_MEMORY)
+        else:
+            process, page = viewer.open_window(), ""
+        stack.enter_context(process)
+        if page:
+            process.wait_until_it_listens()
+            say(page)
+        # Rerun would tell a closed window as errors of its own, in colours.
+        os.environ.setdefault("RUST_LOG", "off")
+        from ..feed.numbers import Analysing
+        from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
+
+        analysing = stack.enter_context(Analysing(file, single.topics))
+        try:
+            with progress("view", total=steps(session)) as bar:
+                bar.update(0, note=_FIRST)
+                front = single.tab or "session"
+                task = Task(session, known, analysing, front, bar, begun=_make_way)
+                notes = show_session(task, process, stop)
+        except NoLongerWantedError:
+            return
+        say(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
+        for note in notes:
+            say(f"note: {note}")
+        process.wait(stop)
+
+
+def _make_way() -> None:
+    """Have what is looked at go before what is converted."""
+    os.nice(max(_NICENESS - os.nice(0), 0))
+
+
+def _known(session: SessionView, single: SingleOptions) -> Layer:
+    """What results say of it."""
+    if not single.result:
+        return Layer(None)
+    from ..feed.numbers import found_before
+
+    return found_before(session, single.result)

@@ -1,1 +1,0 @@
-"""What a recording for Rerun contains, by name."""

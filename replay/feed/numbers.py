@@ -1,0 +1,246 @@
+"""Results as a layer over a session: computed now, or those that were saved.
+
+``undulog analyse``, with one session or several, and ``undulog compare`` save what they found; a
+session that they speak of can be seen with it. Modules that a test names carry a mark on the body,
+at their bars and below the maps.
+
+A session's analysis in a process of its own, which can be ended at any time.
+
+It takes seconds and memory that the picture needs first; once it is done all of that is free.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from undulog.analysis.present.notebook.files import load
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.results.comparison import Comparison
+from undulog.analysis.results.experiment import Experiment
+from undulog.analysis.results.formats import told_p
+from undulog.analysis.results.null_model import ModelledAnalysis
+from undulog.analysis.session.analyse import measure_session
+from undulog.analysis.session.cycles import cycle_maps
+from undulog.analysis.signals.stretch import Options
+from undulog.capture import Session, SessionView
+from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
+
+from ..samples.content import Layer, Named
+
+_NICENESS = 10
+
+
+class Analysing:
+    """An analysis that is on its way."""
+
+    def __init__(self, path: Path, topics: tuple[str, str]) -> None:
+        """Prepare it.
+
+        Args:
+            path: The session.
+            topics: JointState topics of its commands and responses.
+        """
+        self._arguments = [str(path), *topics]
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answer = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115
+
+    def __enter__(self) -> Self:
+        """Nothing to do: it is started when there is time for it."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()  # it has nothing to put in order
+            self._process.wait()
+        self._answer.close()
+        self._said.close()
+
+    def start(self) -> None:
+        """Start it, unless it has been."""
+        if self._process is None:
+            self._process = subprocess.Popen(  # noqa: S603  our own arguments
+                # -P: a file of the user's in this folder is not to be taken for one of ours.
+                [sys.executable, "-P", "-m", __name__, *self._arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=self._answer,
+                stderr=self._said,
+                process_group=0,  # a Ctrl-C ends it through us
+            )
+
+    @property
+    def layer(self) -> Layer | None:
+        """What it found; None while it isn't done, and a note where it failed."""
+        if self._process is None or self._process.poll() is None:
+            return None
+        code = self._process.returncode
+        if code:
+            self._said.seek(0)
+            lines = self._said.read().decode(errors="replace").split("\n")
+            last = next((line for line in reversed(lines) if line.strip()), "")
+            why = f": {last.strip()}" if last else ""
+            return Layer(None, notes=(f"not analysed: the analysis ended with {code}{why}",))
+        self._answer.seek(0)
+        layer: Layer = pickle.load(self._answer)  # noqa: S301  of our own process
+        return layer
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Analyse, and write what was found to standard output.
+
+    Args:
+        arguments: The session's path, the topics of commands and responses.
+    """
+    os.nice(_NICENESS)
+    from undulog.analysis.signals.stretch import Options
+
+    path, command, response = arguments
+    options = Options(command_topic=command, response_topic=response)
+    folder = Path(tempfile.gettempdir())  # its columns lie there in files without names
+    with Session.open(path, column_folder=folder) as session:
+        layer = computed(session, options)
+    pickle.dump(layer, sys.stdout.buffer)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
+
+
+def computed(session: SessionView, options: Options | None = None) -> Layer:
+    """Analyse a session now; one without a gait can be seen too.
+
+    Args:
+        session: The session, open.
+        options: Where its joints are; None for the topics of the log contract.
+
+    Returns:
+        The layer, with a note where there are no numbers.
+    """
+    try:
+        measured = measure_session(session, options)
+    except MissingChannelError as error:
+        # What is there is listed, and one of it may be what was looked for.
+        name = "name them with --command-topic and --response-topic"
+        return Layer(None, notes=(f"not analysed: {error}; {name}",))
+    except UndulogError as error:
+        return Layer(None, notes=(f"not analysed: {error}",))
+    analysis = measured.analysis
+    return Layer(analysis, cycle_maps(measured) if analysis.over_time is None else None)
+
+
+def saved(session: SessionView, paths: Sequence[Path], options: Options | None = None) -> Layer:
+    """Read what was found of a session before.
+
+    Args:
+        session: The session, open.
+        paths: Results, JSON: of the session, of an experiment or a comparison that it is part of.
+        options: As for :func:`computed`, where no result holds numbers.
+
+    Returns:
+        The layer; its numbers are computed now where no result holds them.
+
+    Raises:
+        InputFileError: If a file can't be read.
+        DataError: If one holds no result, one that names no session, one of other sessions, or a
+            second one with numbers of this session.
+    """
+    known = found_before(session, paths)
+    return known if known.analysis is not None else known.with_numbers(computed(session, options))
+
+
+def found_before(session: SessionView, paths: Sequence[Path]) -> Layer:
+    """Read what was found of a session before, and compute nothing.
+
+    Args:
+        session: The session, open.
+        paths: As for :func:`saved`.
+
+    Returns:
+        The layer; without numbers where no result holds them.
+
+    Raises:
+        InputFileError: As :func:`saved`.
+        DataError: As :func:`saved`.
+    """
+    analysis: Analysis | None = None
+    named: dict[str, list[str]] = {}
+    notes: list[str] = []
+    for path in paths:
+        result = load(path)
+        if not isinstance(result, (Analysis, Experiment, Comparison)):
+            kind = type(result).__name__
+            raise DataError(
+                f"{path}: a {kind} names no session; give the result that it is part of"
+            )
+        own = _own(result, session, path)
+        if own is not None and analysis is not None:
+            raise DataError(f"{path}: the second result with numbers of this session; give one")
+        analysis = own or analysis
+        if own is not None:
+            notes.append(f"gain, lag and energy are those of {path.name}")
+        for one in (
+            *_named(result),
+            *(_named(own) if own is not None and own is not result else ()),
+        ):
+            named.setdefault(one.joint, []).append(f"{one.why} ({path.name})")
+    found = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
+    return Layer(analysis, named=found, notes=tuple(notes))
+
+
+def _own(
+    result: Analysis | Experiment | Comparison, session: SessionView, path: Path
+) -> Analysis | None:
+    """The session's own numbers in a result, or None where it only compares."""
+    if isinstance(result, Analysis):
+        known = [result.session.id]
+    elif isinstance(result, Experiment):
+        known = [one.session.id for one in result.sessions]
+    else:
+        known = [one.id for one in (*result.a, *result.b)]
+    if session.session_id not in known:
+        raise DataError(
+            f"{path}: a result of {_listed(known)}; the session is {session.session_id}, so give "
+            "the result of that one"
+        )
+    if isinstance(result, Analysis):
+        return result
+    if isinstance(result, Experiment):
+        return result.sessions[known.index(session.session_id)]
+    return None
+
+
+def _listed(ids: Sequence[str]) -> str:
+    few = ", ".join(ids[:3])
+    return f"session{'s' * (len(ids) > 1)} {few}{' and others' * (len(ids) > 3)}"
+
+
+def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
+    if isinstance(result, Experiment) and result.reversal is not None:
+        for pair in result.reversal.pairs:
+            how = "less gain" if pair.by == "gain" else "more lag"
+            floor = "" if result.reversal.tilt.excluded else ", or the floor is tilted"
+            why = f"{how} than its mirror joint {pair.mirror}, {told_p(pair.p)}{floor}"
+            yield Named(pair.name, why)
+    elif isinstance(result, Comparison):
+        for joint in result.named:
+            if joint.size >= 1.0:  # in margins: what differs by less is there, but small
+                yield Named(joint.name, f"answers differently in A and B, {told_p(joint.p_holm)}")
+    elif isinstance(result, ModelledAnalysis):
+        test = result.null_model
+        for module in test.modules:
+            if module.name in test.named:
+                yield Named(module.name, f"deviates from the others' model, {told_p(module.p)}")

@@ -1,1 +1,0 @@
-"""The body as GIF or MP4."""

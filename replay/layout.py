@@ -1,0 +1,430 @@
+"""The views: the body, plots of a stretch about the time cursor, cycles, and the mean cycle.
+
+A plot of a whole hour of samples is slow and shows nothing, so every such plot has a window; what
+has one value a cycle is plotted whole. Only what the session holds gets a view.
+
+The layout, made for a laptop's 1440 x 900: a tab each for session, cycles and mean cycle.
+
+In the session's the body is on the left and plots are on the right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+from rerun.encodings import EntityPathLike
+
+from undulog.capture.robot.model import Plane, Robot
+
+from .draw import facts
+from .draw.cycles import mean_cycle
+from .draw.cycles.heat_maps import VISIBLE
+from .draw.cycles.steps import SEGMENTS
+from .draw.plots import gait, joints
+from .draw.scene import body
+from .draw.scene import stage as trail
+from .draw.scene.body import body_title
+from .samples import content as entities
+from .samples.content import Content, Series, Start, Tab
+from .samples.timeline import ENSEMBLE_CYCLE, GAIT_CYCLE, SESSION_TIME
+
+BEFORE_CURSOR_S = 4.0
+AFTER_CURSOR_S = 2.0
+
+_ALL = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
+
+_BACKGROUND = rrb.Background(color=(16, 18, 22, 255))
+
+
+@dataclass(frozen=True)
+class Views:
+    """All views of a recording.
+
+    Attributes:
+        scene: The body in space, or None.
+        mode: The gait's mode, or None.
+        words: Facts and events.
+        angles: Joint angles.
+        effort: Power and whatever else the joints report.
+        bars: Response of each joint.
+        maps: Segments against cycles.
+        steps: Cycle by cycle.
+        mean_scene: The body in the mean cycle, or None.
+        mean_words: What the mean cycle is.
+        mean_plots: Its angles and power.
+    """
+
+    scene: rrb.Spatial3DView | None
+    mode: rrb.StateTimelineView | None
+    words: tuple[rrb.View, ...]
+    angles: tuple[rrb.View, ...]
+    effort: tuple[rrb.View, ...]
+    bars: tuple[rrb.View, ...]
+    maps: tuple[rrb.View, ...] = ()
+    steps: tuple[rrb.View, ...] = ()
+    mean_scene: rrb.Spatial3DView | None = None
+    mean_words: rrb.TextDocumentView | None = None
+    mean_plots: tuple[rrb.View, ...] = ()
+
+    @property
+    def all(self) -> tuple[rrb.View, ...]:
+        """Every view, in reading order."""
+        session = (self.scene, self.mode, *self.words, *self.angles, *self.effort, *self.bars)
+        mean = (self.mean_scene, self.mean_words, *self.mean_plots)
+        found = (*session, *self.maps, *self.steps, *mean)
+        return tuple(view for view in found if view is not None)
+
+
+def build_views(content: Content) -> Views:
+    """The views of what a recording holds.
+
+    Args:
+        content: What it holds.
+
+    Returns:
+        The views.
+    """
+    words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
+    if content.has_events:
+        words.append(rrb.TextLogView(name="Events", contents=[f"{gait.EVENTS}/**"]))
+    mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
+    angles, effort = _angle_views(content), _effort_views(content)
+    if content.live:  # nothing comes after the cursor
+        for plot in (*angles, *effort):
+            plot.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
+    return Views(
+        scene=None if content.start is None else _body_view(content, content.start),
+        mode=mode if content.modes else None,
+        words=tuple(words),
+        angles=tuple(angles),
+        effort=tuple(effort),
+        bars=tuple(_bar_views(content)),
+        maps=tuple(_map_views(content)),
+        steps=tuple(_step_views(content)),
+        mean_scene=_mean_scene(content),
+        mean_words=None
+        if content.mean is None
+        else rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT]),
+        mean_plots=tuple(_mean_plots(content)),
+    )
+
+
+def _body_view(content: Content, start: Start) -> rrb.Spatial3DView:
+    robot = content.robot
+    span = sum(link.length for link in robot.links) if robot is not None else 1.0
+    # From behind its right shoulder and above, where the wave shows along the whole body.
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=_beside(start, (-0.92 * span, -0.55 * span, 0.65 * span)),
+        look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
+        eye_up=(0.0, 0.0, 1.0),
+        tracking_entity=body.MEASURED,
+    )
+    tail_time = rrb.VisibleTimeRange(
+        SESSION_TIME,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-trail.TRAIL_SECONDS),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    return rrb.Spatial3DView(
+        name=body_title(content),
+        origin="/world",
+        eye_controls=eye,
+        background=_BACKGROUND,
+        line_grid=_grid(span),
+        overrides={trail.TRAIL: rrb.VisibleTimeRanges([tail_time])},
+    )
+
+
+def _mean_scene(content: Content) -> rrb.Spatial3DView | None:
+    if content.mean is None or not content.mean.has_body or content.robot is None:
+        return None
+    span = sum(link.length for link in content.robot.links)
+    # The frame goes along with the body: its middle stays where it is.
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=(-0.35 * span, -0.6 * span, 0.75 * span),
+        look_target=(0.0, 0.0, 0.0),
+        eye_up=(0.0, 0.0, 1.0),
+    )
+    return rrb.Spatial3DView(
+        name="Mean cycle: body",
+        origin=mean_cycle.BODY,
+        eye_controls=eye,
+        background=_BACKGROUND,
+        line_grid=_grid(span),
+    )
+
+
+def _grid(span: float) -> rrb.LineGrid3D:
+    return rrb.LineGrid3D(
+        visible=True,
+        spacing=_grid_spacing(span),
+        stroke_width=1.0,
+        color=(255, 255, 255, 12),
+    )
+
+
+def _beside(start: Start, offset: tuple[float, float, float]) -> tuple[float, float, float]:
+    """A point given forward, left and up of the head at the start [m]."""
+    cos, sin = math.cos(start.heading), math.sin(start.heading)
+    x, y, z = start.position
+    forward, left, up = offset
+    return (x + cos * forward - sin * left, y + sin * forward + cos * left, z + up)
+
+
+def _grid_spacing(span: float) -> float:
+    """A length that can be read off: at most a fifth of the body [m]."""
+    steps = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
+    return next((step for step in steps if step <= 0.2 * span), 0.01)
+
+
+def _effort_views(content: Content) -> list[rrb.View]:
+    found: list[rrb.View] = []
+    if content.has_power:
+        found.append(_plot("Power [W]", [f"{entities.TOTAL}/**"]))
+    if content.joint_power:
+        found.append(_joint_plot("Joint power [W]", content.joint_power, None))
+    found += [
+        _joint_plot(signal.title, signal.series, None, legend=not signal.of_joints)
+        for signal in content.signals
+    ]
+    return found
+
+
+def _bar_views(content: Content) -> list[rrb.View]:
+    return [
+        rrb.BarChartView(
+            name=chart.title,
+            contents=[f"{SEGMENTS}/{chart.key}/**"],
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        for chart in content.charts
+    ]
+
+
+def _map_views(content: Content) -> list[rrb.View]:
+    return [
+        rrb.Spatial2DView(
+            name=shown.title,
+            origin=shown.entity,
+            visual_bounds=rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1]),
+        )
+        for shown in content.maps
+    ]
+
+
+def _step_views(content: Content) -> list[rrb.View]:
+    return [
+        _whole_plot(f"{quantity.name} by cycle [{quantity.unit}]", [one.entity for one in series])
+        for quantity, series in content.cycles
+    ]
+
+
+def _mean_plots(content: Content) -> list[rrb.View]:
+    mean = content.mean
+    if mean is None:
+        return []
+    found: list[rrb.View] = []
+    if mean.has_places:
+        corner = rrb.Corner2D.LeftBottom  # where a sine isn't
+        contents = [f"{mean_cycle.PLACES}/**"]
+        found.append(_whole_plot("Mean angle [°]", contents, legend=corner))
+    plane = None if content.places is None else content.places.plane
+    names = None if plane is None else _names(content.robot, plane)
+    for title, series in (
+        ("Mean angle of all joints [°]", mean.measured),
+        ("Mean error [°]", mean.error),
+        ("Mean power [W]", mean.power),
+    ):
+        if series:
+            shown = None if series is mean.power else names
+            contents = [one.entity for one in series]
+            found.append(_whole_plot(title, contents, overrides=_lines(series, shown)))
+    return found
+
+
+def _angle_views(content: Content) -> list[rrb.View]:
+    views: list[rrb.View] = []
+    if content.places is not None:
+        three = len(content.places.names) == 3
+        title = "Head, middle, tail [°]" if three else "Angle [°]"
+        views.append(_plot(title, [f"{joints.PLACES}/**"]))
+    for plane in Plane:
+        names = _names(content.robot, plane)
+        if names & {name for series in content.measured for name in series.names}:
+            views.append(_joint_plot(f"{plane.capitalize()} [°]", content.measured, names))
+    if content.robot is None and content.measured:
+        views.append(_joint_plot("Measured [°]", content.measured, None))
+    if content.errors:
+        plane = None if content.places is None else content.places.plane
+        names = None if plane is None else _names(content.robot, plane)
+        views.append(_joint_plot("Error [°]", content.errors, names))
+    if not views and content.commanded:
+        views.append(_joint_plot("Commanded [°]", content.commanded, None))
+    return views
+
+
+def _names(robot: Robot | None, plane: Plane) -> set[str]:
+    if robot is None:
+        return set()
+    return {joint.name for joint in robot.joints if joint.plane is plane}
+
+
+def _joint_plot(
+    title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
+) -> rrb.TimeSeriesView:
+    """A line a joint; ``names`` chooses the lines that are visible at first."""
+    contents = [one.entity for one in series]
+    return _plot(title, contents, overrides=_lines(series, names), legend=legend)
+
+
+def _lines(
+    series: Sequence[Series], names: set[str] | None
+) -> dict[EntityPathLike, rrb.Visualizer]:
+    return {
+        one.entity: rr.SeriesLines.from_fields(
+            visible_series=[names is None or name in names for name in one.names]
+        ).visualizer(
+            mappings=[
+                VisualizerComponentMapping(
+                    "Scalars:scalars",
+                    ComponentSourceKind.SourceComponent,
+                    source_component=one.component,
+                )
+            ]
+        )
+        for one in series
+    }
+
+
+def _whole_plot(
+    title: str,
+    contents: list[str],
+    *,
+    overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
+    legend: rrb.Corner2D | None = None,
+) -> rrb.TimeSeriesView:
+    """All there is on its timeline, whatever the cursor does."""
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=contents,
+        overrides=overrides,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=rrb.TimeAxis(view_range=_ALL),
+    )
+
+
+def _plot(
+    title: str,
+    contents: list[str],
+    *,
+    overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
+    legend: bool = True,
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=contents,
+        overrides=overrides,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        time_ranges=_window(BEFORE_CURSOR_S, AFTER_CURSOR_S),
+    )
+
+
+def _window(before_s: float, after_s: float) -> rrb.VisibleTimeRanges:
+    return rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange(
+                timeline,
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s),
+                end=rrb.TimeRangeBoundary.cursor_relative(seconds=after_s),
+            )
+            for timeline in (SESSION_TIME, GAIT_CYCLE)
+        ]
+    )
+
+
+def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
+    """Lay out the views of what a recording holds.
+
+    Args:
+        content: What it holds.
+        front: The tab in front; the session's where the recording has no such tab. In front, the
+            mean cycle plays on its own timeline.
+
+    Returns:
+        The blueprint, with the viewer's own panels folded away; it opens playing, or
+        following the end of what still grows.
+    """
+    views = build_views(content)
+    tabs: dict[Tab, rrb.Container] = {"session": _session(content, views)}
+    if views.maps or views.steps:
+        rows = [rrb.Horizontal(*row) for row in (views.maps, views.steps) if row]
+        shares = [1.35, 1.0][: len(rows)]
+        tabs["cycles"] = rrb.Vertical(*rows, row_shares=shares, name="Cycles")
+    if views.mean_plots and views.mean_words is not None:
+        tabs["mean-cycle"] = _mean(views, views.mean_words)
+    shown: Tab = front if front in tabs else "session"
+    root = tabs[shown]
+    if len(tabs) > 1:
+        root = rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(shown))
+    timeline = ENSEMBLE_CYCLE if shown == "mean-cycle" else SESSION_TIME
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        _time_panel(content, timeline),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _session(content: Content, views: Views) -> rrb.Container:
+    # A mode that never changes isn't worth a lane of its own.
+    lane = [views.mode] if views.mode is not None and content.modes > 1 else []
+    words = [*views.words, *([views.mode] if views.mode is not None and not lane else [])]
+    plots: list[rrb.View | rrb.Container] = [
+        _tabs(group) for group in (views.angles, views.effort) if group
+    ]
+    heights = [3.0, 2.4][: len(plots)]
+    if views.bars:
+        plots.append(rrb.Horizontal(*views.bars))
+        heights.append(3.0)
+    if views.scene is None:
+        shares = [*heights, *[0.8] * len(lane), 2.0]
+        return rrb.Vertical(*plots, *lane, _tabs(words), row_shares=shares, name="Session")
+    shares = [3.2, *[0.62] * len(lane), 1.1]
+    left = rrb.Vertical(views.scene, *lane, _tabs(words), row_shares=shares)
+    right = rrb.Vertical(*plots, row_shares=heights)
+    return rrb.Horizontal(left, right, column_shares=[1.1, 1.0], name="Session")
+
+
+def _mean(views: Views, words: rrb.TextDocumentView) -> rrb.Container:
+    first, *others = views.mean_plots
+    plots = [first, _tabs(others)] if others else [first]
+    right = rrb.Vertical(*plots)
+    left = words
+    if views.mean_scene is not None:
+        left = rrb.Vertical(views.mean_scene, words, row_shares=[2.6, 1.0])
+    return rrb.Horizontal(left, right, column_shares=[1.1, 1.0], name="Mean cycle")
+
+
+def _time_panel(content: Content, timeline: str) -> rrb.TimePanel:
+    if content.live:
+        return rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline=timeline,
+        play_state="playing",
+        loop_mode="all",
+        # The one timeline of numbers is that of the mean cycle's degrees: at the gait's own speed.
+        fps=None if content.mean is None else 360.0 / content.mean.period_s,
+    )
+
+
+def _tabs(views: Sequence[rrb.View]) -> rrb.View | rrb.Tabs:
+    return views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0)

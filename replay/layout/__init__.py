@@ -1,1 +1,0 @@
-"""Views and tabs of the viewer."""

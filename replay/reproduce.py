@@ -1,0 +1,318 @@
+"""Recorded commands once more, at their own times, into the twin of the session's robot.
+
+Are two sessions the same, message by message? And where not: from when on?
+
+A twin under the same commands in the same world gives the same bytes. Where something was changed,
+the first message that differs says from when on it mattered.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from undulog.analysis.compare.compare import compare_sessions
+from undulog.analysis.results.comparison import Comparison
+from undulog.analysis.signals.columns import RESPONSE_TOPIC
+from undulog.capture import Session, SessionView, load_robot
+from undulog.capture.common.console import emit_json, say
+from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
+from undulog.capture.common.process import StopRequest
+from undulog.capture.log.edit.raw_messages import RawLog, RawMessage
+from undulog.sim.commands.drive_bus import drive_armed, drive_on_bus
+from undulog.sim.drive.in_process import drive_twin
+from undulog.sim.drive.motion import Driven, find_driven
+from undulog.sim.drive.over_bus import bus_address
+from undulog.sim.scenario.scenario import Scenario
+from undulog.sim.scenario.scenario_file import load_scenario
+from undulog.sim.twin.recording import Recording
+from undulog.sim.twin.twin import Sample
+
+EVENTS = "/rosout"
+"""Events are said in words, which may name what was changed: they are not compared."""
+
+_ALWAYS = 1 << 64
+
+
+@dataclass(frozen=True)
+class Sameness:
+    """What two sessions have alike.
+
+    Attributes:
+        same: Topics whose messages are the same: times, numbers and bytes.
+        differs_s: Topic to the time of its first message that differs, from the session's start
+            [s]; a message that only one session has differs.
+        one_sided: Topics that only one session has.
+        messages: Messages that were looked at, of the first session.
+    """
+
+    same: tuple[str, ...]
+    differs_s: dict[str, float]
+    one_sided: tuple[str, ...]
+    messages: int
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing differs."""
+        return not (self.differs_s or self.one_sided)
+
+
+def sameness(one: Path, other: Path) -> Sameness:
+    """Hold two sessions against each other, topic by topic.
+
+    Args:
+        one: A session.
+        other: Another one, of the same time.
+
+    Returns:
+        What is the same.
+
+    Raises:
+        LogError: If one can't be read.
+    """
+    with RawLog(one) as first, RawLog(other) as second:
+        ids = [
+            {channel.topic: key for key, channel in log.file.channels.items()}
+            for log in (first, second)
+        ]
+        topics = [topic for topic in ids[0] if topic in ids[1] and topic != EVENTS]
+        same: list[str] = []
+        differs_s: dict[str, float] = {}
+        messages = 0
+        for topic in topics:
+            pairs = zip_longest(_told(first, ids[0][topic]), _told(second, ids[1][topic]))
+            for a, b in pairs:
+                messages += a is not None
+                if a != b:
+                    at_ns = min(told[0] for told in (a, b) if told is not None)
+                    differs_s[topic] = (at_ns - first.start_ns) * 1e-9
+                    break
+            else:
+                same.append(topic)
+        one_sided = tuple(sorted(({*ids[0]} ^ {*ids[1]}) - {EVENTS}))
+    return Sameness(tuple(same), differs_s, one_sided, messages)
+
+
+def _told(log: RawLog, channel_id: int) -> Iterator[tuple[int, int, bytes]]:
+    """Log time, publish time and bytes of a channel's messages."""
+    message: RawMessage
+    for message in log.messages({channel_id}, 0, _ALWAYS):
+        yield message.log_time_ns, message.publish_time_ns, message.data
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """What is to be run again, and where.
+
+    Attributes:
+        original: The session that commands are taken from.
+        driven: Its commands.
+        scenario: The world that they are given in.
+    """
+
+    original: Path
+    driven: Driven
+    scenario: Scenario
+
+
+@dataclass(frozen=True)
+class Again:
+    """An experiment that was run again.
+
+    Attributes:
+        original: The session that commands were taken from.
+        scenario: Where they were given again.
+        recording: The new session.
+        same: What of it is the same to the last bit; None where the first is no run of the twin.
+        comparison: What differs as the analysis has it; None where it can't be told.
+        not_compared: Why it can't.
+    """
+
+    original: Path
+    scenario: Scenario
+    recording: Recording
+    same: Sameness | None
+    comparison: Comparison | None
+    not_compared: str | None
+
+
+def find_repetition(
+    original: Path,
+    world: str | None = None,
+    changes: Mapping[str, Any] | None = None,
+    duration_s: float | None = None,
+) -> Repetition:
+    """Find a session's commands, and a world for them.
+
+    Args:
+        original: The session.
+        world: A scenario's name or file; the world that the session was recorded in if None.
+        changes: Keys of the world's scenario, with dots, to the values that they are to have.
+        duration_s: How long [s]; as long as there are commands if None.
+
+    Returns:
+        What is to be run.
+
+    Raises:
+        UsageError: If no world is known.
+        ScenarioError: If the world has faults, or a change is none of its values.
+        DataError: If the commands are of another robot, or of none.
+        LogError: If the session can't be read, or has no commands.
+    """
+    there = None if world is None else load_scenario(world, changes)
+    driven = find_driven(str(original), there, changes)
+    return Repetition(original, driven, driven.scenario(there, duration_s))
+
+
+def replay_in_twin(
+    repetition: Repetition,
+    output: Path,
+    *,
+    force: bool = False,
+    stop: StopRequest | None = None,
+    on_sample: Callable[[Sample], None] | None = None,
+) -> Again:
+    """Give a session's commands to the twin again, record it, and compare.
+
+    Args:
+        repetition: What, and where.
+        output: The session to write.
+        force: Replace an existing file.
+        stop: Looked at between samples: the joints come to rest, then the run ends.
+        on_sample: Told of each sample after it was written.
+
+    Returns:
+        How it went.
+
+    Raises:
+        SimulationError: If the twin's state becomes impossible.
+        OutputExistsError: If the file is there and ``force`` is not given.
+        LogWriteError: If the new session can't be written.
+        ImportError: If the kernels of the first run are not installed.
+    """
+    recording = drive_twin(
+        repetition.driven, repetition.scenario, output, force=force, stop=stop, on_sample=on_sample
+    )
+    with Session.open(repetition.original) as first, Session.open(output) as second:
+        of_twin = "physics_rate_hz" in first.metadata.get("undulog", {})
+        comparison, why = compared(first, second)
+    same = sameness(repetition.original, output) if of_twin else None
+    return Again(repetition.original, repetition.scenario, recording, same, comparison, why)
+
+
+def compared(first: SessionView, second: SessionView) -> tuple[Comparison | None, str | None]:
+    """Hold a run against the one that its commands were taken from.
+
+    Args:
+        first: That one.
+        second: The new one.
+
+    Returns:
+        What differs; or None, and why that can't be told, e.g. of a run shorter than two cycles.
+    """
+    if RESPONSE_TOPIC not in first.channels:
+        return None, f"{first.path.name} has commands and no response ({RESPONSE_TOPIC})"
+    try:
+        return compare_sessions(first, second), None
+    except (DataError, MissingChannelError) as error:
+        return None, str(error)
+
+
+def what_next(original: Path, again: Path, *, comparable: bool) -> list[str]:
+    """What to do with a session and its repetition.
+
+    Args:
+        original: The session.
+        again: The new one.
+        comparable: Whether they can be compared.
+
+    Returns:
+        Commands, ready to be typed, a line each.
+    """
+    both = shlex.join([str(original), str(again)])
+    verbs = ("view", "compare") if comparable else ("view",)
+    leads = ("Next: ", "      ")
+    return [f"{lead}undulog {verb} {both}" for lead, verb in zip(leads, verbs, strict=False)]
+
+
+def replay_on_bus(
+    file: Path,
+    on: str,
+    show: Callable[[Comparison], None],
+    *,
+    arm: bool = False,
+    robot: str | None = None,
+    duration_s: float | None = None,
+    output: Path | None = None,
+    recorder: Path | None = None,
+    force: bool = False,
+    as_json: bool = False,
+) -> int:
+    """Give a session's commands again on a bus, and say how it went and what differs.
+
+    Args:
+        file: The session.
+        on: The bus.
+        show: Prints a comparison.
+        arm: Whether commands are sent; a dry run in the twin if not.
+        robot: The robot on the bus, a name or a file; the session's own if None.
+        duration_s: How long [s]; as long as there are commands if None.
+        output: The session to write; a dry run needs none.
+        recorder: Control socket of a recorder that is told the gait; the only one that runs if
+            None.
+        force: Replace an existing session.
+        as_json: Report as one JSON object.
+
+    Returns:
+        The exit code: 0 if it ran to its end, 1 if not.
+
+    Raises:
+        UsageError: If something of it can't be, e.g. the session is of another joint set.
+        SourceError: If nobody is there, or the robot is no robot to start with.
+        LogError: If the session can't be read, or has no commands.
+    """
+    bus_address(on)
+    described = load_robot(robot) if robot is not None else None
+    driven = find_driven(str(file), robot=described)
+    if driven.kind != "commands":
+        raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
+    if not arm:
+        return drive_on_bus(
+            driven,
+            on,
+            arm=False,
+            robot=described,
+            duration_s=duration_s,
+            output=output,
+            recorder=recorder,
+            force=force,
+            as_json=as_json,
+        )
+    run = drive_armed(
+        driven,
+        on,
+        robot=described,
+        duration_s=duration_s,
+        output=output,
+        recorder=recorder,
+        force=force,
+    )
+    comparison, why = None, "it did not run to its end"
+    if run.complete:
+        with Session.open(file) as first, Session.open(run.plan.output) as second:
+            comparison, why = compared(first, second)
+    if as_json:
+        told = None if comparison is None else comparison.to_dict()
+        emit_json({"original": str(file), **run.facts(), "comparison": told, "not_compared": why})
+    else:
+        say(*run.lines())
+        if comparison is not None:
+            show(comparison)
+        elif run.complete:
+            say(f"Not compared: {why}")
+        say(*what_next(file, run.plan.output, comparable=comparison is not None))
+    return run.complain()

@@ -1,0 +1,356 @@
+"""What a recording holds: decides which views there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from undulog.analysis.results.analysis import Analysis
+from undulog.analysis.results.formats import decimals_for_values, number
+from undulog.analysis.session.cycles import CycleMaps
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.palette import COMMANDED_RGB
+from undulog.capture.robot.model import Plane, Robot
+
+COMMANDED = "/joints/commanded"
+MEASURED = "/joints/measured"
+ERROR = "/joints/error"
+SCALARS = "Scalars:scalars"
+
+Color = tuple[int, int, int, int]
+
+GREY: Color = (*COMMANDED_RGB, 255)
+"""The grey of everything commanded."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """An entity with one plotted line a joint.
+
+    Attributes:
+        entity: Its path.
+        names: The lines' names.
+        component: The component that is plotted.
+    """
+
+    entity: str
+    names: tuple[str, ...]
+    component: str = SCALARS
+
+
+@dataclass(frozen=True)
+class Places:
+    """The joints that stand for head, middle and tail.
+
+    Attributes:
+        names: One to three joint names, head to tail.
+        plane: The plane they bend, or None where no robot says.
+    """
+
+    names: tuple[str, ...]
+    plane: Plane | None
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """``head``, ``middle`` and ``tail``, or the joints' names where there are fewer."""
+        return ("head", "middle", "tail") if len(self.names) == 3 else self.names
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a table of cycles holds.
+
+    Attributes:
+        key: Last part of its entity's path, with the unit.
+        name: Its name.
+        unit: The unit in which it is shown.
+    """
+
+    key: str
+    name: str
+    unit: str
+
+
+GAIN = Quantity("gain_minus_one_percent", "Gain − 1", "%")
+LAG = Quantity("lag_degrees", "Lag", "°")
+ENERGY = Quantity("energy_net_joule", "Net energy", "J/cycle")
+
+
+@dataclass(frozen=True)
+class CycleTable:
+    """One quantity of m joints that share their c cycles.
+
+    Attributes:
+        quantity: What it is.
+        names: The joints, head to tail.
+        start_s: Start of each cycle, from the session's start [s], shape (c,).
+        stop_s: Its end [s], shape (c,).
+        value: In the quantity's unit, NaN where the cycle tells nothing, shape (m, c).
+    """
+
+    quantity: Quantity
+    names: tuple[str, ...]
+    start_s: FloatArray
+    stop_s: FloatArray
+    value: FloatArray
+
+
+NAMED = (255, 95, 190, 255)
+"""Pink of a module that a test names: on none of the maps."""
+
+
+MAPS = "/maps"
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """One map.
+
+    Attributes:
+        table: What it shows.
+        places: Number of each joint along the body, the head's joint is 1.
+        low: Value at the low end of the colours.
+        high: Value at the high end.
+        signed: Whether zero is in the middle of the colours.
+    """
+
+    table: CycleTable
+    places: tuple[int, ...]
+    low: float
+    high: float
+    signed: bool
+
+    @property
+    def entity(self) -> str:
+        """Path of its entities."""
+        return f"{MAPS}/{self.table.quantity.key}"
+
+    @property
+    def title(self) -> str:
+        """Name with the range of the colours and the unit."""
+        quantity = self.table.quantity
+        unit = quantity.unit if quantity.unit == "°" else f" {quantity.unit}"
+        low, high = self.ends
+        span = f"±{high}{unit}" if self.signed else f"{low} to {high}{unit}"
+        return f"{quantity.name} map, {span}"
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """The range of the colours in words."""
+        digits = decimals_for_values([self.low, self.high], 3)
+        return number(self.low, digits), number(self.high, digits)
+
+
+MECHANICAL = "/power/mechanical"
+TOTAL = "/power/total"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One joint's bar.
+
+    Attributes:
+        joint: The joint's name.
+        place: Its number along the body, the head's joint is 1.
+        value: Height.
+        far: The end of its 95 % interval that is farther from the baseline, or None.
+    """
+
+    joint: str
+    place: int
+    value: float
+    far: float | None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One bar chart.
+
+    Attributes:
+        key: Last part of its entity's path.
+        title: What it shows, with unit.
+        bars: A bar for each joint whose value could be computed.
+    """
+
+    key: str
+    title: str
+    bars: tuple[Bar, ...]
+
+
+@dataclass(frozen=True)
+class MeanCycle:
+    """The mean cycle that was written.
+
+    Attributes:
+        period_s: Length of a cycle [s].
+        has_body: Whether the body was drawn.
+        has_places: Whether the joints that stand for the body were.
+        measured: Mean angles [degrees].
+        error: Mean measured minus mean commanded angle [degrees].
+        power: Mean mechanical power [W].
+    """
+
+    period_s: float
+    has_body: bool
+    has_places: bool
+    measured: tuple[Series, ...]
+    error: tuple[Series, ...]
+    power: tuple[Series, ...]
+
+
+@dataclass(frozen=True)
+class Named:
+    """A module that a test names.
+
+    Attributes:
+        joint: Its joint.
+        why: What is said of it, without a stop.
+    """
+
+    joint: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What is known of a session beside its samples.
+
+    Attributes:
+        analysis: Its numbers, or None.
+        steady: Cycles of its steady gait, where no phase was logged and they were computed now.
+        named: Modules that tests name, each once.
+        notes: Where it is from and what is missing, a sentence each.
+    """
+
+    analysis: Analysis | None
+    steady: CycleMaps | None = None
+    named: tuple[Named, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def with_numbers(self, computed: Layer) -> Layer:
+        """Put numbers to what results say without them.
+
+        Args:
+            computed: The session's analysis, or a note why there is none.
+
+        Returns:
+            Both.
+        """
+        notes = (*self.notes, *computed.notes)
+        return Layer(computed.analysis, computed.steady, self.named, notes)
+
+
+Tab = Literal["session", "cycles", "mean-cycle"]
+"""The tabs of the layout."""
+
+
+_SHORT = {
+    "/joint_current": "Current",
+    "/joint_voltage": "Voltage",
+    "/joint_temperature": "Temperature",
+    "/joint_velocity": "Velocity",
+    "/energy_ledger": "Ledger",
+    "/joint_power/mechanical": "Mechanical power",
+    "/joint_power/mechanical_plus": "Mechanical power, positive part",
+    "/joint_power/electrical": "Electrical power",
+    "/joint_power/electrical_plus": "Electrical power, positive part",
+}
+_UNITS = {"degC": "°C"}
+
+
+def signal_title(topic: str, unit: str) -> str:
+    """A title short enough for a tab.
+
+    Args:
+        topic: A JointState topic.
+        unit: Of its values.
+
+    Returns:
+        For example ``Current [A]``; another make's topics keep their names.
+    """
+    return f"{_SHORT.get(topic, topic.lstrip('/'))} [{_UNITS.get(unit, unit)}]"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A quantity of all joints that is shown as logged.
+
+    Attributes:
+        title: What it is, with unit.
+        series: Where it was written.
+        of_joints: Whether its lines are the robot's joints, known by their colours; other lines
+            need a legend.
+    """
+
+    title: str
+    series: tuple[Series, ...]
+    of_joints: bool
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the camera finds the robot.
+
+    Attributes:
+        position: The head's first known position [m].
+        heading: Direction of the head there, about z [rad].
+    """
+
+    position: tuple[float, float, float]
+    heading: float
+
+
+@dataclass(frozen=True)
+class AwaitedMap:
+    """A map that is still to be computed.
+
+    Attributes:
+        entity: Path of its entities.
+        title: What it will show, with unit.
+    """
+
+    entity: str
+    title: str
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a recording holds.
+
+    Attributes:
+        robot: The robot, or None.
+        start: Where the robot starts, or None where no body is drawn.
+        power_limit_w: Power at which a segment's colour is full [W]; None if coloured by place.
+        places: Joints that stand for the body, or None without joints.
+        commanded: Commanded angles.
+        measured: Measured angles.
+        errors: Tracking errors.
+        has_power: Whether the body's total power was written.
+        joint_power: Mechanical power of the joints.
+        charts: Response bars.
+        modes: How often a gait mode began; 0 where none was logged.
+        has_events: Whether events were written.
+        signals: Further quantities of the joints.
+        live: Whether it still grows: the views follow its end.
+        cycles: Quantities that were written cycle by cycle, each with where.
+        maps: Maps of segments against cycles.
+        mean: The mean cycle, or None.
+    """
+
+    robot: Robot | None
+    start: Start | None
+    power_limit_w: float | None
+    places: Places | None
+    commanded: tuple[Series, ...]
+    measured: tuple[Series, ...]
+    errors: tuple[Series, ...]
+    has_power: bool
+    joint_power: tuple[Series, ...]
+    charts: tuple[Chart, ...]
+    modes: int
+    has_events: bool
+    signals: tuple[Signal, ...]
+    live: bool = False
+    cycles: tuple[tuple[Quantity, tuple[Series, ...]], ...] = ()
+    maps: tuple[HeatMap | AwaitedMap, ...] = ()
+    mean: MeanCycle | None = None

@@ -1,0 +1,361 @@
+"""The session of a drive over a bus: what was wanted, what was sent, and what came.
+
+Telling a running recorder what the controller means: ``/gait`` and ``/gait/mode``.
+
+The recorder answers once a tick of its own, so a thread asks: the control loop only leaves what is
+to be told. A recorder that goes, refuses or is slow never holds the loop up.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from undulog.capture.common.errors import ControlError
+from undulog.capture.log.messages.frames import FrameArray
+from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.wal.segment import require_space
+from undulog.capture.log.write.channels import StringChannel
+from undulog.capture.log.write.writer import SessionWriter
+from undulog.capture.recorder.bus_recorder import BusRecorder
+from undulog.capture.recorder.control_client import ControlClient
+from undulog.capture.recorder.source_clock import SourceClock
+from undulog.capture.robot.model import ClockDomain, Robot
+from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
+
+from ..gait.contract import GaitTick
+from ..gate.outcome import How, Outcome, Remark
+from ..twin.session_log import GAIT_UNIT
+from .loop import BusTick
+
+_MOST_HELD = 1000
+_AT_ONCE = 64
+_WAIT_S = 0.02
+_LAST_S = 5.0
+
+
+class GaitTeller:
+    """One connection to a recorder's control socket.
+
+    Attributes:
+        told: Samples of the gait that the recorder took.
+        dropped: Samples that it had no time for.
+        error: Why it is told nothing any more; None while it is.
+    """
+
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        """Connect.
+
+        Args:
+            path: The recorder's control socket.
+            names: Names of the gait's values.
+
+        Raises:
+            ControlError: If nobody listens there.
+        """
+        self.told = self.dropped = 0
+        self.error: str | None = None
+        self._client = ControlClient(path)
+        self._names = tuple(names)
+        self._mode = ""
+        self._held: deque[Mapping[str, Any]] = deque()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="undulog-gait", daemon=True)
+        self._thread.start()
+
+    def note(self, text: str, level: str = "info") -> None:
+        """Leave a remark for ``/rosout``.
+
+        Args:
+            text: What to say.
+            level: ``info``, ``warn`` or ``error``.
+        """
+        self._held.append({"do": "note", "text": text, "level": level})
+
+    def tell(self, tick: GaitTick, t_ns: int) -> None:
+        """Leave what the gait says, without waiting.
+
+        Args:
+            tick: What it says.
+            t_ns: From when on it holds [Unix ns].
+        """
+        if tick.mode != self._mode:
+            self._mode = tick.mode
+            self._held.append({"do": "mode", "text": tick.mode})
+        if not self._names or self.error is not None:
+            return
+        if len(self._held) >= _MOST_HELD:
+            self.dropped += 1
+            return
+        values: list[float] = tick.values.tolist()
+        told = [value if math.isfinite(value) else None for value in values]  # as JSON has it
+        named = dict(zip(self._names, told, strict=True))
+        self._held.append({"do": "gait", "values": named, "t_ns": t_ns})
+
+    def close(self) -> None:
+        """Tell what is left, for a few seconds, and disconnect; safe to call twice."""
+        self._ended.set()
+        self._thread.join(_LAST_S)
+        self._client.close()
+
+    def _run(self) -> None:
+        while self.error is None:
+            last = self._ended.wait(_WAIT_S)  # looked at before the deque: what is left comes first
+            while self._held and self.error is None:
+                count = min(len(self._held), _AT_ONCE)
+                batch = [self._held.popleft() for _ in range(count)]
+                try:
+                    self._client.ask_all(batch)
+                except ControlError as error:
+                    self.error = str(error)
+                else:
+                    self.told += sum(request["do"] == "gait" for request in batch)
+            if last:
+                return
+
+
+_EVENTS_OF = "drive"
+_DECODE_TICKS = 10  # many frames at once cost little more than a few
+_ROOM = 48 << 20
+"""So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute."""
+_LAST_WORDS = 4 << 20
+"""So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints."""
+
+
+class BusSession:
+    """Writes one drive; what was written survives the death of the process, and a full disk.
+
+    ``/joint_commands`` holds what was sent, before the bus rounds it, at the tick's own time;
+    ``/gate/wanted`` what was to be sent, before the gate changed anything; ``/gate/phase`` what the
+    gate was about. All frames are in it, both ways.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        robot: Robot,
+        bus: str,
+        clock: ClockDomain,
+        epoch_ns: int,
+        gait_names: tuple[str, ...],
+        facts: Mapping[str, str],
+        settle_s: float | None,
+        attachments: Mapping[str, bytes],
+        records: Mapping[str, Mapping[str, str]],
+        force: bool = False,
+    ) -> None:
+        """Open the session.
+
+        Args:
+            path: The file to create.
+            robot: Whose bus it is.
+            bus: The bus's name.
+            clock: Whose clock the frames' device times are on.
+            epoch_ns: Unix time of its start [ns].
+            gait_names: Names of the gait's values.
+            facts: For the metadata.
+            settle_s: The first part of the gait that is not fit for steady-state analysis [s],
+                None where it isn't known.
+            attachments: File name to TOML text that explains what is driven.
+            records: Other metadata records that explain it, by name.
+            force: Replace an existing file.
+
+        Raises:
+            OutputExistsError: If the file is there and ``force`` is not given, or what a drive
+                that was killed left of it.
+            LogWriteError: If it can't be created, or there is no room for it.
+            DataError: If the robot has no bus.
+        """
+        require_space(path, _ROOM)
+        self._sink = DurableSink(path, force=force, last_words=_LAST_WORDS)
+        self.writer = SessionWriter(
+            path,
+            session_id=uuid.uuid4().hex,
+            epoch_ns=epoch_ns,
+            robot=robot,
+            clock={bus: clock},
+            metadata=facts,
+            sink=self._sink,
+        )
+        self.writer.explain(attachments, records)
+        names = robot.joint_names
+        self._commands = self.writer.joint_state("/joint_commands", names, unit="rad")
+        self._wanted = self.writer.joint_state("/gate/wanted", names, unit="rad")
+        self._gait = (
+            self.writer.joint_state("/gait", gait_names, unit=GAIT_UNIT) if gait_names else None
+        )
+        self._mode = self.writer.string("/gait/mode")
+        self._phase = self.writer.string("/gate/phase")
+        self._events = self.writer.log("/rosout")
+        self._frames = BusRecorder(bus, self.writer, SourceClock(), robot, directions=True)
+        self._settle_s = settle_s
+        self._last = {"mode": "", "phase": ""}
+        self._said: set[str] = set()
+        self._epoch_ns = self._t_ns = epoch_ns
+        self._device_minus_host_ns = 0
+        self._open = True
+
+    @property
+    def shortage(self) -> str | None:
+        """Why it can't go on for long: its disk, and what is missing; None while it can."""
+        found = self._sink.shortage
+        if found is None:
+            return None
+        return f"the disk at {_mount_of(found.path)} is full or fails: {found}"
+
+    def write(self, tick: BusTick, t_ns: int) -> None:
+        """Write one tick.
+
+        Args:
+            tick: What happened in it.
+            t_ns: When it was [Unix ns].
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        self._t_ns = t_ns
+        step = tick.step
+        for frames in tick.received:
+            self._frames.add(frames)
+            newest = frames[-1]
+            if newest["t_device_ns"] >= DEVICE_TIMES_END_NS:
+                continue
+            self._device_minus_host_ns = int(newest["t_device_ns"]) - int(newest["t_host_ns"])
+        self._keep_sent(tick.sent)
+        if tick.tick % _DECODE_TICKS == 0:
+            self._frames.decode(self._now_ns, t_ns + 1)
+            self._say_faults()
+        self._change("phase", self._phase, step.phase)
+        for level, text in step.remarks:
+            self._events.write(t_ns, level, _EVENTS_OF, text)
+        if step.command is not None:
+            self._commands.write(t_ns, step.command)
+        if step.wanted is not None:
+            self._wanted.write(t_ns, step.wanted)
+        if step.gait is not None:
+            self._write_gait(step.gait, t_ns)
+
+    def _say_faults(self) -> None:
+        for text in self._frames.take_faults():
+            self.say("error", text)
+
+    def _keep_sent(self, frames: FrameArray) -> None:
+        """Keep what was sent, with the time on the device's clock as far as that is known."""
+        self._frames.write_raw(self._now_ns)
+        if len(frames):
+            kept = np.array(frames)
+            device_ns = frames["t_host_ns"].astype(np.int64) + self._device_minus_host_ns
+            kept["t_device_ns"] = np.maximum(device_ns, 0)
+            self._frames.keep(kept, self._now_ns)
+
+    def _write_gait(self, gait: GaitTick, t_ns: int) -> None:
+        if self._settle_s is not None:  # the gait begins: so much later it has settled
+            settled_s = self._settle_s + (t_ns - self._epoch_ns) * 1e-9
+            self.writer.note("undulog", {"settle_s": repr(settled_s)})
+            self._settle_s = None
+        if self._gait is not None:
+            self._gait.write(t_ns, gait.values)
+        self._change("mode", self._mode, gait.mode)
+        for name in gait.clamped:
+            self.say("warn", f"{name} clamped to the joint limits")
+
+    def _change(self, what: str, channel: StringChannel, text: str) -> None:
+        """Write a text where it changed."""
+        if text != self._last[what]:
+            self._last[what] = text
+            channel.write(self._t_ns, text)
+
+    def say(self, level: str, text: str) -> None:
+        """Write an event, once.
+
+        Args:
+            level: ``info``, ``warn`` or ``error``.
+            text: What happened.
+        """
+        if text not in self._said:
+            self._said.add(text)
+            self._events.write(self._t_ns, level, _EVENTS_OF, text)
+
+    def note(self, name: str, facts: Mapping[str, str]) -> None:
+        """Write a metadata record.
+
+        Args:
+            name: Its name.
+            facts: Its entries.
+        """
+        self.writer.note(name, facts)
+
+    def finish(self, outcome: Outcome, remarks: Sequence[Remark]) -> None:
+        """Say how it went.
+
+        Args:
+            outcome: The end.
+            remarks: What is worth a line, the warnings among them as reasons for the verdict.
+        """
+        level = "error" if outcome.how is How.FAULT else "info"
+        why = f": {outcome.why}" if outcome.why else ""
+        self.say(level, f"{outcome.how}{why}; {outcome.ended}")
+        for each in remarks:
+            self.say(*each)
+        reasons = [text for kind, text in remarks if kind == "warn"]
+        if outcome.how is How.FAULT:
+            self.writer.set_verdict("bad", [outcome.why, *reasons])
+        else:
+            self.writer.set_verdict("degraded" if reasons else "good", reasons)
+
+    def fail(self, text: str) -> None:
+        """Say why it failed.
+
+        Args:
+            text: What happened.
+        """
+        self.say("error", text)
+        self.writer.set_verdict("bad", [text])
+
+    def close(self) -> None:
+        """Write what is left and finalise; safe to call twice.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        if not self._open:
+            return
+        self._open = False
+        try:
+            self._frames.finish(self._now_ns)
+            self._say_faults()
+        finally:
+            self.writer.close()
+
+    def _now_ns(self) -> int:
+        return self._t_ns
+
+
+def _mount_of(path: Path) -> Path:
+    """Where the disk of a file is mounted."""
+    place = path.resolve()
+    return next(one for one in (place, *place.parents) if one.is_mount())
+
+
+def stamped(tick: BusTick, t_ns: int) -> BusTick:
+    """The same tick with its frames, both ways, at the tick's time.
+
+    Args:
+        tick: The tick.
+        t_ns: Its time [Unix ns].
+
+    Returns:
+        Copies of the frames, ``t_host_ns`` set.
+    """
+    received, sent = [np.array(frames) for frames in tick.received], np.array(tick.sent)
+    for frames in (*received, sent):
+        frames["t_host_ns"] = t_ns
+    return tick._replace(received=received, sent=sent)

@@ -1,0 +1,331 @@
+"""Feedback held against its limits, tick by tick.
+
+Whether a bus is silent, measured against the interval at which its joints report.
+
+Before arming, the interval is measured as the largest gap but one between control ticks in which
+the angle of any joint was received: a single pause does not count, a router that delivers in bursts
+does. From then on the bus is silent when no joint was received for the larger of 3 ticks and 3
+intervals.
+
+At least 3 ticks have to take place without a joint. A process that was stopped itself sends nothing
+meanwhile and finds what came as it goes on: its own pause is no silence of the bus.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from undulog.capture.bus.map_entry import bus_messages, frame_id
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.log.messages.frames import (
+    DIR_RX,
+    ERROR_FLAG,
+    REMOTE_FLAG,
+    FrameArray,
+    identifier_text,
+)
+from undulog.capture.robot.model import Direction, Robot
+from undulog.capture.sources.events import BUS_OFF
+
+from .limits import GateLimits
+from .outcome import FaultKind, GateFault, JointStatus
+
+_IDENTIFIERS_SHOWN = 6
+
+
+class Presence:
+    """Counts what is heard by identifier, and finds what must not be there."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Hear nothing yet.
+
+        Args:
+            robot: The robot; it has a bus map.
+
+        Raises:
+            DataError: If it has no bus.
+        """
+        bus, messages = bus_messages(robot)
+        self._robot_name = robot.name
+        self._known = _sorted({frame_id(message) for message in messages.values()})
+        told = {s.message for s in bus.signals if s.direction is Direction.RX}
+        taken = {s.message for s in bus.signals if s.direction is Direction.TX}
+        replies = {frame_id(messages[name]) for name in told}
+        requests = {frame_id(messages[name]) for name in taken}
+        # Where a request and its reply share an identifier, hearing it tells nothing.
+        self._commands = _sorted(requests - replies)
+        self.known = 0
+        """Frames that the robot's databases know."""
+        self.strange: Counter[int] = Counter()
+        """Identifier to number of frames that they don't."""
+
+    def add(self, frames: FrameArray) -> GateFault | None:
+        """Take what came.
+
+        Args:
+            frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
+
+        Returns:
+            What must end a drive: bus-off, or commands that somebody else sends.
+        """
+        ids = frames["id_flags"]
+        errors = (ids & ERROR_FLAG) != 0
+        if (ids[errors] & BUS_OFF).any():
+            return GateFault(
+                FaultKind.BUS_OFF, "bus-off: a controller left the bus, and nobody may hear it"
+            )
+        data = ids[~errors & ((ids & REMOTE_FLAG) == 0) & (frames["dir"] == DIR_RX)]
+        data = data.astype(np.int64)
+        known = np.isin(data, self._known)
+        self.known += int(known.sum())
+        if not known.all():
+            self.strange.update(data[~known].tolist())
+        others = data[np.isin(data, self._commands)]
+        if not len(others):
+            return None
+        return GateFault(
+            FaultKind.STRANGER,
+            f"somebody else commands {self._robot_name} on this bus: frame "
+            f"{identifier_text(int(others[0]))} was heard; end that controller first",
+        )
+
+    def another_robot(self) -> str | None:
+        """Why this can't be the robot; None if it may be."""
+        if self.strange.total() <= self.known:
+            return None
+        listed = ", ".join(
+            identifier_text(identifier)
+            for identifier, _ in self.strange.most_common(_IDENTIFIERS_SHOWN)
+        )
+        return (
+            f"another robot is on this bus: of {self.strange.total() + self.known} frames heard "
+            f"{self.known} are of {self._robot_name}; others have the identifiers {listed}"
+        )
+
+
+def _sorted(identifiers: set[int]) -> IntArray:
+    return np.array(sorted(identifiers), dtype=np.int64)
+
+
+_INTERVALS = 3
+_LEAST_TICKS = 3
+_LEAST_GAPS = 4
+
+
+class Silence:
+    """Counts control ticks in which no joint of a bus was received.
+
+    Attributes:
+        interval: Reply interval [control ticks]; None before it is measured.
+        ticks: Control ticks since a joint was received.
+    """
+
+    def __init__(self) -> None:
+        """Nothing was received yet."""
+        self.interval: int | None = None
+        self.ticks = 0
+        self._tick = -1
+        self._looked = 0  # ticks of these that took place
+        self._gaps: list[int] | None = None  # None before the first reception
+
+    @property
+    def limit(self) -> int:
+        """After so many ticks without a joint the bus is silent."""
+        return max(_LEAST_TICKS, _INTERVALS * (self.interval or 1))
+
+    @property
+    def silent(self) -> bool:
+        """Whether it is; never before the interval is measured."""
+        long = self.ticks >= self.limit and self._looked >= _LEAST_TICKS
+        return self.interval is not None and long
+
+    def tick(self, tick: int, *, received: bool, expected: bool = True) -> None:
+        """Count a control tick.
+
+        Args:
+            tick: Its number; some may have been left out before it.
+            received: Whether the angle of a joint was received since the tick before.
+            expected: Whether one should have been; else a tick without one is not counted.
+        """
+        before, self._tick = self._tick, tick
+        if received or expected:
+            self.ticks += tick - before
+            self._looked += 1
+        if not received:
+            return
+        if self._gaps is None:
+            self._gaps = []
+        elif self.interval is None:
+            self._gaps.append(self.ticks)
+        self.ticks = self._looked = 0
+
+    def measure(self) -> bool:
+        """Take the interval from what was received so far.
+
+        Returns:
+            Whether it was enough: five ticks in which a joint was received.
+        """
+        if self._gaps is None or len(self._gaps) < _LEAST_GAPS:
+            return False
+        self.interval = sorted(self._gaps)[-2]
+        return True
+
+
+_LESS = 0.8
+_MORE = 0.02
+
+
+class Yielding:
+    """Keeps currents below their limits, as far as a position servo can be kept there.
+
+    A position servo's current follows the distance of its command from the joint's angle. While
+    the current is beyond its limit that distance shrinks by a fifth in each control tick; below it
+    grows back by a fiftieth.
+    """
+
+    def __init__(self, limit: FloatArray) -> None:
+        """Give way nowhere.
+
+        Args:
+            limit: Greatest currents [A], NaN where there is none, shape (m,).
+        """
+        self._limit = limit
+        self._share = np.ones(len(limit))
+
+    @property
+    def yields(self) -> BoolArray:
+        """Joints that give way, shape (m,)."""
+        return self._share < 1.0
+
+    def apply(self, wanted: FloatArray, angle: FloatArray, current: FloatArray) -> FloatArray:
+        """Pull commands towards the measured angles where currents ask for it.
+
+        Args:
+            wanted: Joint angles [rad], shape (m,).
+            angle: Measured angles [rad], NaN where unknown, shape (m,).
+            current: Measured currents [A], NaN where unknown, shape (m,).
+
+        Returns:
+            Joint angles [rad], shape (m,); untouched where nothing gives way.
+        """
+        beyond = np.abs(current) > self._limit  # False for NaN
+        grown = np.minimum(self._share + _MORE, 1.0)
+        self._share = np.where(beyond, self._share * _LESS, grown)
+        pulls = self.yields & np.isfinite(angle)
+        pulled = np.where(pulls, angle, 0.0)
+        pulled += self._share * (wanted - pulled)
+        return np.where(pulls, pulled, wanted)
+
+
+_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class _Excess:
+    """One quantity that must not stay beyond its limit."""
+
+    kind: FaultKind
+    what: str
+    unit: str
+    less: bool = False
+
+
+_EXCESSES = (
+    _Excess(FaultKind.CURRENT, "current", "A"),
+    _Excess(FaultKind.TEMPERATURE, "temperature", "degC"),
+    _Excess(FaultKind.VOLTAGE, "voltage", "V", less=True),
+    _Excess(FaultKind.TRACKING, "tracking error", "rad"),
+)
+
+
+class Watch:
+    """Looks at each tick's readings and says what is wrong, the first time that it is."""
+
+    def __init__(self, limits: GateLimits) -> None:
+        """Nothing is wrong yet.
+
+        Args:
+            limits: What is allowed.
+        """
+        self._limits = limits
+        self._bounds = {
+            FaultKind.CURRENT: limits.current,
+            FaultKind.TEMPERATURE: limits.temperature,
+            FaultKind.VOLTAGE: limits.voltage,
+            FaultKind.TRACKING: limits.tracking_error,
+        }
+        count = len(limits.joint_names)
+        self._since_s = {each.kind: np.full(count, np.nan) for each in _EXCESSES}
+
+    def look(self, time_s: float, status: JointStatus, command: FloatArray) -> GateFault | None:
+        """Look at what is known at a tick.
+
+        Args:
+            time_s: Now, on the loop's clock [s].
+            status: What the joints told.
+            command: What they were commanded last [rad], shape (m,).
+
+        Returns:
+            The fault, None if all is well.
+        """
+        values = {
+            FaultKind.CURRENT: np.abs(status.current),
+            FaultKind.TEMPERATURE: status.temperature,
+            FaultKind.VOLTAGE: status.voltage,
+            FaultKind.TRACKING: np.abs(status.angle - command),
+        }
+        lost = self._lost(time_s, status.silence_s)
+        found = [self._excess(each, time_s, values[each.kind]) for each in _EXCESSES]
+        return next((fault for fault in (lost, *found) if fault is not None), None)
+
+    def _lost(self, time_s: float, silence_s: FloatArray) -> GateFault | None:
+        limit_s = self._limits.reply_timeout_s
+        silent = silence_s > limit_s
+        if not silent.any():
+            return None
+        names = _named(self._limits.joint_names, silent)
+        value = float(np.max(silence_s[silent]))
+        return GateFault(
+            FaultKind.LOST,
+            f"{names} lost: no angle for more than {limit_s:g} s",
+            joint=self._limits.joint_names[int(np.argmax(silent))] if silent.sum() == 1 else "",
+            value=value,
+            limit=limit_s,
+            since_s=time_s - value,
+        )
+
+    def _excess(self, of: _Excess, time_s: float, values: FloatArray) -> GateFault | None:
+        bound = self._bounds[of.kind]
+        beyond = values < bound if of.less else values > bound  # False for NaN
+        began = self._since_s[of.kind]
+        since_s = np.where(beyond, np.where(np.isnan(began), time_s, began), np.nan)
+        self._since_s[of.kind] = since_s
+        due = beyond & (time_s - since_s >= self._limits.fault_after_s - 1e-9)
+        if not due.any():
+            return None
+        far = np.where(due, np.abs(values - bound), -np.inf)
+        joint = int(np.argmax(far))
+        name, value, limit = self._limits.joint_names[joint], values[joint], bound[joint]
+        than = "less than" if of.less else "more than"
+        lasted = time_s - since_s[joint]
+        return GateFault(
+            of.kind,
+            f"{name}: {of.what} {value:.3g} {of.unit}, {than} {limit:g} {of.unit} "
+            f"for {lasted:.2g} s",
+            joint=name,
+            value=float(value),
+            limit=float(limit),
+            since_s=float(since_s[joint]),
+        )
+
+
+def _named(names: tuple[str, ...], chosen: BoolArray) -> str:
+    """Who, as the subject of a sentence."""
+    if chosen.all():
+        return "the robot is"
+    found = [name for name, is_one in zip(names, chosen, strict=True) if is_one]
+    more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    return ", ".join(found[:_SHOWN]) + more + (" is" if len(found) == 1 else " are")

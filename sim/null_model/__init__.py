@@ -1,1 +1,0 @@
-"""Models of identical modules, from runs of the twin."""

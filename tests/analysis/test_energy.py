@@ -1,0 +1,124 @@
+"""Energies on the samples' own times against closed forms."""
+
+import numpy as np
+import pytest
+
+from undulog.analysis.energy import add_up, integrate, power_of
+from undulog.analysis.estimators.series import Series, clean, coverage, sample_weights
+from undulog.capture.log.read.signals import Signal
+
+SECOND = 10**9
+
+
+def test_periodic_power_over_whole_cycles_is_integrated_to_rounding():
+    t = np.arange(400) / 100
+    power = 0.2 + np.sin(2 * np.pi * t) + 0.5 * np.cos(6 * np.pi * t - 1)
+    (energy,) = integrate([Series("q", t, power)], 0.0, 4.0, 4)
+    np.testing.assert_allclose(energy.net_j, 0.2, atol=0.02)
+    assert energy.net_j.sum() == pytest.approx(0.8, abs=1e-12)
+    assert energy.coverage == pytest.approx(1.0)
+
+
+def test_positive_and_absolute_parts():
+    t = np.arange(4000) / 1000
+    (energy,) = integrate([Series("q", t, np.sin(2 * np.pi * t))], 0.0, 4.0, 2)
+    np.testing.assert_allclose(energy.plus_j, 2 / np.pi, rtol=1e-5)
+    np.testing.assert_allclose(energy.abs_j, 4 / np.pi, rtol=1e-5)
+
+
+def test_uneven_sampling_is_weighted_by_time():
+    rng = np.random.default_rng(1)
+    t = np.arange(3000) / 1000 + rng.uniform(0, 0.9e-3, 3000)
+    (energy,) = integrate([Series("q", t, t**2)], 0.0, 3.0)
+    assert energy.net_j[0] == pytest.approx(9.0, rel=1e-3)
+
+
+def test_gaps_are_not_bridged():
+    t = np.arange(1000) / 100
+    t = t[(t < 3) | (t >= 5)]
+    (energy,) = integrate([Series("q", t, np.ones(t.size))], 0.0, 10.0)
+    assert energy.net_j[0] == pytest.approx(8.0, abs=0.02)
+    assert energy.coverage == pytest.approx(0.8, abs=0.002)
+    # Also not at the window's ends.
+    assert coverage(t[t >= 5], 0.0, 10.0) == pytest.approx(0.5, abs=0.002)
+    assert integrate([Series("q", t[:1], np.ones(1))], 0.0, 10.0) == [None]
+
+
+def test_weights_are_the_trapezoidal_rule_inside():
+    t = np.array([0.5, 1.0, 2.0, 2.5, 3.5])
+    np.testing.assert_allclose(sample_weights(t, 0.0, 4.0), [0.75, 0.75, 0.75, 0.75, 1.0])
+
+
+def test_power_of_signals_sampled_at_other_times():
+    t = np.arange(1000) * 10_000_000
+    current = Signal("q", "A", t, np.full(1000, 2.0))
+    shifted = t + 3_000_000
+    kept = (shifted < 3 * SECOND) | (shifted > 4 * SECOND)
+    voltage = Signal("q", "V", shifted[kept], shifted[kept] * 1e-9)
+    power = power_of(current, voltage, 0)
+    np.testing.assert_allclose(power.values, 2 * power.t_s, atol=1e-9)
+    # The first current has no voltage yet, and those in the voltage's gap have none.
+    assert power.count == 1000 - 1 - np.count_nonzero((t > 2.993e9) & (t < 4.003e9))
+    assert power.dropped_nan == 1000 - power.count
+
+
+def test_clean_sorts_drops_and_counts():
+    t_ns = np.array([10, 30, 20, 20, 40]) * SECOND
+    series = clean("q", t_ns, np.array([1.0, 3.0, 2.0, 9.0, np.inf]), 10 * SECOND)
+    np.testing.assert_array_equal(series.t_s, [0.0, 10.0, 20.0])
+    np.testing.assert_array_equal(series.values, [1.0, 2.0, 3.0])
+    assert (series.dropped_nan, series.dropped_duplicates) == (1, 1)
+
+
+def test_each_cycle_has_its_own_energy_and_coverage():
+    t = np.arange(800) / 100 - 3.0
+    power = 0.2 + np.sin(2 * np.pi * t) ** 2
+    kept = (t < 0.2) | (t >= 0.7)
+    (energy,) = integrate([Series("q", t[kept], power[kept])], -3.0, 5.0, 8)
+    whole = np.delete(np.arange(8), 3)
+    np.testing.assert_allclose(energy.net_j[whole], 0.7, atol=1e-9)
+    np.testing.assert_allclose(energy.covered[whole], 1.0, atol=1e-9)
+    assert energy.covered[3] == pytest.approx(0.5, abs=0.011)
+
+
+def accumulated(power, count, start_s=-3.0, length_s=0.01, fine=200):
+    """Means of a power and of its positive part over intervals, by the midpoint rule."""
+    at = start_s + (np.arange(count * fine).reshape(count, fine) + 0.5) * length_s / fine
+    t = start_s + (np.arange(count) + 0.5) * length_s
+    values = power(at)
+    return Series("q", t, values.mean(axis=1)), Series("q", t, np.maximum(values, 0).mean(axis=1))
+
+
+def test_accumulated_powers_keep_what_happens_within_an_interval():
+    # A ripple in step with the sampling, and one that changes the sign within an interval.
+    def power(t):
+        return 0.3 + 2.0 * np.sin(2 * np.pi * 100 * t) + np.sin(2 * np.pi * t)
+
+    net, plus = accumulated(power, 800)
+    energy = add_up(net, plus, -3.0, 5.0, 8)
+    np.testing.assert_allclose(energy.net_j, 0.3, atol=1e-12)
+    fine = power((np.arange(800_000) + 0.5) * 1e-5)
+    np.testing.assert_allclose(energy.abs_j.sum(), np.abs(fine).sum() * 1e-5, rtol=1e-4)
+    np.testing.assert_allclose(energy.covered, 1.0)
+    (product,) = integrate([net], -3.0, 5.0, 8)
+    assert product.abs_j.sum() < 0.6 * energy.abs_j.sum()  # the sign of the mean alone
+
+
+def test_a_window_takes_its_part_of_the_intervals_at_its_edges():
+    net, plus = accumulated(lambda t: 1.0 + t, 800)  # stamps from -2.995 on
+    energy = add_up(net, plus, -1.0037, 2.0021, 1)
+    exact = 3.0058 + (2.0021**2 - 1.0037**2) / 2
+    assert energy.net_j[0] == pytest.approx(exact, abs=2 * 0.01**2 / 8)
+    assert energy.plus_j[0] == pytest.approx(exact + 0.0037**2 / 2, abs=2 * 0.01**2 / 8)
+
+
+def test_a_lost_message_is_a_gap_of_one_interval():
+    net, plus = accumulated(np.ones_like, 800)
+    kept = np.delete(np.arange(800), [5, 6, 400])
+    lost = [Series("q", one.t_s[kept], one.values[kept]) for one in (net, plus)]
+    energy = add_up(*lost, -3.0, 5.0, 8)
+    np.testing.assert_allclose(energy.net_j, [0.98, 1, 1, 1, 0.99, 1, 1, 1])
+    np.testing.assert_allclose(energy.covered, energy.net_j)
+    assert energy.coverage == pytest.approx(7.97 / 8)
+    assert add_up(net, lost[1], -3.0, 5.0, 8) is None
+    assert add_up(net, plus, 6.0, 7.0, 1) is None

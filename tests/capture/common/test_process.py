@@ -1,0 +1,66 @@
+"""Real signals to a real process: the file is whole, the second signal kills."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from undulog.capture import Session
+
+RECORDER = """
+import sys, time
+from undulog.capture import SessionWriter
+from undulog.capture.common.process import interruptible
+
+with interruptible() as stop, SessionWriter(sys.argv[1], session_id="s", epoch_ns=10**18) as writer:
+    channel = writer.joint_state("/joint_states", ["a"], unit="rad")
+    tick = 0
+    while not stop.requested:
+        channel.write(10**18 + tick * 10**6, [float(tick)])
+        tick += 1
+        if tick == 100:
+            print("recording", flush=True)
+        time.sleep(1e-4)
+print(tick, flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    path = tmp_path / "s.mcap"
+    process = subprocess.Popen(
+        [sys.executable, "-c", RECORDER, str(path)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "recording\n"
+    process.send_signal(number)
+    ticks = int(process.communicate(timeout=30)[0])
+    assert process.returncode == 0
+    with Session.open(path) as session:
+        assert session.warnings == []
+        assert session.joints("/joint_states").values[0].tolist() == list(range(ticks))
+
+
+def test_the_second_signal_acts_as_usual() -> None:
+    code = (
+        "import time; from undulog.capture.common.process import interruptible\n"
+        "with interruptible() as stop:\n"
+        "    print('in', flush=True)\n"
+        "    while not stop.requested: time.sleep(1e-3)\n"
+        "    print('asked', flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "in\n"
+    process.send_signal(signal.SIGTERM)
+    assert process.stdout.readline() == "asked\n"
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=30)
+    assert process.returncode == -signal.SIGTERM

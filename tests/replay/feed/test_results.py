@@ -1,0 +1,232 @@
+"""Saved results as a layer: whose they are, what they name, and where that is marked."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import undulog
+from undulog.analysis.results.comparison import Comparison, NamedJoint
+from undulog.analysis.results.coupling import Coupling
+from undulog.analysis.results.estimate import Estimate, Provenance
+from undulog.analysis.results.experiment import (
+    Experiment,
+    FloorTilt,
+    Headings,
+    OrderedPair,
+    Reversal,
+    Run,
+)
+from undulog.analysis.results.null_model import ModelledAnalysis, ModuleDeviation, NullModelResult
+from undulog.capture import Session
+from undulog.capture.common.errors import DataError
+from undulog.capture.robot.kinematics import link_poses
+from undulog.replay.feed.numbers import saved
+
+PINK = 0xFF5FBEFF
+NO_COUPLING = Coupling(identifiable=False, why="one gait")
+MADE = Provenance("", {}, {}, {})
+
+
+def run(capsys, *arguments):
+    """Exit code, standard output, standard error."""
+    code = undulog.run(["view", *map(str, arguments)])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+@pytest.fixture
+def session(session_file):
+    """The whole session, open."""
+    with Session.open(session_file) as opened:
+        yield opened
+
+
+@pytest.fixture
+def comparison(analysis):
+    """A comparison of the session with another one that names two joints, one beyond margins."""
+    other = dataclasses.replace(analysis.session, id="another")
+    named = (NamedJoint("joint05", 2.1, 0.0004), NamedJoint("joint07", 0.6, 0.01))
+    return Comparison(
+        "B differs from A",
+        "different",
+        "sessions",
+        a=(other,),
+        b=(analysis.session,),
+        partial=None,
+        changed=(),
+        named=named,
+        differences=(),
+        equivalence=(),
+        phase_rad=(),
+        waveforms=(),
+        warnings=(),
+        provenance=MADE,
+    )
+
+
+@pytest.fixture
+def experiment(analysis):
+    """An experiment of the session and its reverse, that names the joint it finds weak."""
+    pair = OrderedPair("joint03", "joint23", "lag", Estimate(-0.01), Estimate(0.03), 0.002)
+    nothing = Estimate()
+    reversal = Reversal(
+        forward_runs=6,
+        reverse_runs=6,
+        statistic=9.0,
+        p=0.002,
+        p_floor=0.001,
+        labellings=924,
+        labellings_tried=924,
+        joints=(),
+        pairs=(pair,),
+        gain_bound=0.1,
+        lag_bound_rad=0.1,
+        equivalence_gain_p=1.0,
+        equivalence_lag_p=1.0,
+        module_variance=nothing,
+        boundary_variance=nothing,
+        noise_variance=0.0,
+        module_share=nothing,
+        boundary_share=nothing,
+        tilt=FloorTilt(Headings.BALANCED, 2, nothing, None, nothing, excluded=True),
+    )
+    one = dataclasses.replace(analysis, session=dataclasses.replace(analysis.session, id="reverse"))
+    runs = (
+        Run("reverse", "reverse.mcap", "tail-to-head", "reverse"),
+        Run("made-for-tests", "made.mcap", "head-to-tail", "forward"),
+    )
+    return Experiment("joint03 is weak", (one, analysis), runs, {}, reversal, NO_COUPLING, (), MADE)
+
+
+def test_the_numbers_shown_are_the_saved_ones(session, analysis, tmp_path):
+    layer = saved(session, [analysis.save(tmp_path / "made.json")])
+    assert layer.analysis == analysis
+    assert layer.named == ()
+    assert layer.notes == ("gain, lag and energy are those of made.json",)
+
+
+def test_an_experiment_gives_the_sessions_own_numbers_and_its_weak_module(
+    session, analysis, experiment, tmp_path
+):
+    layer = saved(session, [experiment.save(tmp_path / "both.json")])
+    assert layer.analysis == analysis
+    (weak,) = layer.named
+    assert weak.joint == "joint03"
+    assert weak.why == "more lag than its mirror joint joint23, p = 0.002 (both.json)"
+
+
+def test_a_comparison_names_what_differs_by_more_than_its_margins(
+    session, analysis, comparison, tmp_path
+):
+    paths = [analysis.save(tmp_path / "made.json"), comparison.save(tmp_path / "two.json")]
+    layer = saved(session, paths)
+    assert layer.analysis == analysis
+    assert [(one.joint, one.why) for one in layer.named] == [
+        ("joint05", "answers differently in A and B, p < 0.001 (two.json)")
+    ]
+
+
+def test_a_session_held_to_a_model_names_the_module_that_deviates(session, analysis, tmp_path):
+    modules = (
+        ModuleDeviation("joint07", named=False, gain=1.0, p=0.6, relative={}),
+        ModuleDeviation("joint09", named=True, gain=40.0, p=0.0002, relative={}),
+    )
+    test = NullModelResult(
+        answer="joint09 deviates",
+        condition="conditional on the model",
+        file="null.json",
+        made_by="twin",
+        parameters=(),
+        fit=1.0,
+        fit_p=0.5,
+        p=0.0002,
+        modules=modules,
+        named=("joint09",),
+        rest_p=0.4,
+        draws=200,
+    )
+    values = {one.name: getattr(analysis, one.name) for one in dataclasses.fields(analysis)}
+    modelled = ModelledAnalysis(**values, null_model=test)
+    layer = saved(session, [modelled.save(tmp_path / "held.json")])
+    assert layer.analysis == modelled
+    assert [(one.joint, one.why) for one in layer.named] == [
+        ("joint09", "deviates from the others' model, p < 0.001 (held.json)")
+    ]
+
+
+def test_with_a_comparison_alone_the_session_is_analysed(session, comparison, tmp_path):
+    layer = saved(session, [comparison.save(tmp_path / "two.json")])
+    assert layer.analysis is not None
+    assert layer.analysis.session.id == "made-for-tests"
+    assert [one.joint for one in layer.named] == ["joint05"]
+
+
+def test_results_of_another_session_are_refused(session, analysis, tmp_path):
+    other = dataclasses.replace(analysis.session, id="another")
+    path = dataclasses.replace(analysis, session=other).save(tmp_path / "other.json")
+    with pytest.raises(DataError, match=r"other\.json: a result of session another; the session"):
+        saved(session, [path])
+
+
+def test_two_results_with_numbers_of_the_session_are_refused(
+    session, analysis, experiment, tmp_path
+):
+    paths = [analysis.save(tmp_path / "a.json"), experiment.save(tmp_path / "b.json")]
+    with pytest.raises(DataError, match=r"b\.json: the second result with numbers"):
+        saved(session, paths)
+
+
+def test_a_result_that_names_no_session_is_refused(session, tmp_path):
+    path = NO_COUPLING.save(tmp_path / "coupling.json")
+    with pytest.raises(DataError, match=r"a Coupling names no session"):
+        saved(session, [path])
+
+
+@pytest.fixture
+def marked(session_file, analysis, comparison, tmp_path, read_back):
+    """The session's recording with a comparison that names joint 5."""
+    paths = [analysis.save(tmp_path / "made.json"), comparison.save(tmp_path / "two.json")]
+    results = [str(word) for path in paths for word in ("--result", path)]
+    words = ["view", str(session_file), *results, "--save", str(tmp_path / "a.rrd")]
+    assert undulog.run(words) == 0
+    return read_back(tmp_path / "a.rrd")
+
+
+def test_named_modules_are_marked_on_the_body(marked, snake25, truth):
+    assert marked.column("/world/snake/named", "Points3D:labels")[0] == ["joint05"]
+    assert marked.static("/world/snake/named", "Points3D:colors") == [PINK]
+    # Above the axis of joint 5, between links 5 and 6.
+    at = np.array(marked.column("/world/snake/named", "Points3D:positions")[0][0])
+    centre, rotation = link_poses(snake25, truth.head[0], np.eye(3), truth.position[0])
+    axis = centre[4] - 0.5 * snake25.links[4].length * rotation[4, :, 0]
+    np.testing.assert_allclose(at[:2], axis[:2], atol=1e-6)
+    assert at[2] > axis[2]
+
+
+def test_named_modules_are_marked_at_their_bars_and_in_words(marked):
+    (left,) = marked.static("/segments/lag_degrees/named", "BarChart:abscissa")
+    assert 4.4 < left["buffer"][0] < 4.6
+    words = marked.static("/session", "TextDocument:text")[0]
+    assert "**Named, pink in the pictures:** joint05 (answers differently" in words
+    assert "- gain, lag and energy are those of made.json" in words
+
+
+def test_without_results_nothing_is_marked(recording):
+    _, recorded = recording
+    assert not any("named" in path for path in recorded.entities)
+
+
+def test_results_and_tabs_are_of_one_session(session_file, tmp_path, capsys):
+    for words in (["--result", tmp_path / "a.json"], ["--tab", "cycles"]):
+        code, _, err = run(capsys, session_file, session_file, *words)
+        assert code == 2
+        assert f"{words[0]}: needs one session" in err
+
+
+def test_a_result_that_is_not_there_fails(session_file, tmp_path, capsys):
+    missing = tmp_path / "nowhere.json"
+    code, _, err = run(capsys, session_file, "--result", missing, "--save", tmp_path / "a.rrd")
+    assert code == 1
+    assert "nowhere.json" in err
+    assert not (tmp_path / "a.rrd").exists()

@@ -1,0 +1,305 @@
+"""Recordings read back with Rerun's own reader hold the session's columns, under their names."""
+
+import numpy as np
+import pytest
+
+from undulog.capture import Session, SessionWriter
+from undulog.capture.common.errors import DataError, LogWriteError
+from undulog.capture.common.palette import joint_colors
+from undulog.replay.draw.scene.body import ROUNDING
+from undulog.replay.feed.recording import recording_id, write_recording
+
+START = 1_735_689_600_000_000_000
+
+
+def converted(file, path, **options):
+    """Convert a session; what was said."""
+    with Session.open(file) as session:
+        return write_recording(session, path, **options)
+
+
+def rows(column):
+    """Rows of equal length as an array."""
+    return np.array(column, dtype=float)
+
+
+def assert_drawn(shown, truth):
+    """Lines are rounded by at most a thousandth of their range, and to 32 bits."""
+    assert shown.shape == truth.shape
+    np.testing.assert_array_equal(np.isnan(shown), np.isnan(truth))
+    room = np.nanmax(truth, axis=0) - np.nanmin(truth, axis=0)
+    apart = np.nanmax(np.abs(shown - truth), axis=0)
+    assert (apart <= 1e-3 * room + 1e-7 * np.nanmax(np.abs(truth))).all()
+
+
+def test_the_file_passes_reruns_own_verification(recording, rerun_command):
+    rerun_command("rrd", "verify", recording[0].path)
+
+
+def test_all_entities_are_there_by_name(recording):
+    assert recording[1].entities >= {
+        "/world/snake/measured",
+        "/world/snake/commanded",
+        "/world/snake/places",
+        "/world/trail",
+        "/joints/commanded",
+        "/joints/measured",
+        "/joints/error",
+        "/joints/places/measured",
+        "/joints/places/commanded",
+        "/power/mechanical",
+        "/power/total/mechanical",
+        "/power/total/electrical",
+        "/signals/joint_current",
+        "/segments/lag_degrees/estimate/joint01",
+        "/gait/mode",
+        "/events",
+        "/session",
+    }
+
+
+def test_angles_are_shown_in_degrees(recording, truth):
+    _, found = recording
+    for entity, angles in (("measured", truth.position), ("commanded", truth.command)):
+        shown = rows(found.column(f"/joints/{entity}", "Angle:degrees"))
+        assert_drawn(shown, np.degrees(angles))
+        np.testing.assert_array_equal(found.times(f"/joints/{entity}"), truth.t_ns - START)
+
+
+def test_other_topics_are_shown_in_their_unit(recording, truth):
+    shown = rows(recording[1].column("/signals/joint_current", "Scalars:scalars"))
+    assert_drawn(shown, truth.effort)
+
+
+def test_head_middle_and_tail_have_a_plot_of_their_own(recording, truth):
+    _, found = recording
+    shown = rows(found.column("/joints/places/measured", "Scalars:scalars"))
+    assert_drawn(shown, np.degrees(truth.position[:, [0, 12, 24]]))
+    names = ["joint01 head", "joint13 middle", "joint25 tail"]
+    assert found.static("/joints/places/measured", "SeriesLines:names") == names
+    assert found.static("/joints/places/measured", "SeriesLines:widths") == [2.0, 2.0, 2.0]
+
+
+def test_error_and_power_follow_from_the_columns(recording, truth):
+    _, found = recording
+    error = rows(found.column("/joints/error", "Angle:degrees"))
+    assert_drawn(error, np.degrees(truth.position - truth.command))
+    power = truth.effort * truth.velocity
+    assert_drawn(rows(found.column("/power/mechanical", "Scalars:scalars")), power)
+    total = rows(found.column("/power/total/mechanical", "Scalars:scalars"))
+    assert_drawn(total, power.sum(axis=1, keepdims=True))
+    electrical = rows(found.column("/power/total/electrical", "Scalars:scalars"))
+    assert_drawn(electrical, 6.0 * truth.effort.sum(axis=1, keepdims=True))
+
+
+def test_joints_are_named_and_keep_their_colours(recording, snake25):
+    _, found = recording
+    assert found.static("/joints/measured", "SeriesLines:names") == list(snake25.joint_names)
+    packed = joint_colors(25).astype(int) @ [1 << 24, 1 << 16, 1 << 8, 1]
+    assert found.static("/joints/measured", "SeriesLines:colors") == packed.tolist()
+    assert set(found.static("/joints/commanded", "SeriesLines:colors")) == {0x8C8C8CFF}
+
+
+def test_the_body_is_drawn_at_50_hz_where_the_head_was(recording, truth, snake25):
+    _, found = recording
+    origin = rows(found.column("/world/snake/measured", "Capsules3D:translations"))
+    assert origin.shape == (150, 26, 3)
+    np.testing.assert_array_equal(found.times("/world/snake/measured"), (truth.t_ns - START)[::2])
+    length = found.column("/world/snake/measured", "Capsules3D:lengths")[0][0]
+    # The head looks along x, so its capsule starts half its length behind its centre.
+    expected = truth.head[::2] - [length / 2, 0.0, 0.0]
+    np.testing.assert_allclose(origin[:, 0], expected, atol=ROUNDING / 2 + 1e-9)
+
+
+def test_the_gait_gives_a_second_timeline(recording, truth):
+    cycles = recording[1].times("/joints/measured", "gait_cycle") / 1e9
+    np.testing.assert_allclose(cycles, truth.phase / (2 * np.pi), atol=1e-9)
+
+
+def test_mode_and_events_are_as_logged(recording):
+    _, found = recording
+    assert found.column("/gait/mode", "StateChange:state") == [["walk"], ["avoid"]]
+    assert found.times("/gait/mode").tolist() == [0, 1_000_000_000]
+    assert found.column("/events", "TextLog:text") == [["drive: start"], ["drive: wall ahead"]]
+    assert found.column("/events", "TextLog:level") == [["INFO"], ["ERROR"]]
+    assert found.times("/events").tolist() == [5, 1_000_000_000]
+
+
+def test_the_facts_begin_with_the_answer(recording, analysis):
+    text = recording[1].static("/session", "TextDocument:text")[0]
+    assert text.startswith(f"**{analysis.answer.sentence}**")
+    for fact in ("made-for-tests", "snake25, 25 joints", "2025-01-01", "head-to-tail", "good"):
+        assert fact in text
+
+
+def test_the_same_session_gives_the_same_recording(
+    recording, session_file, analysis, tmp_path, rerun_command
+):
+    again = converted(session_file, tmp_path / "again.rrd", analysis=analysis)
+    assert again.recording_id == recording[0].recording_id == recording_id("made-for-tests")
+    assert recording[1].stores == [("undulog", again.recording_id)]
+    rerun_command("rrd", "compare", recording[0].path, again.path)
+
+
+def test_a_recording_is_replaced_by_a_whole_one_only(session_file, tmp_path):
+    path = tmp_path / "made.rrd"
+    path.write_bytes(b"the former one")
+
+    def fail(_content):
+        raise RuntimeError("no layout")
+
+    with pytest.raises(RuntimeError, match="no layout"):
+        converted(session_file, path, layout=fail)
+    assert path.read_bytes() == b"the former one"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_is_not_there_is_an_error(session_file, tmp_path):
+    with pytest.raises(LogWriteError, match="can't be written"):
+        converted(session_file, tmp_path / "nowhere" / "made.rrd")
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_full_disk_is_an_error_and_leaves_nothing(session_file, disk_of):
+    disk = disk_of("64k")
+    with Session.open(session_file) as session, pytest.raises(LogWriteError, match="can't be wr"):
+        write_recording(session, disk / "run.rrd")
+    assert list(disk.iterdir()) == []
+
+
+def test_a_file_cut_short_by_a_full_disk_is_an_error(session_file, tmp_path, monkeypatch):
+    import rerun as rr
+
+    whole = rr.RecordingStream.disconnect
+
+    def cut(self):
+        whole(self)
+        for draft in tmp_path.glob("*.part"):
+            draft.write_bytes(draft.read_bytes()[:-4000])
+
+    monkeypatch.setattr(rr.RecordingStream, "disconnect", cut)
+    with pytest.raises(LogWriteError, match="couldn't be written whole"):
+        converted(session_file, tmp_path / "made.rrd")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lost_samples_stay_holes(write, truth, read_back, tmp_path):
+    position = truth.position.copy()
+    position[100:110, 6] = np.nan
+    written = converted(write(tmp_path / "a.mcap", position=position), tmp_path / "a.rrd")
+    found = read_back(written.path)
+    assert_drawn(rows(found.column("/joints/measured", "Angle:degrees")), np.degrees(position))
+    links = [len(row) for row in found.column("/world/snake/measured", "Capsules3D:translations")]
+    assert links == [7 if 50 <= i < 55 else 26 for i in range(150)]
+
+
+def test_a_pause_is_not_bridged(write, truth, read_back, tmp_path):
+    keep = (truth.t < 1.0) | (truth.t >= 2.0)
+    written = converted(write(tmp_path / "a.mcap", keep=keep), tmp_path / "a.rrd")
+    found = read_back(written.path)
+    measured = rows(found.column("/joints/measured", "Angle:degrees"))
+    assert measured.shape == (201, 25)
+    assert np.isnan(measured[100]).all()
+    assert_drawn(np.delete(measured, 100, axis=0), np.degrees(truth.position[keep]))
+    assert found.times("/joints/measured")[100] == 1_000_000_000
+    body = found.column("/world/snake/measured", "Capsules3D:translations")
+    assert [i for i, row in enumerate(body) if not row] == [50]
+    trail = found.times("/world/trail")
+    assert not ((trail > 1_000_000_000) & (trail <= 2_000_000_000)).any()
+
+
+def test_without_odometry_the_head_stays_at_the_origin(write, read_back, tmp_path):
+    written = converted(write(tmp_path / "a.mcap", odometry=False), tmp_path / "a.rrd")
+    assert "no /odom in the session: the head is held at the origin" in written.warnings
+    found = read_back(written.path)
+    origin = rows(found.column("/world/snake/measured", "Capsules3D:translations"))
+    assert (origin[:, 0] == origin[0, 0]).all()
+    assert "/world/trail" not in found.entities
+
+
+def test_without_a_robot_there_are_plots_but_no_body(write, truth, read_back, tmp_path):
+    written = converted(write(tmp_path / "a.mcap", robot=False), tmp_path / "a.rrd")
+    assert any("no robot description" in warning for warning in written.warnings)
+    found = read_back(written.path)
+    assert not [entity for entity in found.entities if entity.startswith("/world")]
+    shown = rows(found.column("/joints/measured", "Angle:degrees"))
+    assert_drawn(shown, np.degrees(truth.position))
+
+
+def test_without_torques_the_body_wears_the_colours_of_its_joints(write, read_back, tmp_path):
+    written = converted(write(tmp_path / "a.mcap", effort=False), tmp_path / "a.rrd")
+    assert written.content.power_limit_w is None
+    found = read_back(written.path)
+    packed = joint_colors(26).astype(int) @ [1 << 24, 1 << 16, 1 << 8, 1]
+    assert found.column("/world/snake/measured", "Capsules3D:colors")[0] == packed.tolist()
+    assert "/power/mechanical" not in found.entities
+
+
+def test_without_a_gait_there_is_one_timeline(write, read_back, tmp_path):
+    written = converted(write(tmp_path / "a.mcap", gait=False), tmp_path / "a.rrd")
+    found = read_back(written.path)
+    assert found.times("/joints/measured", "gait_cycle").size == 0
+    assert "/events" not in found.entities
+
+
+def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times(
+    snake25, read_back, tmp_path
+):
+    names = snake25.joint_names
+    offset = 2.5e-4 * np.arange(25)
+    t = START + np.arange(50, dtype=np.int64) * 10_000_000
+    with SessionWriter(
+        tmp_path / "a.mcap", session_id="polled", epoch_ns=START, robot=snake25
+    ) as w:
+        states = w.joint_state("/joint_states", names, unit="rad")
+        offsets = w.joint_state("/joint_sample_offset", names, unit="s")
+        for t_ns in t.tolist():
+            states.write(t_ns, np.full(25, (t_ns - START) * 1e-9) + offset)
+            offsets.write(t_ns, offset)
+    found = read_back(converted(tmp_path / "a.mcap", tmp_path / "a.rrd").path)
+    np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
+    shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
+    assert np.isnan(shown[0, 1:]).all()  # none of them was sampled before
+    line = np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25))
+    assert_drawn(shown[1:], line)
+
+
+def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_path):
+    t = START + np.arange(60, dtype=np.int64) * 10_000_000
+    with SessionWriter(tmp_path / "a.mcap", session_id="", epoch_ns=START) as w:
+        both = w.joint_state("/joint_states", ["left", "right"], unit="rad")
+        other = w.joint_state("/gripper/state", ["finger"], unit="m")
+        for i, t_ns in enumerate(t.tolist()):
+            angles = np.full(2, np.nan)
+            angles[i % 2] = i
+            both.write(t_ns, angles)
+            other.write(t_ns, np.array([0.01]))
+    written = converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
+    found = read_back(written.path)
+    right = rows(found.column("/joints/measured/right", "Angle:degrees"))
+    assert_drawn(np.radians(right), np.arange(1.0, 60.0, 2.0)[:, None])
+    assert len(found.column("/signals/gripper/state", "Scalars:scalars")) == 60
+    assert [signal.title for signal in written.content.signals] == ["gripper/state [m]"]
+
+
+def test_a_session_without_messages_is_an_error(tmp_path):
+    with SessionWriter(tmp_path / "a.mcap", session_id="empty", epoch_ns=START) as w:
+        w.joint_state("/joint_states", ["a"], unit="rad")
+    with pytest.raises(DataError, match="no messages"):
+        converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
+
+
+def test_rerun_opens_our_sessions_itself_with_the_joints_named(
+    session_file, truth, read_back, tmp_path, rerun_command
+):
+    path = tmp_path / "native.rrd"
+    names = [f"joint{i:02d}" for i in range(1, 26)]
+    rerun_command("mcap", "convert", session_file, "-o", path)
+    rerun_command("rrd", "verify", path)
+    printed = rerun_command("rrd", "print", "-vvv", "--entity", "/joint_states/position", path)
+    assert ", ".join(names[:10]) in printed  # it cuts long lists short
+    found = read_back(path)
+    assert found.column("/joint_states/position", "SeriesLines:names")[0] == names
+    np.testing.assert_array_equal(
+        rows(found.column("/joint_states/position", "Scalars:scalars")), truth.position
+    )
