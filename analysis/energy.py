@@ -187,16 +187,8 @@ def energy_result(
     """Set the energies out in cycles.
 
     Args:
-        session: An open session.
-        columns: Its columns.
-        energies: By joint name.
-        span: The window.
-        transport: Cost of transport.
         closure: Against the ledger, or None.
         warn: Told where E_el is made of the supply's voltage.
-
-    Returns:
-        The result.
     """
     shift_s = (span.origin_ns - session.start_ns) * 1e-9
     edges = np.linspace(span.start_s, span.stop_s, max(span.cycles, 1) + 1) + shift_s
@@ -235,10 +227,6 @@ def energy_result(
 
 def electrical_source(session: SessionView, columns: Columns) -> str | None:
     """What electrical energy is made of.
-
-    Args:
-        session: An open session.
-        columns: Its columns.
 
     Returns:
         ``simulated``, ``motor``, ``supply``, or None where current or voltage was not recorded.
@@ -296,9 +284,6 @@ def check_ledger(
     """Compare the joints' energies with the ledger's over the same window, and close its balance.
 
     Args:
-        session: An open session.
-        energies: Of all joints.
-        span: The window.
         warn: Told where they differ by more than ``TOLERANCE``.
 
     Returns:
@@ -338,10 +323,6 @@ def check_ledger(
 def booked_energies(session: SessionView, span: Span) -> dict[str, float] | None:
     """What the twin's ledger books over a window.
 
-    Args:
-        session: An open session.
-        span: The window.
-
     Returns:
         Energies of the whole robot [J], by the ledger's terms; None where there is no ledger.
 
@@ -366,9 +347,6 @@ def booked_energies(session: SessionView, span: Span) -> dict[str, float] | None
 
 def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
     """Energies of all joints together.
-
-    Args:
-        energies: Of the joints.
 
     Returns:
         Sums [J], by the names in :data:`TERMS`, with ``el_abs`` besides; those that no joint has
@@ -401,10 +379,8 @@ def transport(
     """Cost of transport of a session.
 
     Args:
-        session: An open session.
         responses: Measured joint angles that can be trusted, by name.
         energies: By joint name, in cycles.
-        span: Whole cycles.
         warn: Told why there is no value.
 
     Returns:

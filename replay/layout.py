@@ -48,15 +48,11 @@ class Views:
     Attributes:
         scene: The body in space, or None.
         mode: The gait's mode, or None.
-        words: Facts and events.
-        angles: Joint angles.
         effort: Power and whatever else the joints report.
         bars: Response of each joint.
-        maps: Segments against cycles.
         steps: Cycle by cycle.
         mean_scene: The body in the mean cycle, or None.
         mean_words: What the mean cycle is.
-        mean_plots: Its angles and power.
     """
 
     scene: rrb.Spatial3DView | None
@@ -81,14 +77,7 @@ class Views:
 
 
 def build_views(content: Content) -> Views:
-    """The views of what a recording holds.
-
-    Args:
-        content: What it holds.
-
-    Returns:
-        The views.
-    """
+    """The views of what a recording holds."""
     words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
     if content.has_events:
         words.append(rrb.TextLogView(name="Events", contents=[f"{gait.EVENTS}/**"]))
@@ -352,7 +341,6 @@ def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
     """Lay out the views of what a recording holds.
 
     Args:
-        content: What it holds.
         front: The tab in front; the session's where the recording has no such tab. In front, the
             mean cycle plays on its own timeline.
 

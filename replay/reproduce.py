@@ -65,11 +65,7 @@ def sameness(one: Path, other: Path) -> Sameness:
     """Hold two sessions against each other, topic by topic.
 
     Args:
-        one: A session.
         other: Another one, of the same time.
-
-    Returns:
-        What is the same.
 
     Raises:
         LogError: If one can't be read.
@@ -110,7 +106,6 @@ class Repetition:
 
     Attributes:
         original: The session that commands are taken from.
-        driven: Its commands.
         scenario: The world that they are given in.
     """
 
@@ -126,7 +121,6 @@ class Again:
     Attributes:
         original: The session that commands were taken from.
         scenario: Where they were given again.
-        recording: The new session.
         same: What of it is the same to the last bit; None where the first is no run of the twin.
         comparison: What differs as the analysis has it; None where it can't be told.
         not_compared: Why it can't.
@@ -149,7 +143,6 @@ def find_repetition(
     """Find a session's commands, and a world for them.
 
     Args:
-        original: The session.
         world: A scenario's name or file; the world that the session was recorded in if None.
         changes: Keys of the world's scenario, with dots, to the values that they are to have.
         duration_s: How long [s]; as long as there are commands if None.
@@ -180,13 +173,8 @@ def replay_in_twin(
 
     Args:
         repetition: What, and where.
-        output: The session to write.
-        force: Replace an existing file.
         stop: Looked at between samples: the joints come to rest, then the run ends.
         on_sample: Told of each sample after it was written.
-
-    Returns:
-        How it went.
 
     Raises:
         SimulationError: If the twin's state becomes impossible.
@@ -207,10 +195,6 @@ def replay_in_twin(
 def compared(first: SessionView, second: SessionView) -> tuple[Comparison | None, str | None]:
     """Hold a run against the one that its commands were taken from.
 
-    Args:
-        first: That one.
-        second: The new one.
-
     Returns:
         What differs; or None, and why that can't be told, e.g. of a run shorter than two cycles.
     """
@@ -226,8 +210,6 @@ def what_next(original: Path, again: Path, *, comparable: bool) -> list[str]:
     """What to do with a session and its repetition.
 
     Args:
-        original: The session.
-        again: The new one.
         comparable: Whether they can be compared.
 
     Returns:
@@ -255,16 +237,12 @@ def replay_on_bus(
     """Give a session's commands again on a bus, and say how it went and what differs.
 
     Args:
-        file: The session.
-        on: The bus.
-        show: Prints a comparison.
         arm: Whether commands are sent; a dry run in the twin if not.
         robot: The robot on the bus, a name or a file; the session's own if None.
         duration_s: How long [s]; as long as there are commands if None.
         output: The session to write; a dry run needs none.
         recorder: Control socket of a recorder that is told the gait; the only one that runs if
             None.
-        force: Replace an existing session.
         as_json: Report as one JSON object.
 
     Returns:

@@ -71,13 +71,9 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
     """Look for wraps and jumps.
 
     Args:
-        position: Measured positions.
         most_rate: Rate that the joint can't exceed [rad/s].
         released: Stretches in which the position was frozen: the step at the end of one is the
             way that the joint has gone meanwhile.
-
-    Returns:
-        What was found.
     """
     t_s, value = position.t_s, position.values
     nothing = Jumps((), 0.0, ())
@@ -150,10 +146,6 @@ class _Joint:
 
 def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ...]:
     """Look at the whole session, joint by joint.
-
-    Args:
-        session: An open session.
-        columns: Its columns.
 
     Returns:
         What was found, in chain order.

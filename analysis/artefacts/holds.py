@@ -67,7 +67,6 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
     """Stretches in which a position stays exactly the same while the joint must move.
 
     Args:
-        position: Measured positions.
         motion: What says that it moves: its command, or its velocity integrated over time.
         way: Its velocity integrated over time, if known.
 
@@ -102,9 +101,6 @@ def stale(position: Series) -> tuple[Span, ...]:
 
     Looked at where the motion is fast: where the change over four samples is more than half of
     the usual most (95 %), and more than eight times the smallest step that the sensor ever shows.
-
-    Args:
-        position: Measured positions.
 
     Returns:
         Stretches in which more than ``STALE_SHARE`` of the fast samples repeat the one before, and
@@ -177,7 +173,6 @@ def clipped(
     has lost that height.
 
     Args:
-        series: Any quantity.
         limits: Values at which it may stay by itself, e.g. a joint limit or the supply voltage.
         command: Of a driven joint whose position this is.
 

@@ -100,9 +100,6 @@ def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Sp
     """Stretches in which a channel is at a limit.
 
     Args:
-        one: The channel.
-        lower: Lower limit.
-        upper: Upper limit.
         slack: This close to a limit is at it.
 
     Returns:
@@ -124,7 +121,6 @@ def stalled(
 
     Args:
         effort: Torque, or motor current.
-        position: Measured positions.
         most: Torque or current at standstill and full voltage; None where it is not known.
         asked: Its command, or else its position: what it does at most, 95 % of the time less,
             tells what standing still is.

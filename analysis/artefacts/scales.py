@@ -60,7 +60,6 @@ def inside(t_s: FloatArray, spans: Iterable[Span]) -> BoolArray:
 
     Args:
         t_s: Times, increasing [s], shape (n,).
-        spans: Stretches, their ends included.
 
     Returns:
         Shape (n,).
@@ -128,9 +127,6 @@ class Compared:
 
         Args:
             marked: Shape (c,).
-
-        Returns:
-            Neighbours joined.
         """
         found: list[Span] = []
         for start, stop in zip(
@@ -145,9 +141,6 @@ class Compared:
 
 def turns(one: Series) -> FloatArray:
     """Times at which a signal swings up through its middle.
-
-    Args:
-        one: The signal.
 
     Returns:
         Between them lies a cycle each [s]; with hysteresis, so that noise makes none.
@@ -165,14 +158,9 @@ def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool =
     """Compare two channels over each cycle.
 
     Args:
-        first: Its times are used.
-        second: Interpolated to them.
         edges_s: Edges of the cycles [s], shape (c + 1,); the first and the last cycle reach to the
             ends of ``first``; with fewer than two edges all of it is one.
         noisy: Whether the error counts with the autocorrelation of what differs.
-
-    Returns:
-        The comparison.
     """
     inner = edges_s[1:-1] if edges_s.size > 2 else np.zeros(0)
     starts: IntArray = np.concatenate(([0], np.searchsorted(first.t_s, inner)))
@@ -199,9 +187,6 @@ def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool =
 
 def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
     """Wrong sign and unit of a position, from its command.
-
-    Args:
-        one: Position against command.
 
     Returns:
         ``wrong_sign`` and ``wrong_unit`` to stretches, those that were found.

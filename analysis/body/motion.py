@@ -54,9 +54,6 @@ def place_links(count: int) -> tuple[int, int, int]:
 
     Args:
         count: Number of links; of an even number the front one of the two middle links.
-
-    Returns:
-        Three indices.
     """
     return 0, (count - 1) // 2, count - 1
 
@@ -105,7 +102,6 @@ def observed(robot: Robot, plane: Plane, seen: Track, omega: float) -> tuple[Bod
     """Transverse amplitude and phase of head, middle and tail.
 
     Args:
-        robot: The robot.
         plane: Plane of the motion: horizontal is seen to the left of the heading, vertical up.
         seen: Where the three links were.
         omega: Gait frequency [rad/s].
@@ -154,7 +150,6 @@ def perfect_tracking(
     """The same three points if every joint were exactly on its command.
 
     Args:
-        robot: The robot.
         plane: The driven plane; joints of the other plane are straight.
         commands: By joint index: harmonics of the command (complex amplitudes) and its mean [rad].
         omega: Gait frequency [rad/s].
@@ -239,7 +234,6 @@ def body_motion(
     """Head, middle and tail across the mean heading, beside their null.
 
     Args:
-        session: An open session.
         responses: Measured joint angles by name, on the analysed stretch.
         gait: The fitted gait, or None.
         span: Whole cycles to look at.
@@ -307,9 +301,7 @@ def head_poses(
     """The head's poses within a window.
 
     Args:
-        session: An open session.
         head: Name of the head link.
-        span: The window.
 
     Returns:
         Times from the window's origin [s], shape (n,), positions [m], shape (n, 3), and unit

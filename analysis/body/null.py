@@ -63,7 +63,6 @@ def viscous_chain(robot: Robot, ratio: float = DRAG_RATIO) -> Chain:
     """The robot's chain under anisotropic viscous drag, without inertia.
 
     Args:
-        robot: The robot.
         ratio: K = c_n / c_t.
 
     Returns:
@@ -77,11 +76,7 @@ def free_chain(robot: Robot, plane: Plane) -> Chain:
     """The robot's chain that nothing touches, at rest as a whole.
 
     Args:
-        robot: The robot.
         plane: The plane of motion; it says which moment of inertia counts.
-
-    Returns:
-        The chain.
     """
     length = np.array([link.length for link in robot.links])
     mass = np.array([link.mass for link in robot.links])
@@ -134,10 +129,7 @@ def places(chain: Chain, motion: Motion, links: tuple[int, ...], cycles: int) ->
     """Where some links are over several cycles.
 
     Args:
-        chain: The chain.
         motion: Its motion over one cycle.
-        links: Indices of the links.
-        cycles: How many cycles.
 
     Returns:
         Positions x + j y [m] of the link centres, shape (cycles * SAMPLES, number of links).

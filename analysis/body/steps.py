@@ -34,7 +34,6 @@ class Steps:
     Attributes:
         forward_m: Along the net displacement, horizontally [m], shape (c,).
         cycle_s: Length of a cycle [s].
-        mass_kg: Of the body.
     """
 
     forward_m: FloatArray
@@ -48,7 +47,6 @@ def body_steps(
     """Follow the centre of mass from cycle to cycle.
 
     Args:
-        session: An open session.
         responses: Measured joint angles by name.
         span: Whole cycles to look at.
         warn: Told why there is no result.
@@ -139,9 +137,6 @@ def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
 def speed(steps: Steps) -> tuple[float, float, float] | None:
     """Speed of the centre of mass along its net displacement.
 
-    Args:
-        steps: From cycle to cycle.
-
     Returns:
         Value [m/s], variance, degrees of freedom.
     """
@@ -152,7 +147,6 @@ def cost_of_transport(steps: Steps, energy_j: FloatArray) -> tuple[float, float,
     """E_abs / (m g d), a ratio of means over cycles (delta method).
 
     Args:
-        steps: Of the same cycles.
         energy_j: E_abs of all joints together in each cycle [J], shape (c,).
 
     Returns:

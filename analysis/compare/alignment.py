@@ -34,9 +34,6 @@ _ORDER = ("robot", *_FILES, "session")
 def facts_of(session: SessionView) -> dict[str, str]:
     """What a session says of how it was made.
 
-    Args:
-        session: An open session.
-
     Returns:
         Dotted names to text: of the attached robot, scenario and plan (e.g.
         ``scenario.toml: servo_of.joint03.stall_torque``), and of the metadata.
@@ -131,9 +128,6 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
         b: Runs of the other, at least one.
         any_gait: Compare the responses although the gaits differ.
 
-    Returns:
-        The joints in common.
-
     Raises:
         DataError: If a session has no gait, no joint is in all of them, or the gaits differ and
             that is not allowed.
@@ -175,7 +169,6 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
     """What makes a run's gait another one than the model's.
 
     Args:
-        run: A run.
         model: The run that it is held against.
         names: Joints to look at, driven in both.
 

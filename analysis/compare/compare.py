@@ -29,10 +29,6 @@ from .side import Quantities, Seen, independent, phases_rad, see, turned
 def broken_joints(a: Sequence[Seen], b: Sequence[Seen]) -> tuple[BrokenJoint, ...]:
     """Find the joints that do not follow, or stand off their command, on one side only.
 
-    Args:
-        a: Sessions of side A.
-        b: Those of side B.
-
     Returns:
         The joints in the order of the answers, those that do not follow first.
     """
@@ -103,11 +99,6 @@ def compare_sessions(
 
     Args:
         a: An open session, or several, each used once and in turn.
-        b: The other side.
-        choices: What the user chose.
-
-    Returns:
-        The comparison.
 
     Raises:
         MissingChannelError: If a session has neither commands nor responses.
@@ -141,13 +132,7 @@ def compare_seen(
     """Compare what was taken from the sessions.
 
     Args:
-        a: Side A.
-        b: Side B.
-        choices: What the user chose.
         warnings: What was said so far.
-
-    Returns:
-        The comparison.
 
     Raises:
         DataError: If sessions have no gait, no joint in common or another gait.

@@ -30,7 +30,6 @@ class Margins:
     """Differences below which two sides count as the same.
 
     Attributes:
-        gain: Of ln gain.
         lag_rad: [rad].
         relative: Of energies (as a share of side A's mean over the joints), speed and cost of
             transport.
@@ -48,7 +47,6 @@ class Decided:
     Attributes:
         differences: Beyond doubt first, by size, then the others by p.
         named: Joints that answer differently, the largest difference first.
-        equivalence: One a quantity.
     """
 
     differences: tuple[Difference, ...]
@@ -60,8 +58,6 @@ def family(a: Sequence[Seen], b: Sequence[Seen], joints: Sequence[str]) -> list[
     """What every session of both sides knows.
 
     Args:
-        a: Sessions of side A.
-        b: Sessions of side B.
         joints: Joints in common, head to tail.
 
     Returns:
@@ -97,7 +93,6 @@ def estimates_of(side: Sequence[Seen], keys: Sequence[Key], lags_about: FloatArr
     """Estimates of a side as arrays.
 
     Args:
-        side: Its sessions.
         keys: What to take, k.
         lags_about: Lags are taken within pi of these, shape (k,).
 
@@ -118,13 +113,7 @@ def decide(
 
     Args:
         keys: What each is, k.
-        a: Side A.
-        b: Side B.
-        found: B minus A.
         margins: What counts as the same.
-
-    Returns:
-        The decisions.
     """
     p, adjusted, half = found.p, holm(found.p), found.half
     kinds = np.array([quantity for quantity, _ in keys])
@@ -225,7 +214,6 @@ def answer_of(
     """Verdict and answer.
 
     Args:
-        decided: The decisions.
         partial: Whether something could not be compared.
         broken: Joints that do not follow their command on one side only: the first difference.
 
@@ -278,9 +266,6 @@ def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
 def told(one: Difference) -> str:
     """A difference with its interval.
 
-    Args:
-        one: The difference.
-
     Returns:
         For example ``gain −8.1 % [−8.6, −7.6]``.
     """
@@ -289,9 +274,6 @@ def told(one: Difference) -> str:
 
 def in_people_units(one: Difference) -> tuple[Estimate, str]:
     """A difference in the unit people read.
-
-    Args:
-        one: The difference.
 
     Returns:
         Percent for gains, degrees for lags, and for the others percent of side A.
@@ -310,7 +292,6 @@ def signed(quantity: Estimate, unit: str) -> str:
 
     Args:
         quantity: In ``unit``.
-        unit: With its own space.
 
     Returns:
         For example ``+1.9° [1.7, 2.1]``.

@@ -121,10 +121,6 @@ def independent(a: Quantities, b: Quantities) -> Differences:
 
     Args:
         a: One side, k quantities.
-        b: The other.
-
-    Returns:
-        The differences.
     """
     variances = np.stack([a.variance, b.variance])
     return Differences(
@@ -140,9 +136,6 @@ def paired(a: FloatArray, b: FloatArray) -> Differences:
     Args:
         a: Shape (r, k).
         b: Shape (r, k); run i belongs to run i of ``a``.
-
-    Returns:
-        The differences.
 
     Raises:
         UsageError: If there are fewer than 2 pairs, or the runs don't pair up.
@@ -194,7 +187,6 @@ def cycles_by_phase(
     so nothing of the gait itself is lost between samples.
 
     Args:
-        one: The response.
         fit: The fit that holds it.
         channel: Its index in the fit.
         zero_rad: Phase of the reference command's fundamental at t = 0 [rad].
@@ -236,8 +228,6 @@ class Seen:
     """One session.
 
     Attributes:
-        analysis: Its numbers.
-        run: Its gait.
         facts: What it says of how it was made.
         estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
             cost of transport of the body.
@@ -257,12 +247,7 @@ def see(session: SessionView, options: Options, warn: Warn) -> Seen:
     """Take from a session what a comparison needs.
 
     Args:
-        session: An open session.
-        options: What the user chose.
         warn: Told what the session lacks.
-
-    Returns:
-        The estimates.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.

@@ -41,7 +41,6 @@ class Witness:
 
     Attributes:
         effort: Motor current, or else effort, or None.
-        quantity: Its name.
         second: Positions by a second sensor, or None.
     """
 
@@ -55,7 +54,6 @@ class Witness:
 
         Args:
             columns: The session's columns.
-            name: Of the joint.
             series: Takes a signal into the form of the estimators.
 
         Returns:
@@ -75,12 +73,6 @@ def decide(cycles: Cycles, joint: int, one: Fitted, witness: Witness) -> tuple[s
 
     A motor that dry friction holds pulls ever harder, from one direction to the other, while the
     command crosses the band; one that crosses a gear's play has nothing to pull.
-
-    Args:
-        cycles: The motion.
-        joint: Index.
-        one: Its fit.
-        witness: What else is recorded.
 
     Returns:
         The kind, and what decides it.
@@ -229,7 +221,6 @@ def dead_bands(
     Args:
         columns: The session's columns, for efforts, currents and second sensors.
         commands: By joint name, on the analysed stretch.
-        responses: The same.
         gait: The fitted gait, or None.
         origin_ns: Unix time of the series' origin [ns].
 

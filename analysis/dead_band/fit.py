@@ -61,7 +61,6 @@ class Fitted:
         travel: W after top and bottom, with lower and upper end [rad], shape (2, 3).
         step: b of both, the same [rad of the command], shape (2, 3).
         cost: Residual sum of squares [rad^2].
-        independent: Number of independent residuals.
         rests: Where the model rests, the warm-up included, shape (k, n).
         follower: z [rad], the same.
     """
@@ -82,14 +81,10 @@ def fit_dead_bands(
     """Fit the model to some joints, all in step.
 
     Args:
-        cycles: Their motion.
         omega: Of the gait [rad/s].
         amplitude: Of the commands [rad], shape (j,).
         lag: Of the fundamentals, in [0, 2 pi) [rad], shape (j,).
         resolution: Smallest step that each sensor shows [rad], shape (j,).
-
-    Returns:
-        One fit a joint.
     """
     joints = np.arange(len(amplitude), dtype=np.int64)
     scales = _Scales(cycles.period_s, omega, amplitude, resolution)

@@ -83,7 +83,6 @@ class Cycles:
     """Whole cycles of some joints that share their sampling times.
 
     Attributes:
-        commands: One a joint.
         t_s: Times of k windows, each with its warm-up, shape (k, n).
         first: First sample of a window after its warm-up.
         measured: Positions [rad], shape (j, k, n).
@@ -105,14 +104,7 @@ class Cycles:
         return np.diff(self.t_s, axis=1, prepend=2 * self.t_s[:, :1] - self.t_s[:, 1:2])
 
     def some(self, count: int) -> Cycles:
-        """Fewer of the windows, evenly spread.
-
-        Args:
-            count: At most so many.
-
-        Returns:
-            The same joints.
-        """
+        """Fewer of the windows, evenly spread."""
         kept = _spread(np.arange(len(self.t_s)), count)
         return Cycles(self.commands, self.t_s[kept], self.first, self.measured[:, kept])
 
@@ -120,7 +112,6 @@ class Cycles:
         """A joint's command at all times.
 
         Args:
-            joint: Index.
             delay_s: How much earlier [s].
 
         Returns:
@@ -135,7 +126,6 @@ def whole_cycles(
     """Cut the motion of some joints into cycles.
 
     Args:
-        commands: One a joint.
         responses: One a joint, all of the same times.
         omega: Of the gait [rad/s].
         most: So many cycles, evenly spread.
@@ -184,7 +174,6 @@ def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
     """Hold the model against what was measured; gain and offset are fitted.
 
     Args:
-        cycles: The motion.
         joint: Index of each row's joint, shape (r,).
         parameters: Shape (r, 5).
 

@@ -34,7 +34,6 @@ class Weighed:
         weights: Time that each stands for, gaps not bridged [s], shape (n,).
         starts: Where the cycles begin and the last one ends, shape (c + 1,).
         covered: Fraction of each cycle that has samples, shape (c,).
-        coverage: Fraction of the window.
     """
 
     t_s: FloatArray
@@ -110,8 +109,6 @@ class Drift:
     """Drift of one joint's response.
 
     Attributes:
-        name: Joint name.
-        log_gain: Per cycle.
         phase_rad: Per cycle [rad].
     """
 

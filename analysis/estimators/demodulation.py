@@ -110,7 +110,6 @@ def demodulate(
     """Complex amplitudes of command and response in each cycle of a run.
 
     Args:
-        command: Commands of the joint.
         response: Its responses, on their own times.
         phase: Its phase over the run.
         edges_s: Edges of the cycles [s], shape (c + 1,), from :meth:`Phase.edges_s` of its plane.
@@ -217,12 +216,7 @@ def _amplitudes(one: Series, phase: Phase, edges_s: FloatArray) -> tuple[Complex
 def _moments(
     phase: FloatArray, values: FloatArray, starts: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums over each cycle, all that the fit needs.
-
-    Returns:
-        Of cos(m Phi) and sin(m Phi), m = 1 .. 4, shape (4, 2, c); of the values times 1 and times
-        cosine and sine of the first two, shape (5, c); and of the squared values, shape (c,).
-    """
+    """Sums over each cycle, all that the fit needs."""
     count = starts.size - 1
     sums = np.empty((14, count))
     # So many cycles at a time that their rows stay in the processor's cache.

@@ -123,7 +123,6 @@ def basis(
     Args:
         t_s: Times [s], shape (n,).
         omega: Angular frequency [rad/s].
-        model: Basis.
         scale: Unit of the scaled time [s].
         spare: So many rows are left at the end, to be filled.
 
@@ -153,14 +152,7 @@ def basis(
 
 
 def chunks(count: int) -> Iterator[slice]:
-    """Slices that cut a record into pieces of at most ``CHUNK`` samples.
-
-    Args:
-        count: Samples in the record.
-
-    Yields:
-        Consecutive slices.
-    """
+    """Slices that cut a record into pieces of at most ``CHUNK`` samples."""
     for start in range(0, count, CHUNK):
         yield slice(start, min(start + CHUNK, count))
 
@@ -183,7 +175,6 @@ def solve(series: Sequence[Series], omega: float, model: HarmonicModel) -> Solve
     Args:
         series: The channels, k of them.
         omega: Angular frequency [rad/s].
-        model: Basis.
 
     Returns:
         Parameters, and what a step of omega needs.
@@ -289,7 +280,6 @@ class HarmonicFit:
         total: Sum of squares about the mean, shape (K,).
         count: Samples, shape (K,).
         mean_time_s: Mean sampling time, shape (K,).
-        model: What was fitted.
         lines: Complex amplitudes of the model's further lines, shape (K, lines).
     """
 
@@ -344,7 +334,6 @@ class HarmonicFit:
         """The fitted model of one channel.
 
         Args:
-            channel: Index of the channel.
             t_s: Times [s], any shape.
 
         Returns:
@@ -369,9 +358,6 @@ def fit_shared(
         series: Channels, each on its own times.
         omega_guess: Start [rad/s], within about a quarter of 2 pi over the record's length.
         model: Basis; three harmonics and a constant if None.
-
-    Returns:
-        The fit.
 
     Raises:
         DataError: If a channel has too few samples for the model, or no frequency fits.
@@ -405,9 +391,6 @@ def fit_at(
         series: Channels, each on its own times.
         omega: Angular frequency [rad/s].
         model: Basis; three harmonics and a constant if None.
-
-    Returns:
-        The fit.
 
     Raises:
         DataError: If a channel has too few samples for the model.

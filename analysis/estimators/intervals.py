@@ -65,9 +65,6 @@ class ResponseErrors:
 
         Args:
             chosen: Indices, k of them.
-
-        Returns:
-            Their errors.
         """
         index = np.asarray(chosen, dtype=np.int64)
         return ResponseErrors(self.bins[index], self.rounding[index], self.turn[index])
@@ -86,7 +83,6 @@ def response_errors(
 
     Args:
         command: Fundamentals c of the commands, shape (m,).
-        command_bins: Their residuals.
         response: Fundamentals a of the responses, shape (m,).
         response_bins: Their residuals, in the same bins.
         omega_variance: Variance of the shared frequency [(rad/s)^2].
@@ -199,7 +195,6 @@ def t_factor(dof: float, confidence: float = CONFIDENCE) -> float:
     """Two-sided Student factor.
 
     Args:
-        dof: Degrees of freedom.
         confidence: E.g. 0.95.
 
     Returns:
@@ -209,15 +204,7 @@ def t_factor(dof: float, confidence: float = CONFIDENCE) -> float:
 
 
 def around(value: float, half: float) -> Interval:
-    """The interval of a value with a half width.
-
-    Args:
-        value: Centre.
-        half: Half width.
-
-    Returns:
-        Low and high end.
-    """
+    """The interval of a value with a half width."""
     return value - half, value + half
 
 
@@ -242,10 +229,6 @@ class Noisy(Protocol):
 
 def noise_draws(matrix: Noisy, seed: int) -> FloatArray:
     """Errors that a measured matrix may have.
-
-    Args:
-        matrix: With standard errors.
-        seed: Of the draws.
 
     Returns:
         Student draws, shape (DRAWS, n, m). Where errors of a column are correlated their variances
@@ -274,7 +257,6 @@ def norm_ratio(
         above: Any shape.
         above_noise: Draws of its error, shape (draws, ...).
         below: Any shape.
-        below_noise: Draws of its error.
 
     Returns:
         The ratio with its interval, at least 95 %; without a value where what is below can't be

@@ -124,10 +124,8 @@ def rounding_covariance(
     half as many different errors while it keeps its phase. The larger of both counts.
 
     Args:
-        one: The channel.
         fit: The fit that holds it.
         channel: Its index in the fit.
-        step: Step of its lattice.
         noise: Standard deviation of what else moves it, from :func:`steady_noise`.
 
     Returns:
@@ -176,9 +174,6 @@ def not_negative(symmetric: FloatArray) -> FloatArray:
 
 def draws(samples: int) -> int:
     """How many draws :func:`rounding_covariance` makes.
-
-    Args:
-        samples: Of a channel.
 
     Returns:
         Fewer for a record that is long.

@@ -95,7 +95,6 @@ def clean(name: str, t_ns: IntArray, values: FloatArray, origin_ns: int) -> Seri
     of a Unix time in seconds resolves 0.2 microseconds only).
 
     Args:
-        name: Channel name.
         t_ns: Unix times [ns], any order, shape (n,).
         values: Values, NaN where there is none, shape (n,).
         origin_ns: Unix time that becomes 0 s.
@@ -135,7 +134,6 @@ def clean_together(signals: Mapping[str, Signal], origin_ns: int) -> dict[str, S
     """Take several signals into that form; what shares its times goes on sharing them.
 
     Args:
-        signals: By any key.
         origin_ns: Unix time that becomes 0 s.
 
     Returns:
@@ -159,9 +157,6 @@ def gaps_after(step_s: FloatArray) -> IntArray:
 
     Args:
         step_s: The intervals, all above 0 [s], shape (n,).
-
-    Returns:
-        Their indices.
     """
     if step_s.size == 0 or _all_usual(step_s, float(step_s.max())):
         return np.zeros(0, dtype=np.int64)
@@ -221,9 +216,6 @@ def coverage(t_s: FloatArray, start_s: float, stop_s: float) -> float:
 
 def shared_times(series: Sequence[Series]) -> list[list[int]]:
     """Group channels that were sampled at the same times.
-
-    Args:
-        series: Channels.
 
     Returns:
         Indices into ``series``, grouped; every index once.

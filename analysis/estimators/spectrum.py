@@ -79,9 +79,6 @@ def bins_per_side(cycles: float) -> int:
     They stay within the inner two thirds of the band between zero and the second harmonic, where
     neither the constant nor a harmonic has taken the noise away.
 
-    Args:
-        cycles: Cycles in the record.
-
     Returns:
         From 1 to ``BINS_PER_SIDE``.
     """
@@ -116,9 +113,6 @@ class ResidualBins:
 
         Args:
             chosen: Indices, k of them; an index may come more than once.
-
-        Returns:
-            Their bins.
         """
         index = np.asarray(chosen, dtype=np.int64)
         return ResidualBins(
@@ -136,7 +130,6 @@ def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
 
     Args:
         series: The channels that were fitted.
-        fit: Their fit.
 
     Returns:
         Level, degrees of freedom and covariance.
@@ -153,7 +146,6 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
 
     Args:
         series: The channels that were fitted.
-        fit: Their fit.
 
     Returns:
         The noise, as from :func:`residual_noise`, and the common bins.
@@ -243,7 +235,6 @@ def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
 
     Args:
         fit: Fit with a shared frequency.
-        noise: Its noise.
 
     Returns:
         Variance [(rad/s)^2] and its degrees of freedom (Welch-Satterthwaite).
@@ -279,7 +270,6 @@ def residuals(
     """What a fit leaves of channels with shared times, turned back by the gait's own rotation.
 
     Args:
-        group: The channels.
         fit: The fit that holds them.
         members: Their indices in the fit.
 

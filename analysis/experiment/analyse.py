@@ -176,14 +176,7 @@ def _of_sweep(
 
 
 def one_way(ways: Sequence[Role]) -> bool:
-    """Whether all runs are of one direction.
-
-    Args:
-        ways: Of the runs.
-
-    Returns:
-        False without runs, too.
-    """
+    """Whether all runs are of one direction."""
     return len(set(ways)) == 1
 
 

@@ -31,9 +31,6 @@ from .reversal.modules import SIGNIFICANT
 def kick_answer(coupling: Coupling) -> str:
     """Answer from the coupling.
 
-    Args:
-        coupling: Of a kick experiment.
-
     Returns:
         One sentence without its full stop, intervals in square brackets.
     """
@@ -100,14 +97,7 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
 
 
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
-    """What stands below the answer.
-
-    Args:
-        coupling: Of a kick experiment.
-
-    Yields:
-        Sentences.
-    """
+    """What stands below the answer."""
     yield from kick_checks(coupling)
     yield from held_out_detail(coupling)
     size = coupling.kick_size
@@ -119,14 +109,7 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
 
 
 def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
-    """What was checked, and what the kicks say of a linear chain.
-
-    Args:
-        coupling: Of a kick experiment.
-
-    Yields:
-        Sentences.
-    """
+    """What was checked, and what the kicks say of a linear chain."""
     said = "pass" if coupling.checks_pass else "FAIL"
     yield (
         f"Time shift: rows of P sum to 1 within {_worst(coupling.phase_rows)}, rows of R to 0 "
@@ -148,14 +131,7 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
 
 
 def held_out_detail(coupling: LocalCoupling) -> Iterable[str]:
-    """How well runs that were not used are predicted.
-
-    Args:
-        coupling: Of a kick experiment.
-
-    Yields:
-        Sentences.
-    """
+    """How well runs that were not used are predicted."""
     for one in coupling.held_out:
         yield (
             f"Held out, {one.session}: deviations up to {one.size:.3f}, error "
@@ -197,9 +173,6 @@ _TOLD = {
 def sweep_answer(coupling: Coupling) -> str:
     """Answer from the coupling.
 
-    Args:
-        coupling: Of a sweep.
-
     Returns:
         One sentence without its full stop, intervals in square brackets.
     """
@@ -218,28 +191,14 @@ def sweep_answer(coupling: Coupling) -> str:
 
 
 def sweep_detail(coupling: LinearCoupling) -> Iterable[str]:
-    """What stands below the answer.
-
-    Args:
-        coupling: Of a sweep.
-
-    Yields:
-        Sentences.
-    """
+    """What stands below the answer."""
     for tone in coupling.tones:
         yield _tone(tone)
     yield from sweep_checks(coupling)
 
 
 def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
-    """What was checked of all tones together.
-
-    Args:
-        coupling: Of a sweep.
-
-    Yields:
-        Sentences.
-    """
+    """What was checked of all tones together."""
     yield f"{coupling.route_why[0].upper()}{coupling.route_why[1:]}."
     settled = (
         "settled"
@@ -256,9 +215,6 @@ def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
 
 def sweep_method(coupling: LinearCoupling) -> str:
     """How the numbers were made.
-
-    Args:
-        coupling: Of a sweep.
 
     Returns:
         A sentence in lower case, with its full stop.
@@ -332,10 +288,6 @@ def experiment_answer(
 def broken_first(sessions: Sequence[Analysis], answer: str) -> str:
     """Put the joints that do not follow their command before what an experiment shows.
 
-    Args:
-        sessions: Its sessions.
-        answer: What it shows.
-
     Returns:
         The answer, with a clause for each of these joints and where it was so.
     """
@@ -362,9 +314,6 @@ def _sessions(names: Sequence[str], count: int) -> str:
 def pair_order(pair: OrderedPair) -> str:
     """Which joint of a pair answers less.
 
-    Args:
-        pair: The pair.
-
     Returns:
         A clause; joints as they are named.
     """
@@ -372,14 +321,7 @@ def pair_order(pair: OrderedPair) -> str:
 
 
 def blind_spots(reversal: Reversal) -> str:
-    """What a reversal of these joints can't see.
-
-    Args:
-        reversal: Its result.
-
-    Returns:
-        A clause.
-    """
+    """What a reversal of these joints can't see."""
     middle = "" if reversal.middle is None else f" or of the middle joint, {reversal.middle}"
     return f"blind to what is alike at both joints of a pair{middle}"
 

@@ -115,10 +115,6 @@ def null_test(response: Response, joints: IntArray, model: NullModel, seed: int 
         response: Of r joints.
         joints: Their places among the model's joints, shape (r,).
         model: The model of m joints.
-        seed: Of the bootstrap.
-
-    Returns:
-        The test.
 
     Raises:
         DataError: If fewer numbers than unknowns were seen, or no shared parameters fit.
@@ -287,14 +283,6 @@ def analyse_with_null(
     session: SessionView, file: Path, options: Options | None = None
 ) -> ModelledAnalysis:
     """Everything that one session can tell, and its test against a null model.
-
-    Args:
-        session: An open session.
-        file: The null model.
-        options: What the user chose.
-
-    Returns:
-        The result.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.

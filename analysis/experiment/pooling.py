@@ -193,7 +193,6 @@ def pooled_answer(
     Args:
         robot: The robot, or None; then all joints are one chain.
         pooled: The response over the runs, two or more of them.
-        sessions: The runs' analyses.
 
     Returns:
         The answer; intervals contain the scatter from run to run.

@@ -207,7 +207,6 @@ def session_couplings(
     """Tell the couplings of each plane's oscillators.
 
     Args:
-        session: An open session.
         start_s: From when on, from the session's start [s]; all of it if None.
         stop_s: Until when [s].
 

@@ -73,7 +73,6 @@ class SpectrumIntervals:
         real: 95 % intervals of the rates' real parts, shape (m - 1, 2).
         imag: Of their imaginary parts, shape (m - 1, 2).
         gap: The slowest rate's real part.
-        strong: Number of strong modes.
         growth: Largest rate at which the sum of squares of a deviation can grow for a while [eps].
     """
 
@@ -89,9 +88,6 @@ def spectrum(P: FloatArray) -> Spectrum:
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (m, m).
-
-    Returns:
-        The modes.
     """
     found = eig(of_deviations(P), left=True, right=True)
     values, left, right = (np.asarray(one, dtype=np.complex128) for one in found)
@@ -134,15 +130,7 @@ def growth(P: FloatArray) -> float:
 
 
 def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
-    """What the noise of P leaves open, by drawing its errors anew.
-
-    Args:
-        P: With standard errors.
-        seed: Of the draws.
-
-    Returns:
-        The intervals.
-    """
+    """What the noise of P leaves open, by drawing its errors anew."""
     return intervals_of(P.value, P.value + noise_draws(P, seed))
 
 
@@ -156,9 +144,6 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
     Args:
         P: Its rows sum to 1, shape (m, m).
         drawn: P with errors that it may have, shape (draws, m, m).
-
-    Returns:
-        The intervals.
     """
     here = spectrum(P)
     draws = [spectrum(one) for one in drawn]
@@ -249,7 +234,6 @@ def pseudospectrum(P: Noisy, seed: int = 21) -> Pseudospectrum:
     """The levels around all eigenvalues.
 
     Args:
-        P: With standard errors.
         seed: Of the draws that tell the noise's norm.
 
     Returns:

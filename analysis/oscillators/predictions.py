@@ -178,9 +178,6 @@ def homogeneous(P: FloatArray) -> FloatArray:
 def path_laplacian(m: int) -> FloatArray:
     """Laplacian of a chain coupled to its next neighbours both ways, with open ends.
 
-    Args:
-        m: Oscillators.
-
     Returns:
         Shape (m, m); its eigenvalues are 4 sin^2(k pi / 2m), k = 0 .. m - 1.
     """
@@ -279,7 +276,6 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP
     """A matrix of a result with its errors.
 
     Args:
-        matrix: Of a coupling.
         correlation: Of a column's errors, shape (m, m), or None.
 
     Returns:

@@ -51,7 +51,6 @@ class PhaseLog:
     """Phases of one plane's oscillators.
 
     Attributes:
-        plane: Its name.
         names: Of its n joints, head to tail.
         t_ns: Times [Unix ns], shape (k,).
         phases: Without wrap-around [rad], shape (k, n).
@@ -75,7 +74,6 @@ def read_phases(
     """Read the phases of oscillators.
 
     Args:
-        session: An open session.
         start_ns: From when on [Unix ns]; from the start if None.
         stop_ns: Until when, not included; until the end if None.
 
@@ -216,8 +214,6 @@ class OscillatorFit:
         quadrature: K_ij sin(psi_ij) [1/s], shape (p,).
         covariance: Of each pair (in phase, quadrature), shape (p, 2, 2).
         gain: eps_i [1/s] where there are inputs.
-        gain_error: Its standard error.
-        dof: Degrees of freedom.
         noise: Of the state [rad/sqrt(s)].
         condition_number: Of the regressors, each of which is of size 1 at most.
     """
@@ -253,7 +249,6 @@ def fit_oscillator(
     """Estimate what turns one oscillator.
 
     Args:
-        pieces: Phases between kicks.
         period_s: Of their samples [s].
         target: Which oscillator, i.
         sources: Which may act on it, j.

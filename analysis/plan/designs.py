@@ -57,11 +57,9 @@ class PlannedRun:
     """One run's commands.
 
     Attributes:
-        label: For its file name.
         amplitude: Complex amplitudes of the driven joints' commands at the gait's frequency [rad],
             shape (m,).
         facts: What it is, for its metadata record.
-        more: Tones beside it.
     """
 
     label: str
@@ -153,7 +151,6 @@ def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tupl
     """As many gaits as there are joints, of the lags 2 pi k / m.
 
     Args:
-        m: Driven joints.
         amplitude: Of every command [rad].
         repeats: How often all of it is run.
         seed: Of the order, random so that warming up looks like no lag.
@@ -176,7 +173,6 @@ def multisine(
     """All joints at all tones in each of m runs, with the phases of a DFT matrix over the runs.
 
     Args:
-        m: Driven joints.
         amplitude: Of the first tone of every command [rad]; the others fall as 1 / omega^2, so
             that all of them need about the same torque, and none shakes the chain out of its
             linear range.
@@ -224,7 +220,6 @@ def period_s(omega: float, count: int) -> float:
 
     Args:
         omega: Of the gait [rad/s].
-        count: Tones.
 
     Returns:
         2 L - 1 periods of the gait.
@@ -259,17 +254,11 @@ def write_plan(
     """Write each run's commands to a session of its own.
 
     Args:
-        plan: Name of the design.
-        base: The gait.
-        runs: The runs.
         like: The session the gait is of; its robot, and the twin's scenario, go along.
         folder: Where to; made if it isn't there.
         settle_s: Time before what is to be measured [s].
         measure_s: Length of what is to be measured [s].
         facts: More for the metadata record of every run.
-
-    Returns:
-        The files.
 
     Raises:
         UsageError: If a command would leave the robot's joint limits, or a file is there already;
@@ -326,8 +315,6 @@ def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) ->
     """Commands of all joints.
 
     Args:
-        base: The gait.
-        run: The run.
         t_s: Times [s], shape (k,).
         ramp_s: Time over which the amplitude grows from zero without a corner [s].
 

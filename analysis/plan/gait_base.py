@@ -52,11 +52,7 @@ def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
     """The mode that takes longest to die away, of the planes that are driven.
 
     Args:
-        robot: Its links and servos.
         driven: Names of the driven joints, at least one.
-
-    Returns:
-        The mode.
     """
     poles = np.concatenate(
         [
@@ -74,7 +70,6 @@ def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
     """Mass matrix of the free straight chain bending in one plane.
 
     Args:
-        robot: Its links.
         plane: The plane; joints of the other one are rigid.
 
     Returns:
@@ -151,9 +146,6 @@ def base_gait(session: SessionView) -> BaseGait:
 
     Args:
         session: An open session with commands.
-
-    Returns:
-        The gait.
 
     Raises:
         UsageError: If it commands no steady gait of sines.

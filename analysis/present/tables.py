@@ -79,11 +79,7 @@ class Column(Generic[Row]):
         """The cells of the column.
 
         Args:
-            rows: Of the table.
             where: ``TERMINAL`` or ``PAGE``.
-
-        Returns:
-            One a row.
         """
         values = [_number(self.of(row)) for row in rows]
         digits = self.digits[where]
@@ -150,7 +146,6 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
     """The response of joints, on a terminal with their energies.
 
     Args:
-        analysis: Whose joints.
         joints: Those to show, in chain order.
     """
     frequency = Column[JointResult](
@@ -201,11 +196,7 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
 
 
 def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
-    """The energies of every joint over the analysed windows, all with the same digits.
-
-    Args:
-        joints: In chain order.
-    """
+    """The energies of every joint over the analysed windows, all with the same digits."""
     every = [Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints]
     digits = _significant(4)(every)
     columns: list[Column[JointResult]] = [Column(None, "joint", lambda j: j.name, kind="word")]
@@ -215,11 +206,7 @@ def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
 
 
 def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
-    """Head, middle and tail, for a terminal: measured, and the nulls beside it.
-
-    Args:
-        body: The motion.
-    """
+    """Head, middle and tail, for a terminal: measured, and the nulls beside it."""
     columns: list[Column[tuple[BodyPoint, ...]]] = [
         Column(f"body, {body.plane}", None, lambda points: points[0].place, kind="word"),
         Column("link", None, lambda points: points[0].link, kind="word"),
@@ -242,11 +229,7 @@ def _phase_deg(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
 
 
 def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
-    """Head, middle and tail, for the page: measured, and the nulls below it.
-
-    Args:
-        body: The motion.
-    """
+    """Head, middle and tail, for the page: measured, and the nulls below it."""
     rows: list[tuple[str, BodyPoint]] = []
     for point in body.observed:
         rows.append(("measured", point))
@@ -263,11 +246,7 @@ def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
 
 
 def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
-    """Heterogeneity indices.
-
-    Args:
-        indices: Name to index.
-    """
+    """Heterogeneity indices."""
 
     def value(index: Index) -> Estimate:
         return scaled(Estimate(index.value, index.ci95), math.degrees(1) if rad(index) else 1.0)
@@ -297,11 +276,7 @@ def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
 
 
 def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
-    """Each joint against its mirror joint.
-
-    Args:
-        reversal: The test.
-    """
+    """Each joint against its mirror joint."""
     relative, most = formats.relative, (_typical(3), _typical(5))
     columns: list[Column[MirrorJoint]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
@@ -314,11 +289,7 @@ def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
 
 
 def run_table(experiment: Experiment) -> Table[tuple[Run, Analysis]]:
-    """The sessions of an experiment.
-
-    Args:
-        experiment: The numbers.
-    """
+    """The sessions of an experiment."""
 
     def start(session: Analysis) -> str:
         return formats.utc(session.session.start_ns).replace(" UTC", "")
@@ -338,11 +309,7 @@ def run_table(experiment: Experiment) -> Table[tuple[Run, Analysis]]:
 
 
 def difference_table(comparison: Comparison) -> Table[Difference]:
-    """Every quantity of both sides.
-
-    Args:
-        comparison: The numbers.
-    """
+    """Every quantity of both sides."""
     columns: list[Column[Difference]] = [
         Column("joint", "where", lambda one: _place(one.place), kind="word"),
         Column("quantity", "quantity", lambda one: WORDS[one.quantity], kind="word"),
@@ -376,11 +343,7 @@ def _difference(one: Difference) -> Quantity:
 
 
 def named_table(comparison: Comparison) -> Table[NamedJoint]:
-    """The joints that differ, the largest difference first.
-
-    Args:
-        comparison: The numbers.
-    """
+    """The joints that differ, the largest difference first."""
     known = {(one.place, one.quantity): _difference(one) for one in comparison.differences}
     columns: list[Column[NamedJoint]] = [
         Column(None, "joint", lambda one: one.name, kind="word"),
@@ -393,11 +356,7 @@ def named_table(comparison: Comparison) -> Table[NamedJoint]:
 
 
 def waveform_table(comparison: Comparison) -> Table[Waveform]:
-    """How far the mean cycles of each joint are apart.
-
-    Args:
-        comparison: The numbers.
-    """
+    """How far the mean cycles of each joint are apart."""
     most, rms = "largest ° (95 %, by itself)", "RMS of B - A °"
     columns: list[Column[Waveform]] = [
         Column("mean cycle of", "joint", lambda one: one.name, kind="word"),

@@ -34,9 +34,6 @@ _SPANS = 3
 def more_lines(analysis: Analysis) -> Iterator[str]:
     """Lines to print after the tables.
 
-    Args:
-        analysis: The result.
-
     Yields:
         Plain text without a line break.
     """
@@ -116,9 +113,6 @@ def _over_time(analysis: Analysis) -> Iterator[str]:
 def chain_detail(chain: ChainCoupling) -> Iterable[str]:
     """A chain of oscillators, told from its phases.
 
-    Args:
-        chain: The result.
-
     Yields:
         Sentences; the first is the answer.
     """
@@ -145,9 +139,6 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
 def body_detail(body: BodyOscillators) -> Iterable[str]:
     """What oscillators that feel their servos would do on this body.
 
-    Args:
-        body: The result.
-
     Yields:
         Sentences; the first is the answer.
     """
@@ -172,7 +163,6 @@ class Sheet:
         """Begin.
 
         Args:
-            width: Columns of the terminal.
             color: Whether to use bold and dim type.
         """
         from rich.console import Console
@@ -193,16 +183,11 @@ class Sheet:
 
         Args:
             line: Any text; what would end a line or control a terminal is escaped.
-            style: Of the line.
         """
         self._console.print(plain(line), style=style)
 
     def table(self, table: tables.AnyTable) -> None:
-        """Add a table, without what it can spare where the terminal is too narrow for all of it.
-
-        Args:
-            table: The table.
-        """
+        """Add a table, without what it can spare where the terminal is too narrow for all of it."""
         columns = [column for column in table.columns if column.text is not None]
         cells = zip(*(column.cells(table.rows, TERMINAL) for column in columns), strict=True)
         styles = ["bold" if table.bold(row) else "" for row in table.rows]
@@ -249,7 +234,6 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     """Set a result as text.
 
     Args:
-        analysis: The result.
         width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
         color: Whether to use bold and dim type.
 
@@ -319,8 +303,6 @@ def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False
     """Set a prediction as text.
 
     Args:
-        loop: The prediction.
-        width: Columns of the terminal.
         color: Whether to use bold and dim type.
 
     Returns:

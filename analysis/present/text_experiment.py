@@ -35,7 +35,6 @@ def render_comparison(
     """Set a comparison as text.
 
     Args:
-        comparison: The result.
         width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
         color: Whether to use bold and dim type.
 
@@ -82,7 +81,6 @@ def margin_told(one: Equivalence, value: float | None = None) -> str:
     """A margin, or a difference that is held to it, in the unit people read.
 
     Args:
-        one: The test.
         value: In the test's unit; its margin if None.
 
     Returns:
@@ -109,9 +107,6 @@ def _equivalence(comparison: Comparison) -> str:
 def comparison_method(comparison: Comparison) -> str:
     """How a comparison was made.
 
-    Args:
-        comparison: The result.
-
     Returns:
         One sentence, beginning in lower case.
     """
@@ -134,7 +129,6 @@ def render_experiment(
     """Set an experiment as text.
 
     Args:
-        experiment: The result.
         width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
         color: Whether to use bold and dim type.
 
@@ -176,14 +170,7 @@ def render_experiment(
 
 
 def reversal_detail(reversal: Reversal) -> Iterable[str]:
-    """What stands below the answer.
-
-    Args:
-        reversal: The test.
-
-    Yields:
-        Sentences.
-    """
+    """What stands below the answer."""
     for pair in reversal.pairs:
         yield (
             f"{pair.name} against its mirror {pair.mirror}, over both directions: "
@@ -236,9 +223,6 @@ def _lag(lag_rad: Estimate) -> str:
 def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
     """Return the sessions' own warnings, each once, without what the experiment itself answers.
 
-    Args:
-        experiment: The result.
-
     Returns:
         Warning, and the names of the files that have it, or ``all sessions``.
     """
@@ -247,9 +231,6 @@ def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
 
 def by_note(experiment: Experiment) -> list[tuple[str, str]]:
     """Return the sessions' own notes, each once, without what the experiment itself answers.
-
-    Args:
-        experiment: The result.
 
     Returns:
         Note, and the names of the files that have it, or ``all sessions``.
@@ -277,9 +258,6 @@ def _by_sentence(
 
 def method(experiment: Experiment) -> str:
     """How the numbers of an experiment were made.
-
-    Args:
-        experiment: The result.
 
     Returns:
         One sentence, beginning in lower case.

@@ -45,7 +45,6 @@ class GaitFit:
     Attributes:
         fit: Commands of the ``driven`` joints, then responses of the ``answered`` ones.
         omega_error: Standard error of the shared frequency [rad/s].
-        omega_dof: Its degrees of freedom.
         driven: Names of the joints that the gait drives, head to tail.
         answered: Those of them with a usable response.
         response: Of the ``answered`` joints.
@@ -76,9 +75,6 @@ class GaitFit:
     def group_of(self, joint: str) -> int | None:
         """Find the group that a joint is in.
 
-        Args:
-            joint: Its name.
-
         Returns:
             The group's index in ``groups``; None where the gait does not drive the joint.
         """
@@ -88,14 +84,7 @@ class GaitFit:
         return None
 
     def command_of(self, joint: str) -> int:
-        """Index of a driven joint's command in the fit.
-
-        Args:
-            joint: Its name.
-
-        Returns:
-            The index.
-        """
+        """Index of a driven joint's command in the fit."""
         return self.driven.index(joint)
 
 
@@ -115,7 +104,6 @@ def fit_gait(
 
     Args:
         commands: By joint name, in chain order.
-        responses: By joint name.
         duration_s: Length of the stretch [s].
         warn: Takes one sentence for each thing that is missing or doubtful.
 

@@ -75,9 +75,7 @@ def group_model(
     """The basis of a group's channels: own harmonics, and those of the other groups.
 
     Args:
-        series: Channels of the group.
         omegas: Angular frequencies of all groups [rad/s].
-        group: Index of the group.
         duration_s: Length of the record [s].
 
     Returns:
@@ -95,7 +93,6 @@ def further_lines(
 
     Args:
         omegas: Angular frequencies of all groups [rad/s].
-        group: Index of the group.
         harmonics: How many harmonics of its own its model has.
         highest: Highest frequency that the sampling rate allows [rad/s].
         duration_s: Length of the record [s].
@@ -128,7 +125,6 @@ def with_mixed_lines(
     Args:
         responses: Of the group's joints, k of them.
         omegas: Angular frequencies of all groups [rad/s].
-        group: Index of the group.
         model: From :func:`group_model`.
         duration_s: Length of the record [s].
 

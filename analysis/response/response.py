@@ -60,9 +60,6 @@ class Response:
 
         Args:
             chosen: Indices, k of them.
-
-        Returns:
-            Their response.
         """
         index = np.asarray(chosen, dtype=np.int64)
         return Response(
@@ -91,9 +88,7 @@ def respond(
 
     Args:
         command: Fundamentals c of the commands, shape (m,).
-        command_noise: Their noise.
         response: Fundamentals a of the responses, shape (m,).
-        response_noise: Their noise.
         omega_variance: Variance of the shared frequency [(rad/s)^2].
         delay_between_s: Mean sampling time of the response minus that of the command [s], (m,).
         bins: Residuals of the commands and of the responses, for the contrasts between joints.
@@ -137,10 +132,6 @@ def respond(
 def gain_estimate(response: Response, joint: int) -> Estimate:
     """Gain with its interval, symmetric in log gain.
 
-    Args:
-        response: The response.
-        joint: Index of the joint.
-
     Returns:
         The estimate; empty where the joint has no response.
     """
@@ -156,10 +147,6 @@ def lag_estimate(response: Response, joint: int) -> Estimate:
 
     Of an amplitude |a| with standard error s across its direction, |a| sin(error) / s is
     Student's t exactly, so the half width is arcsin(t s / |a|).
-
-    Args:
-        response: The response.
-        joint: Index of the joint.
 
     Returns:
         The estimate; empty where noise leaves the phase open. The interval lies around the lag

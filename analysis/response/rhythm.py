@@ -97,9 +97,7 @@ def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> Har
     """The basis that the slowest channel's sampling rate allows.
 
     Args:
-        series: Channels.
         omega: Angular frequency [rad/s].
-        trend: Degree of the polynomial.
 
     Returns:
         One to ``HARMONICS`` harmonics.
@@ -156,7 +154,6 @@ def refine(series: Sequence[Series], omega: float) -> Rhythm | None:
     """Fit a rhythm to channels that share it.
 
     Args:
-        series: Channels that move.
         omega: Where to start [rad/s].
 
     Returns:

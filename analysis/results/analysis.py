@@ -31,10 +31,7 @@ class JointCycles:
     """Energies of one joint in each cycle of the window.
 
     Attributes:
-        name: Joint name.
         net_j: Integral of torque times velocity.
-        plus_j: Of its positive part.
-        abs_j: Of its absolute value.
         el_j: Of motor voltage times motor current (signed).
         el_clipped_j: Of its positive part (no regeneration).
         coverage: Fraction of each cycle that has samples of mechanical power, 0 to 1.
@@ -59,10 +56,6 @@ class Transport:
         distance_m: Net displacement of the centre of mass, d.
         mass_kg: m, of the robot's description; None without one.
         net: Of E_net of all joints.
-        plus: Of E_plus.
-        abs: Of E_abs.
-        el: Of E_el, signed.
-        el_clipped: Of E_el, clipped.
         why: Why values are missing, or empty.
     """
 
@@ -85,9 +78,6 @@ class Closure:
         electrical_balance: What is left of electrical work minus mechanical work, losses and what
             rotors and gears store.
         net: E_net from the logged samples minus the ledger's.
-        abs: The same of E_abs.
-        el: The same of E_el.
-        plus: The same of E_plus.
         el_clipped: The same of E_el, clipped.
     """
 
@@ -107,11 +97,9 @@ class EnergyResult:
     Attributes:
         start_s: Start of each cycle, from the session's start [s]; one stretch without a gait.
         stop_s: Its end [s].
-        joints: Head to tail.
         electrical: What E_el is made of: ``simulated`` (the twin's motor voltage and current),
             ``motor`` (measured at the motor), ``supply`` (the voltage is the supply's, so E_el is
             an upper bound), or None.
-        transport: Cost of transport.
         closure: Against the twin's ledger, or None where the log has none.
         unknown: Which energies are products of samples, so that what happens within a sampling
             interval is not in them, by an unknown amount; None where all were accumulated.
@@ -135,7 +123,6 @@ class JointOverTime:
     """One joint's response to its command, cycle by cycle; arrays of one entry a cycle.
 
     Attributes:
-        name: Joint name.
         start_s: Start of the cycle, from the session's start [s].
         stop_s: Its end [s].
         run: Which of :attr:`ResponseOverTime.runs_s` it belongs to.
@@ -212,7 +199,6 @@ class GroupFacts:
     """Joints that share a rhythm.
 
     Attributes:
-        frequency_hz: Their frequency with interval.
         joints: Names of the driven joints that have it, head to tail.
         windows: Whole cycles of it at the end of the fitted stretch.
         wave: As in :class:`GaitFacts`.
@@ -255,18 +241,15 @@ class JointResult:
     """One joint's response to its command.
 
     Attributes:
-        name: Joint name.
         plane: ``horizontal``, ``vertical`` or None where no robot description says.
         command_amplitude_rad: Amplitude of the command at the frequency of its group.
         gain: Amplitude of the response over that of the command.
         lag_rad: Lag of the response behind the command, in (-pi, pi]; positive = late.
         energy_net_j: Integral of torque times velocity.
         energy_plus_j: Its positive part only.
-        energy_abs_j: Its absolute value.
         energy_el_j: Electrical energy at the motor, integral of u V i (signed).
         energy_el_clipped_j: Its positive part only (no regeneration).
         coverage: Fraction of the windows that has samples, 0 to 1.
-        samples: Response samples used.
         flags: Artefacts seen in the analysed stretch, e.g. ``saturated``;
             :attr:`Analysis.artefacts` says when.
         group: Index of the joint's group in :attr:`GaitFacts.groups`, 0 is the largest; None
@@ -299,7 +282,6 @@ class BodyPoint:
 
     Attributes:
         place: ``head``, ``middle`` or ``tail``.
-        link: Link name.
         amplitude_m: Amplitude across the mean heading.
         phase_rad: Phase relative to the head link.
     """
@@ -315,7 +297,6 @@ class BodyResult:
     """Head, middle and tail, with the perfect-tracking null beside them.
 
     Attributes:
-        plane: Plane of the motion.
         observed: From the logged head pose and joint angles.
         null: Name of the null's model (``viscous`` or ``free``) to the same three points, with
             every joint exactly on its command.
@@ -350,15 +331,11 @@ class Analysis(Shown):
     """All numbers of one session.
 
     Attributes:
-        session: Which session.
-        gait: The rhythm.
         joints: In chain order, head to tail.
         body: Head, middle and tail; None with a note where it can't be told.
-        heterogeneity: Index name to index.
         coupling: Identifiable or not.
         warnings: One sentence each, worst first: what is missing or doubtful, and changes what a
             reader does.
-        provenance: How it was made.
         artefacts: What is wrong with samples or at a limit, anywhere in the session, and when.
         over_time: Gain and lag cycle by cycle, by the logged phase; None with a note.
         energy: Energies cycle by cycle, cost of transport, closure.
@@ -388,9 +365,6 @@ class Analysis(Shown):
 
         An estimate becomes two keys, e.g. ``gain`` and ``gain_ci95``; ``lag_rad`` has its
         interval in ``lag_ci95``.
-
-        Returns:
-            A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
         """
         gait = dataclasses.asdict(self.gait) | _flat("frequency_hz", self.gait.frequency_hz)
         gait["groups"] = [

@@ -22,7 +22,6 @@ def percent(share: float, limit: float) -> str:
     """Print a share so that it reads as on the side of a limit that it is on.
 
     Args:
-        share: Any share.
         limit: What it was compared with.
 
     Returns:
@@ -39,7 +38,6 @@ def beyond(value: float, limit: float, digits: int = 2) -> str:
     """Print a value so that it reads as on the side of a limit that it is on.
 
     Args:
-        value: Any value.
         limit: What it was compared with.
         digits: Significant digits, at least.
 
@@ -61,8 +59,6 @@ def distinct(first: float, second: float, digits: int = 4) -> tuple[str, str]:
     """Print two numbers so that they read as different if they are.
 
     Args:
-        first: A number.
-        second: Another.
         digits: Significant digits, at least.
 
     Returns:
@@ -137,13 +133,11 @@ class NotFollowing:
     """A joint that does not follow its command.
 
     Attributes:
-        joint: Joint name.
         kinds: Kinds of fault that fit and that the data can't tell apart: keys of
             :data:`.capture.following.fault.KINDS`.
         since_s: From the session's start [s]; None where it holds from the beginning.
         until_s: Its end [s]; None where it holds to the end.
         share: Share of the session in which it holds, 0 to 1.
-        evidence: What the data show.
     """
 
     joint: str
@@ -159,7 +153,6 @@ class StandOut:
     """A joint that responds differently from the prediction of the others.
 
     Attributes:
-        joint: Joint name.
         plane: ``horizontal``, ``vertical`` or ``chain``.
         group: Index of its rhythm group.
         rank: 1 for the joint that deviates most.
@@ -207,7 +200,6 @@ class Answer:
     """The first thing that every output shows.
 
     Attributes:
-        verdict: Its kind.
         sentence: One to three sentences; plain text, intervals in square brackets.
         detail: What qualifies it, one or two sentences.
         not_following: Joints that do not follow their command, in chain order.
@@ -215,8 +207,6 @@ class Answer:
         undecided: Why it can't be decided which joint differs, or None.
         shape: Shapes of the rest, largest first; each simultaneous interval excludes zero.
         alike: Whether all commanded joints are shown to be alike; None where it is open.
-        compared: Joints compared.
-        commanded: Joints whose command moves.
     """
 
     verdict: Verdict = Verdict.NOTHING

@@ -39,10 +39,8 @@ class DeadBand:
         kind: :data:`EITHER`, :data:`STICK` or :data:`PLAY`.
         evidence: What decides the kind, or what is lacking.
         top: After the command's maxima.
-        bottom: After its minima.
         gain_change: Factor that the dead band alone makes on the gain, at this command.
         lag_change_rad: What it alone adds to the lag, at this command [rad].
-        cycles: Cycles that were fitted.
     """
 
     kind: str
@@ -86,8 +84,6 @@ class Artefact:
     """Something wrong with the samples of one joint, or a limit that it is at.
 
     Attributes:
-        joint: Joint name.
-        topic: Where the samples are.
         quantity: ``command``, ``position``, ``velocity``, ``effort``, ``current``, ``voltage`` or
             ``reference`` (a second sensor of the position).
         flag: One of :data:`KINDS`.
@@ -153,7 +149,6 @@ def overlapping(spans: Sequence[Span], start_s: float, stop_s: float) -> bool:
     """Whether any of some stretches meets a window.
 
     Args:
-        spans: Stretches.
         start_s: Start of the window [s].
         stop_s: Its end, not included [s].
 

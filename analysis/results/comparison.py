@@ -23,7 +23,6 @@ class Change:
     Attributes:
         name: For example ``scenario.toml: servo_of.joint03.stall_torque``.
         a: On side A, or None where it is not there.
-        b: On side B.
     """
 
     name: str
@@ -39,8 +38,6 @@ class Difference:
         quantity: ``gain``, ``lag``, ``energy_abs``, ``speed`` or ``cost_of_transport``.
         place: Joint name, or ``body``.
         unit: Of ``a``, ``b`` and ``difference``; gains differ by their ratio less one, in ``1``.
-        a: On side A.
-        b: On side B.
         difference: B minus A (of gains B/A - 1), its interval holding together with all the
             others of the comparison at 95 %.
         p: Of no difference, this one by itself.
@@ -64,7 +61,6 @@ class NamedJoint:
     """A joint that answers its command differently on the two sides.
 
     Attributes:
-        name: The joint.
         size: abs of the difference of ln(response/command), gain and lag in margins together.
         p_holm: Of its clearer part, for the whole family.
     """
@@ -79,7 +75,6 @@ class BrokenJoint:
     """A joint that does not follow its command, or stands off it, on one side only.
 
     Attributes:
-        name: The joint.
         side: ``A`` or ``B``.
         kinds: Kinds of fault that fit; empty for a joint that stands off its command.
         text: What it does, as a clause.
@@ -115,7 +110,6 @@ class Waveform:
     """Mean cycle of a joint's response by gait phase.
 
     Attributes:
-        name: The joint.
         a_rad: On side A at each phase [rad].
         b_rad: On side B [rad].
         difference_rad: B minus A [rad].
@@ -141,13 +135,10 @@ class Comparison(Shown):
     """Two sessions, or two groups of them, side by side.
 
     Attributes:
-        answer: One sentence.
         verdict: ``different``, ``same`` (within the margins), ``small`` (different, by less than
             the margins) or ``open``.
         design: ``sessions`` (one a side, errors from each session's own noise), ``groups``
             (independent runs, Welch) or ``pairs`` (run by run).
-        a: Sessions of side A.
-        b: Sessions of side B.
         partial: What the comparison leaves out or takes in its stride; None for nothing.
         changed: What the sessions themselves say was changed.
         broken: Joints that do not follow their command on one side only: the first differences.
@@ -157,7 +148,6 @@ class Comparison(Shown):
         phase_rad: Gait phases of the waveforms [rad].
         waveforms: Mean cycles, head to tail.
         warnings: One sentence each.
-        provenance: How it was made.
     """
 
     answer: str

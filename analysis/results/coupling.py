@@ -38,9 +38,6 @@ def rows_of(values: FloatArray) -> Rows:
 
     Args:
         values: Shape (m, n).
-
-    Returns:
-        Its rows.
     """
     return tuple(tuple(float(x) for x in row) for row in values)
 
@@ -74,10 +71,8 @@ class RowCheck:
     """A joint's sum over the columns, which a time shift fixes whatever the system.
 
     Attributes:
-        name: The responding joint.
         expected: 1 for P, 0 for R.
         total: With its 95 % interval.
-        standard_error: Of the sum.
     """
 
     name: str
@@ -91,7 +86,6 @@ class Lti:
     """H and its inverse X, a reading that holds for linear chains only.
 
     Attributes:
-        label: Says so.
         real: Real part of H, row = responding joint [rad/rad].
         imag: Imaginary part of H.
         condition_number: Of H: what inverting it may multiply relative errors by.
@@ -116,7 +110,6 @@ class HeldOut:
     """A run that was predicted, not used.
 
     Attributes:
-        session: Its file.
         size: Largest deviation of a command from the base [rad or log amplitude].
         error: ||a - predicted|| / ||a||.
         error_kept: The same of 'each joint keeps its response to its own command'.
@@ -135,7 +128,6 @@ class BaseResponse:
     """How the joints answer the gait that is kicked: the mean over the runs without a kick.
 
     Attributes:
-        frequency_hz: Of the gait.
         gain: Of m joints.
         lag_rad: Of m joints [rad].
         gain_error: Standard errors, scatter between runs included.
@@ -205,7 +197,6 @@ class LocalCoupling(Coupling):
     Attributes:
         joints: Names, head to tail, m.
         base_runs: Runs of the base gait.
-        kicked_runs: Runs with a kick.
         P: d psi / d psi_c.
         R: d ln|a| / d psi_c [1/rad].
         G: d ln|a| / d ln|c|; None where amplitudes were not kicked.
@@ -214,7 +205,6 @@ class LocalCoupling(Coupling):
         gain_rows: Of R, each sums to 0.
         checks_pass: Whether all sums agree within their errors (family-wise 5 %) or 1e-2.
         nonlinearity: ||(G - P, S + R)|| / ||(P, R)||; 0 = linear and time-invariant.
-        lti: The linear reading.
         held_out: Predictions of runs that were not used.
         valid_to: Largest deviation up to which all of them are predicted at least twice as well
             as by 'each joint keeps its response'; None where there are none, or the first fails.
@@ -278,7 +268,6 @@ class ToneCoupling:
     """The coupling at one frequency.
 
     Attributes:
-        frequency_hz: Of the tone.
         command_condition: Condition number of the commands C; 1 = every run counts fully.
         H: Response per command as the servo holds it [rad/rad].
         condition_number: Of H, or None where it is singular.
@@ -323,9 +312,7 @@ class LinearCoupling(Coupling):
     Attributes:
         plan: ``lag-sweep`` or ``multisine``.
         joints: Names, head to tail, m.
-        runs: How many.
         contact: Whether the robot touched anything; None where its sessions don't say.
-        validity: Where the matrices hold.
         hold_s: Delay of the held commands that is taken out of H [s].
         route_why: Why Z was told the way it was.
         tones: One for each frequency, rising.

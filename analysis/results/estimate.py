@@ -39,9 +39,7 @@ class Provenance:
 
     Attributes:
         command: The command line that makes it.
-        versions: Package name to version.
         inputs: Input file to SHA-256.
-        options: Option name to value.
     """
 
     command: str

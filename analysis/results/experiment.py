@@ -29,12 +29,9 @@ class Run:
     """One session's part in the experiment.
 
     Attributes:
-        id: Session id.
-        path: The file.
         wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
         role: ``forward`` (wave from head to tail), ``reverse``; among kicks ``base``, ``kick`` or
             ``held-out``; or None where it has none.
-        why: Why it has none.
     """
 
     id: str
@@ -51,7 +48,6 @@ class MirrorJoint:
     All intervals of a reversal hold together at 95 %.
 
     Attributes:
-        name: The joint.
         mirror: The joint as far from the tail as this one is from the head.
         log_gain_difference: Of ln gain [1].
         lag_difference_rad: Positive = the joint is later than its mirror joint [rad].
@@ -73,7 +69,6 @@ class OrderedPair:
 
     Attributes:
         name: The joint that answers less.
-        mirror: Its mirror joint.
         by: ``gain`` or ``lag``: which of them shows it more clearly.
         log_gain_contrast: ln gain of the joint minus that of its mirror joint, mean of both ways.
         lag_contrast_rad: The same of the lag [rad].
@@ -146,10 +141,7 @@ class Reversal(Shown):
         equivalence_gain_p: Of 'some pair differs by 2 % or more'.
         equivalence_lag_p: Of 'some pair differs by 1 degree or more'.
         module_variance: V_module of ln(response/command), gain and lag together.
-        boundary_variance: V_boundary.
-        noise_variance: Of a mean profile.
         module_share: V_module / (V_module + V_boundary).
-        boundary_share: The rest.
         tilt: Whether a tilted floor can make the differences.
         middle: The middle joint of an odd number, which is its own mirror joint.
         blind: What the test can't see.
@@ -183,7 +175,6 @@ class PooledJoint:
     """One joint's response over several runs.
 
     Attributes:
-        name: The joint.
         gain: Amplitude of the response over that of the command.
         lag_rad: Positive = late [rad].
     """
@@ -198,7 +189,6 @@ class PooledRuns:
     """Several runs of one direction as one; the scatter from run to run is in the intervals.
 
     Attributes:
-        runs: How many.
         joints: In chain order, head to tail.
     """
 
@@ -220,7 +210,6 @@ class Experiment(Shown):
             :class:`.analysis.results.coupling.LocalCoupling`, from a sweep without contact a
             :class:`.analysis.results.coupling.LinearCoupling`.
         warnings: One sentence each.
-        provenance: How it was made.
         oscillators: From kicks around one gait: how oscillators that feel their servos would
             synchronise through the body; None without such kicks.
         pooled: The response over the runs, where all of them are of one direction.
@@ -242,9 +231,6 @@ class Experiment(Shown):
 
         An estimate becomes an object of ``value`` and ``ci95``; each session is the object that
         it gives by itself.
-
-        Returns:
-            A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
         """
         return {
             "answer": self.answer,

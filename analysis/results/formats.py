@@ -89,9 +89,6 @@ def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
 def gait_frequency(gait: GaitFacts) -> str:
     """The gait's frequency, or the frequency of each group of joints.
 
-    Args:
-        gait: The gait.
-
     Returns:
         For example ``0.97 Hz [0.969, 0.971]`` or ``1.432 Hz (8 joints) and 0.954 Hz (8 joints)``,
         each with its interval.
@@ -121,8 +118,6 @@ def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) 
 
     Args:
         quantities: Estimates of one table column, in the unit they are printed in.
-        least: Never fewer.
-        most: Never more.
 
     Returns:
         Digits after the point, the same for the whole column so that it lines up. Without any
@@ -165,14 +160,7 @@ def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
 
 
 def degrees(quantity: Estimate) -> Estimate:
-    """The same estimate in degrees.
-
-    Args:
-        quantity: In rad.
-
-    Returns:
-        In degrees.
-    """
+    """The same estimate in degrees."""
     return scaled(quantity, 180.0 / math.pi)
 
 
@@ -180,7 +168,6 @@ def scaled(quantity: Estimate, factor: float) -> Estimate:
     """The same estimate in another unit.
 
     Args:
-        quantity: The estimate.
         factor: New units in one old unit, positive.
 
     Returns:
@@ -221,14 +208,7 @@ def coverage(share: float) -> str:
 
 
 def relative(log_gain: Estimate) -> Estimate:
-    """A ratio of gains, less one, in percent.
-
-    Args:
-        log_gain: Logarithm of the ratio.
-
-    Returns:
-        In percent.
-    """
+    """A ratio of gains, less one, in percent."""
     value, ci95 = log_gain.value, log_gain.ci95
     return Estimate(
         None if value is None else 100 * math.expm1(value),
@@ -289,11 +269,7 @@ def short(text: str, most: int = 40) -> str:
     """Text that has to fit into a figure.
 
     Args:
-        text: From a log.
         most: Characters kept at most; the middle gives way, since names differ at their ends.
-
-    Returns:
-        Plain text.
     """
     known = plain(text)
     if len(known) <= most:
@@ -306,9 +282,6 @@ def filename(path: str) -> str:
 
     Args:
         path: As the user named it.
-
-    Returns:
-        Plain text.
     """
     return plain(path.replace("\\", "/").rstrip("/").rpartition("/")[2] or path)
 
@@ -318,22 +291,12 @@ def sentence(text: str) -> str:
 
     Args:
         text: From a log or a result; a name at its beginning keeps its own letters.
-
-    Returns:
-        Plain text.
     """
     return capital(plain(text).strip().rstrip(".")) + "."
 
 
 def capital(text: str) -> str:
-    """Text with a capital at its beginning; a name keeps its own letters.
-
-    Args:
-        text: Plain text.
-
-    Returns:
-        The text.
-    """
+    """Text with a capital at its beginning; a name keeps its own letters."""
     first = text.partition(" ")[0]
     if first.endswith(":") or any(c in "._/\\" or c.isdigit() for c in first):
         return text

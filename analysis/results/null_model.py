@@ -42,10 +42,8 @@ class ModuleDeviation:
     those that are named.
 
     Attributes:
-        name: Its joint.
         named: Whether it is shown to deviate.
         gain: Lambda: by how much Q falls if it deviates.
-        p: Family-wise.
         relative: Kind, e.g. ``stall_torque``, to own value / shared value - 1.
     """
 
@@ -61,18 +59,14 @@ class NullModelResult:
     """H1, identical modules, and H2, one of them deviates, from one direction alone.
 
     Attributes:
-        answer: One sentence.
         condition: What all of it rests on.
-        file: The model.
         made_by: What the model was made from.
         parameters: Shared by all modules, as fitted.
         fit: Q1, of identical modules.
         fit_p: p-value of Q1.
         p: p-value of identical modules against one that deviates, family-wise.
-        modules: Head to tail.
         named: Joints whose modules deviate, the clearest first.
         rest_p: p-value of what the named ones leave.
-        draws: Of the parametric bootstrap.
     """
 
     answer: str
@@ -91,11 +85,7 @@ class NullModelResult:
 
 @dataclass(frozen=True)
 class ModelledAnalysis(Analysis):
-    """The numbers of one session, and what a null model makes of them.
-
-    Attributes:
-        null_model: The test.
-    """
+    """The numbers of one session, and what a null model makes of them."""
 
     null_model: NullModelResult = field(kw_only=True)
 
@@ -108,7 +98,6 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
     """The answer in one sentence.
 
     Args:
-        modules: All of them.
         named: Those that deviate, the clearest first.
         p: Of identical modules against one that deviates.
         fit_p: Of identical modules against anything.
@@ -139,9 +128,6 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
 
 def told_null(result: NullModelResult) -> list[str]:
     """Lines for a terminal.
-
-    Args:
-        result: The test.
 
     Returns:
         The answer first, the parameters last.

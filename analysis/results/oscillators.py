@@ -13,8 +13,6 @@ class Link:
     """What one oscillator does to another.
 
     Attributes:
-        source: Whose phase acts.
-        target: Whose phase it turns.
         K: Strength of the coupling [1/s], 0 or more.
         lag_rad: psi, the lead of the source over the target at which it does nothing [rad].
     """
@@ -30,7 +28,6 @@ class Rate:
     """What one oscillator does by itself.
 
     Attributes:
-        name: Its joint.
         omega: Its own rate [rad/s].
         feedback: eps_i, what it takes from its own servo's angle [1/s]; empty where no angle was
             logged.
@@ -48,13 +45,11 @@ class ChainCoupling:
     """The couplings of one chain of oscillators, or why they can't be told.
 
     Attributes:
-        plane: Of its joints.
         identifiable: Whether the phases tell the couplings.
         why: Why not, or how.
         record: What to record so that they do; None if they do.
         condition_number: Of the regression of the worst oscillator; None where it is infinite.
         kicks: Instants at which a phase jumps.
-        duration_s: Of the phases used.
         reach: abs(i - j) up to which couplings are looked for.
         links: Empty if not identifiable.
         oscillators: Empty if not identifiable.
@@ -103,7 +98,6 @@ class Comparator:
 
     Attributes:
         slowest: Its slowest rate [eps].
-        strong: Its strong modes.
         real: Its rates' real parts, the slowest first [eps].
     """
 
@@ -135,7 +129,6 @@ class RelativeCoupling:
     """The entrainment reading.
 
     Attributes:
-        label: Says what it is.
         value: P^-1 - I, row = joint that follows; None where P is singular.
         ci95_half: Half widths of the 95 % intervals, one by one.
         condition_number: Of P; None where it is infinite.
@@ -152,7 +145,6 @@ class BodyOscillators:
     """How oscillators that feel their own servos would synchronise through the body.
 
     Attributes:
-        answer: One sentence.
         joints: Names, head to tail, m.
         slowest: Real part of the slowest rate but that of all phases together [eps].
         strong: Modes with a rate above 0.1.
@@ -162,7 +154,6 @@ class BodyOscillators:
         comparator: A homogeneous chain as strong.
         explicit_coupling: Coupling of next neighbours, both ways, which lifts every mode to
             ``strong_above`` [eps]; its value is None where none does.
-        pseudospectrum: Levels around the rates.
         entrainment: The other reading of P.
     """
 
@@ -218,7 +209,6 @@ class ClosedLoop:
     """How oscillators that feel their servos relax: d phi' = J d phi, predicted from kicks.
 
     Attributes:
-        answer: One sentence.
         joints: Names, head to tail, m.
         eps: Of the feedback [1/s].
         age_s: How old an angle is on average when it is used [s].

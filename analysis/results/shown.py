@@ -133,9 +133,6 @@ class Shown:
             path: A name that ends in .json.
             force: Replace the file if it exists.
 
-        Returns:
-            The path.
-
         Raises:
             UsageError: If the name ends in anything else, or its folder doesn't exist.
             OutputExistsError: If it is there and ``force`` is not given.
@@ -148,7 +145,6 @@ class Shown:
 
         Args:
             folder: Made if it isn't there.
-            force: Replace files that exist.
 
         Returns:
             The files, named after the tables.

@@ -55,8 +55,6 @@ class Facts:
     """What an answer is composed of.
 
     Attributes:
-        gait: The rhythm.
-        joints: The joints' results.
         commanded: Names of the joints whose command moves.
         not_following: Joints that do not follow, in chain order.
         findings: Joints that stand out, and the shape of the rest.
@@ -74,14 +72,7 @@ class Facts:
 
 
 def compose(facts: Facts) -> Answer:
-    """Compose the answer of one session.
-
-    Args:
-        facts: What is known.
-
-    Returns:
-        The answer.
-    """
+    """Compose the answer of one session."""
     known = [joint for joint in facts.joints if joint.gain.value is not None]
     first = _named(facts)
     broken = f"{facts.left_out[:1].upper()}{facts.left_out[1:]}." if facts.left_out else ""
@@ -147,9 +138,6 @@ def kinds_in_words(kinds: Sequence[str]) -> str:
 def fault_in_words(fault: NotFollowing) -> str:
     """One joint that does not follow, as a clause.
 
-    Args:
-        fault: The joint.
-
     Returns:
         For example ``joint04 does not follow its command from 7.4 s on: jammed or dead``.
     """
@@ -208,9 +196,6 @@ def _undecided(findings: Findings, facts: Facts) -> str:
 
 def deviation_in_words(each: StandOut) -> str:
     """One deviation with its interval; the word carries the sign.
-
-    Args:
-        each: The deviation.
 
     Returns:
         For example ``gain 20.1 % [18.9, 21.2] less``.

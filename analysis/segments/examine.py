@@ -139,7 +139,6 @@ def profile_of(chain: Chain, quantity: str) -> Profile:
     """The profile of one quantity along a chain.
 
     Args:
-        chain: The chain.
         quantity: ``gain`` (as its logarithm) or ``lag``.
 
     Returns:

@@ -61,9 +61,7 @@ class Deviation:
     """One joint's deviation from the prediction of the others.
 
     Attributes:
-        joint: Index into the profile.
         value: In the unit of the profile.
-        error: Its standard error.
     """
 
     joint: int

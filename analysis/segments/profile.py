@@ -106,8 +106,6 @@ def critical_value(members: Sequence[Member], level: float = LEVEL, draws: int =
 
     Args:
         members: All contrasts of the family; members are drawn independently.
-        level: Family-wise level.
-        draws: Draws of the simulation.
 
     Returns:
         The (1 - level) quantile of the largest studentised contrast; infinity for no contrasts.
@@ -171,7 +169,6 @@ class Profile:
         place: Index of each joint among the plane's commanded joints, head to tail, shape (m,).
         count: Commanded joints of the plane.
         values: Log gain, or lag [rad], shape (m,).
-        scatter: Errors of the values.
         margin: Deviations below this are of no interest, in the unit of the values.
     """
 
@@ -206,7 +203,6 @@ class Contrast:
             regression line), ``mirror`` (outer minus inner half, symmetric to the middle) or
             ``each`` (largest deviation of a joint from the common value).
         value: In the unit of the profile.
-        error: Its standard error.
         joint: For ``each``: index into the profile.
     """
 
@@ -218,9 +214,6 @@ class Contrast:
 
 def family_of(profile: Profile) -> Member:
     """All contrasts that a profile adds to the family of an answer.
-
-    Args:
-        profile: The profile.
 
     Returns:
         The deviation of each joint from the others, and the shapes.
@@ -234,7 +227,6 @@ def shape_weights(profile: Profile, active: BoolArray) -> list[tuple[str, FloatA
     """Weights of the shapes' contrasts on the joints that take part.
 
     Args:
-        profile: The profile.
         active: Joints that take part, shape (m,).
 
     Returns:
@@ -267,7 +259,6 @@ def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
     """The shape of the joints that take part.
 
     Args:
-        profile: The profile.
         active: Joints that take part, shape (m,).
 
     Returns:
@@ -302,7 +293,6 @@ def deviation_weights(
     """Weights of the joints' deviations from the prediction of the others.
 
     Args:
-        profile: The profile.
         active: Joints that predict, shape (m,).
         shapes: Columns of the model beside a common value, shape (m,) each.
 

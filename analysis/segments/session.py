@@ -81,7 +81,6 @@ class Following:
     Attributes:
         faults: Joints that do not, times from the session's start, in chain order.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
-        motions: The joints' signals.
     """
 
     faults: tuple[Fault, ...]
@@ -91,11 +90,6 @@ class Following:
 
 def following(session: SessionView, columns: Columns, window: Stretch) -> Following:
     """Find how the joints follow their commands in a window.
-
-    Args:
-        session: An open session.
-        columns: Its columns.
-        window: What is looked at.
 
     Returns:
         The joints that do not follow, and the offsets of all.
@@ -123,7 +117,6 @@ def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefa
     """Leave out values that repeat for a moment where the joint follows its command all the same.
 
     Args:
-        artefacts: Of the analysed window.
         follows: How the joints follow in it.
 
     Returns:
@@ -160,8 +153,6 @@ def not_following(
     """Join faults with the artefacts that falsify a joint's position.
 
     Args:
-        follows: Of the analysed window.
-        artefacts: Of the same.
         names: All joints, in chain order.
         duration_s: Length of the window [s].
 
@@ -242,9 +233,7 @@ def compare_joints(
     Args:
         robot: The robot, or None; then all joints are one chain.
         gait: The fitted gait, or None.
-        joints: The joints' results.
         faulty: Joints that do not follow.
-        commanded: Joints whose command moves.
         offsets: Of each joint, cycle by cycle [rad].
 
     Returns:

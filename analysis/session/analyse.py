@@ -53,16 +53,7 @@ _NS = 1e9
 def within(
     artefacts: Iterable[Artefact], session: SessionView, stretch: Stretch
 ) -> tuple[Artefact, ...]:
-    """The artefacts that hold in the analysed stretch.
-
-    Args:
-        artefacts: Of the whole session.
-        session: The session.
-        stretch: What is analysed.
-
-    Returns:
-        Those of them.
-    """
+    """The artefacts that hold in the analysed stretch."""
     start_s, stop_s = ((t - session.start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns))
     return tuple(one for one in artefacts if one.within(start_s, stop_s))
 
@@ -76,8 +67,6 @@ def warn_flags(
     """Name the joints of each artefact, and whether it is the sensor's, the record's or a limit.
 
     Args:
-        artefacts: Of the analysed stretch.
-        joints: The joints' results.
         gait: The fitted gait, or None.
         warn: Takes a sentence for each kind.
     """
@@ -124,7 +113,6 @@ class Examined:
     """One session's numbers, and the fit that an experiment of several sessions builds on.
 
     Attributes:
-        analysis: The numbers.
         gait: The fitted gait, or None.
     """
 
@@ -138,7 +126,6 @@ class Measured(Examined):
 
     Attributes:
         responses: Measured joint angles by name, on the analysed stretch.
-        energies: By joint name.
         span: Whole cycles over which energies are taken.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
     """
@@ -153,7 +140,6 @@ def analyse_session(session: SessionView, options: Options | None = None) -> Ana
     """Compute everything that one session can tell.
 
     Args:
-        session: An open session.
         options: What the user chose; the defaults choose by themselves.
 
     Returns:
@@ -173,7 +159,6 @@ def examine_session(
     """Compute what one session tells, and keep the fit.
 
     Args:
-        session: An open session.
         options: What the user chose; the defaults choose by themselves.
         with_dead_bands: See :func:`measure_session`.
 
@@ -195,7 +180,6 @@ def measure_session(
     """Compute what one session tells, and keep what it was computed from.
 
     Args:
-        session: An open session.
         options: What the user chose; the defaults choose by themselves.
         with_dead_bands: Whether to fit them, which takes a third of the time of a short session
             and changes nothing else.

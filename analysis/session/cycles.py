@@ -106,7 +106,6 @@ def amplitudes(series: Series, starts: IntArray, omega: float) -> ComplexArray:
     """Complex amplitude of each cycle, from its samples alone.
 
     Args:
-        series: Samples.
         starts: Where c cycles begin among them and the last one ends, shape (c + 1,).
         omega: Angular frequency [rad/s].
 

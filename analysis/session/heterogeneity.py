@@ -211,9 +211,6 @@ def spread(values: FloatArray, variance: FloatArray, dof: FloatArray, blocks: in
         variance: Their variances, same shape.
         dof: Degrees of freedom of the variances of each joint, shape (m,).
         blocks: Number of blocks with a mean of their own.
-
-    Returns:
-        The spread.
     """
     rows, noise = values.reshape(blocks, -1), variance.reshape(blocks, -1)
     m = rows.shape[1]
@@ -316,8 +313,6 @@ def heterogeneity_indices(
     Args:
         robot: The robot, or None; then all joints are one chain.
         gait: The fitted gait, or None.
-        joints: The joints' results.
-        energies: By joint name.
         warn: Told why an index is None.
 
     Returns:

@@ -35,9 +35,7 @@ def group_facts(
 
     Args:
         robot: The robot, or None.
-        gait: The fitted gait.
         span: The largest group's whole cycles.
-        stretch: The fitted stretch.
         start_ns: Unix time of the session's start [ns].
 
     Returns:
@@ -83,14 +81,9 @@ def joint_energies(
     """Energies of all joints.
 
     Args:
-        session: An open session.
         columns: The session's columns.
         artefacts: Of the analysed stretch; what a sensor falsifies has no energy.
-        span: The window.
         warn: Told of joints whose power has gaps or is falsified.
-
-    Returns:
-        By joint name.
     """
     wrong = list(artefacts)
     false = {one.joint for one in wrong if one.falsifies("velocity", "effort")}
@@ -170,13 +163,9 @@ def joint_results(
         columns: The session's columns.
         responses: By joint name, on the analysed stretch.
         gait: The fitted gait, or None.
-        energies: By joint name.
         flags: Artefacts of each joint on the analysed stretch, by name.
         dead: Dead bands, by name.
         span: The window of energies and coverage.
-
-    Returns:
-        One result a joint.
     """
     planes = planes_of(robot)
     results: list[JointResult] = []

@@ -107,8 +107,6 @@ def response_over_time(
     """Gain and lag of every driven joint in every cycle of its logged phase.
 
     Args:
-        session: An open session.
-        columns: Its columns.
         artefacts: What falsifies positions, and when.
         warn: Told why there is no result.
 

@@ -84,7 +84,6 @@ def posture(session: SessionView, windows: Sequence[Window]) -> Posture:
     """Read how the robot lay in a session.
 
     Args:
-        session: An open session.
         windows: Whole gait cycles, over which the motion's own acceleration nearly vanishes.
 
     Returns:
@@ -175,7 +174,6 @@ class GaitRun:
         command: Complex amplitudes of the commands, each at its group's frequency [rad], (m,).
         wave: Which way the wave runs; of several groups, the largest group's.
         response: Response of the joints to their commands, NaN where it isn't known, m joints.
-        posture: How the robot lay.
         group: Index of each joint's group, m.
         frequencies_hz: Of each group, the largest group first.
         waves: Which way each group's wave runs.
@@ -219,12 +217,7 @@ def gait_run(
     Args:
         label: The file's name.
         robot: Its robot, or None.
-        analysis: Its numbers.
         gait: Its fitted gait, or None.
-        posture: How the robot lay.
-
-    Returns:
-        The run.
     """
     name, start_ns = analysis.session.robot, analysis.session.start_ns
     if gait is None or not gait.driven:
@@ -276,9 +269,6 @@ def _unknown(count: int) -> Response:
 
 def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]:
     """Runs of the commonest gait and of its reverse.
-
-    Args:
-        runs: All runs.
 
     Returns:
         Roles by index (the wave from head to tail is forward), and why the others have none.
@@ -373,10 +363,6 @@ def command_change(command: ComplexArray, model: ComplexArray) -> ComplexArray:
 
 def other_frequency(run: GaitRun, model: GaitRun) -> tuple[str, str] | None:
     """Find a group whose frequency is not the model's.
-
-    Args:
-        run: A run.
-        model: Another one.
 
     Returns:
         Both frequencies [Hz] of the first such group, with the digits in which they differ; None

@@ -92,14 +92,10 @@ def read_columns(
     """Read what is there, and say what is not.
 
     Args:
-        session: An open session.
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
         warn: Takes one sentence for each thing missing.
         reference_topic: JointState topic of a second sensor of the positions, or None.
-
-    Returns:
-        The columns.
 
     Raises:
         MissingChannelError: If neither topic is there, or one that was chosen is not; the message
@@ -179,9 +175,6 @@ def read_columns(
 def settle_time_s(session: SessionView) -> float:
     """Settling time that the session states [s]; 0 where it states none.
 
-    Args:
-        session: An open session.
-
     Returns:
         From the session's start.
     """
@@ -190,9 +183,6 @@ def settle_time_s(session: SessionView) -> float:
 
 def drag_ratio(session: SessionView) -> float:
     """Ratio of the drag across a link to that along it, for the viscous null.
-
-    Args:
-        session: An open session.
 
     Returns:
         That of the twin's ground, else the default.
@@ -220,7 +210,6 @@ def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
 
     Args:
         robot: The robot, or None.
-        names: Joint names.
 
     Returns:
         Plane to names, in their order; all under ``chain`` without a robot description.

@@ -61,8 +61,6 @@ def without_breaks(
     """Leave out all but the longest stretch in which samples follow each other.
 
     Args:
-        session: An open session.
-        columns: Its columns.
         options: What the user chose; only samples between his limits count.
         warn: Takes one sentence where something is left out.
 
@@ -106,13 +104,8 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
     """The stretch to analyse.
 
     Args:
-        session: An open session.
-        columns: Its columns.
         options: What the user chose; a start of his own replaces the settling time.
         warn: Takes one sentence where the choice needs one.
-
-    Returns:
-        The stretch.
 
     Raises:
         DataError: If there are no samples at all.
@@ -165,11 +158,6 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
 
 def recorded(session: SessionView, columns: Columns, options: Options) -> Stretch:
     """What was recorded of commands and positions, within the user's limits.
-
-    Args:
-        session: An open session.
-        columns: Its columns.
-        options: What the user chose.
 
     Returns:
         The window, without regard to settling or steadiness.

@@ -318,7 +318,6 @@ def settled(run: Stretch, session_start_ns: int, settle_s: float) -> Stretch:
     for a run that begins later it counts from the run's own start.
 
     Args:
-        run: The run.
         session_start_ns: Unix time [ns].
         settle_s: Settling time [s].
 
@@ -333,9 +332,6 @@ def settled(run: Stretch, session_start_ns: int, settle_s: float) -> Stretch:
 
 def moving(commands: Sequence[Series]) -> tuple[float, float] | None:
     """From the first to the last sample at which any command moves.
-
-    Args:
-        commands: Commands.
 
     Returns:
         Times [s], or None where no command ever moves.

@@ -55,7 +55,6 @@ class Message:
     """A message that is ready to be written.
 
     Attributes:
-        topic: Where it goes.
         sampled_ns: Time of its last sample [Unix ns].
         write: Writes it; takes the log time [Unix ns].
     """
@@ -69,13 +68,7 @@ class DecodedTopics:
     """Turns decoded signals into messages, block by block."""
 
     def __init__(self, writer: SessionWriter, robot: Robot, decoder: BusDecoder) -> None:
-        """Plan the topics; each is opened when its first sample comes.
-
-        Args:
-            writer: The session.
-            robot: The robot.
-            decoder: Its compiled bus.
-        """
+        """Plan the topics; each is opened when its first sample comes."""
         joints = robot.joint_names
         offsets = {
             topic: _OffsetTopic(writer, topic, joints)

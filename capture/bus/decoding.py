@@ -64,9 +64,7 @@ class FrameTally:
     """What became of the frames.
 
     Attributes:
-        frames: All frames.
         decoded: Frames with at least one sample.
-        errors: Error frames.
         remote: Remote frames; they carry no data.
         unknown: Identifier to number of data frames that no database knows.
         silent: Identifier to number of data frames that the databases know and whose contents the
@@ -86,11 +84,7 @@ class FrameTally:
     undirected: Counter[str] = field(default_factory=Counter[str])
 
     def add(self, other: FrameTally) -> None:
-        """Count further frames.
-
-        Args:
-            other: Their tally.
-        """
+        """Count further frames."""
         self.frames += other.frames
         self.decoded += other.decoded
         self.errors += other.errors

@@ -37,9 +37,6 @@ _MOST_POLL_BYTES = 8
 def poll_frames(robot: Robot) -> FrameArray:
     """The frames that ask for the robot's state.
 
-    Args:
-        robot: The robot.
-
     Returns:
         Records of :data:`.FRAME_DTYPE`, without times, in the order of the map;
         none where nothing has to be asked.
@@ -100,8 +97,6 @@ class _Frame:
     """One kind of frame in the making.
 
     Attributes:
-        id_flags: Identifier with flags.
-        size: Number of data bytes.
         fixed: Multiplexers and initial values of what the map doesn't name, at their places.
         slots: The values that it carries.
         last: The last of each, at its place.

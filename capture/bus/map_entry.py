@@ -39,13 +39,9 @@ class BitField:
     """Where a signal lies and what its bits mean.
 
     Attributes:
-        start: Start bit.
         length: Number of bits, 1 to 64.
-        little_endian: Intel byte order.
         signed: Two's complement.
         is_float: IEEE 754 of 16, 32 or 64 bits.
-        scale: Physical value of one.
-        offset: Physical value of zero.
     """
 
     start: int
@@ -58,14 +54,7 @@ class BitField:
 
     @classmethod
     def of(cls, signal: Signal) -> BitField:
-        """The field of a DBC signal.
-
-        Args:
-            signal: The signal.
-
-        Returns:
-            Its layout and conversion.
-        """
+        """The field of a DBC signal."""
         return cls(
             start=signal.start,
             length=signal.length,
@@ -153,7 +142,6 @@ class BitField:
 
         Args:
             lower: Least physical value that is allowed.
-            upper: Greatest one.
 
         Returns:
             Whole numbers that the field can hold; of a floating field any numbers.
@@ -191,7 +179,6 @@ class BitField:
 
         Args:
             bits: Of this field, ``length`` of them.
-            size: Number of data bytes.
 
         Returns:
             The data as one little-endian number, zero elsewhere: those of several fields are
@@ -214,7 +201,6 @@ class MapEntry:
     Attributes:
         quantity: What it is of its target.
         axis: Axis of a vector quantity, else empty.
-        bits: The signal.
         unit: Unit of the decoded value.
         scale: Applied to the decoded value.
         offset: Added after ``scale``.
@@ -292,14 +278,7 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
 
 
 def frame_id(message: Message) -> int:
-    """A message's identifier with the flags of :mod:`.capture.log.messages.frames`.
-
-    Args:
-        message: The message.
-
-    Returns:
-        The identifier.
-    """
+    """A message's identifier with the flags of :mod:`.capture.log.messages.frames`."""
     return message.frame_id | (EXTENDED_FLAG if message.is_extended_frame else 0)
 
 
@@ -307,7 +286,6 @@ def conditions_of(signal: Signal, by_name: Mapping[str, Signal]) -> Conditions:
     """What selects a signal.
 
     Args:
-        signal: The signal.
         by_name: All signals of its message.
 
     Returns:
@@ -326,10 +304,6 @@ def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
 
     Args:
         message: The message that carries it.
-        signal: The entry.
-
-    Returns:
-        The entry, compiled.
     """
     by_name = {each.name: each for each in message.signals}
     wanted = by_name[signal.signal]

@@ -20,9 +20,6 @@ def frozen(array: _Array) -> _Array:
 
     Args:
         array: Any array, any shape; changed in place (its write flag only).
-
-    Returns:
-        The same array.
     """
     array.setflags(write=False)
     return array

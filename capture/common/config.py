@@ -121,7 +121,6 @@ def read(table: Table, cls: type[_Class], **own: Callable[[], Any]) -> _Class:
 
     Args:
         table: The table; faults are noted in its list.
-        cls: The dataclass.
         own: What gives the value of a field that is read in another way, called in its turn.
 
     Returns:
@@ -149,8 +148,6 @@ def read_field(table: Table, cls: type[Any], name: str, default: Any = None) -> 
 
     Args:
         table: The table; faults are noted in its list.
-        cls: The dataclass.
-        name: Name of the field.
         default: In place of the one that the class declares.
 
     Returns:

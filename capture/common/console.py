@@ -90,7 +90,6 @@ def progress(description: str, total: float) -> Generator[Progress]:
     """A progress bar on stderr, or silence where stderr is not a terminal.
 
     Args:
-        description: What is being done.
         total: What ``done`` will reach.
 
     Yields:
@@ -168,7 +167,6 @@ class Column:
 
     Attributes:
         title: Its head, with the unit.
-        width: Least width in characters.
         left: Whether it holds words; numbers go to the right.
         spare: Where the table is too wide, columns of the same number are left out together, the
             least number first; 0 stays.
@@ -186,9 +184,7 @@ def table(
     """Lay out a table, without columns that it can spare where the terminal is too narrow.
 
     Args:
-        columns: The columns.
         rows: A cell for each column, also for those that may not be shown.
-        width: Characters in a line.
         cropped: Whether no line may be longer, whatever it takes: the last columns go too, and the
             first gives way.
 
@@ -236,12 +232,7 @@ def table(
 
 
 def fit(text: str, width: int) -> str:
-    """Text of exactly this many characters.
-
-    Args:
-        text: Any text.
-        width: Characters.
-    """
+    """Text of exactly this many characters."""
     return cut(text, width).ljust(width)
 
 
@@ -250,7 +241,6 @@ def cut(text: str, width: int) -> str:
 
     Args:
         text: Any text; a device may have put anything into it.
-        width: Characters.
     """
     clean = Text(_printable(text))
     clean.truncate(max(width, 1), overflow="ellipsis")

@@ -87,7 +87,6 @@ class InputFileError(UndulogError, OSError):
         """Build the message.
 
         Args:
-            path: The file.
             message: What is wrong with it.
         """
         self.path = Path(path)
@@ -100,8 +99,6 @@ class Fault:
 
     Attributes:
         key: Where it is, e.g. ``joints[3].plane``.
-        found: What stands there.
-        valid: What would be valid.
     """
 
     key: str
@@ -122,7 +119,6 @@ class FaultyFileError(UndulogError, ValueError):
         """Build the message.
 
         Args:
-            path: The file.
             faults: All its faults, at least one.
         """
         self.path = Path(path)
@@ -191,7 +187,6 @@ class LogError(UndulogError):
         """Build the message.
 
         Args:
-            path: The log file.
             message: What is wrong and what to do.
         """
         self.path = Path(path)
@@ -206,13 +201,7 @@ class MissingChannelError(LogError, KeyError):
     """A topic, joint or field that the log does not have."""
 
     def __init__(self, path: Path | str, wanted: str, available: Sequence[str]) -> None:
-        """Build the message.
-
-        Args:
-            path: The log file.
-            wanted: What was asked for.
-            available: What is there.
-        """
+        """Build the message."""
         self.wanted = wanted
         self.available = tuple(available)
         listed = ", ".join(available[:_MOST_LISTED]) if available else "nothing"

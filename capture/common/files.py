@@ -18,9 +18,6 @@ from .strict_table import listed
 def is_file(path: Path) -> bool:
     """Whether a name, which a file may have given, is that of a file.
 
-    Args:
-        path: The file.
-
     Returns:
         False also for a name that no file system takes.
     """
@@ -32,12 +29,6 @@ def is_file(path: Path) -> bool:
 
 def read_input(path: Path) -> bytes:
     """Read a file that the user named.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its content.
 
     Raises:
         InputFileError: If it isn't there or can't be read.
@@ -52,13 +43,7 @@ def read_input(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class Description:
-    """The text of a description and where it comes from.
-
-    Attributes:
-        text: The TOML text.
-        source: For messages.
-        folder: Where its companions lie.
-    """
+    """The text of a description and where it comes from."""
 
     text: str
     source: Path
@@ -92,9 +77,6 @@ class Shelf:
         Args:
             name_or_path: One of :meth:`names`, or the path of a TOML file.
 
-        Returns:
-            Its text.
-
         Raises:
             UsageError: If there is none of that name.
             InputFileError: If it is a path, and the file isn't there or can't be read.
@@ -123,7 +105,6 @@ def check_output(output: Path, endings: Iterable[str], why: str, *, force: bool)
     """Check an output path before any work is done.
 
     Args:
-        output: The path.
         endings: Any of which its name must have.
         why: What to say if it has none of them.
         force: Whether an existing file may be replaced.
@@ -144,9 +125,6 @@ def part_file(output: Path) -> Generator[Path]:
     Args:
         output: The file wanted; one of that name is replaced, so callers that must not replace it
             ask :func:`.capture.common.console.refuse_existing` before they start.
-
-    Yields:
-        Where to write.
 
     Raises:
         LogWriteError: If it can't be written; nothing is left behind then.
@@ -182,7 +160,6 @@ def check_stop(output: Path, stop: StopRequest | None) -> None:
     """End the writing of a part file if an end was asked for.
 
     Args:
-        output: The file wanted.
         stop: The request to look at.
 
     Raises:

@@ -40,7 +40,6 @@ class Priority:
 
     Attributes:
         text: The priority, e.g. ``SCHED_RR 1``, or that it was refused.
-        refused: Whether it was.
     """
 
     text: str
@@ -49,11 +48,7 @@ class Priority:
 
 @contextmanager
 def raised_priority() -> Generator[Priority]:
-    """Raise the priority of all threads that the process has at the moment, and lower it again.
-
-    Yields:
-        What they have got.
-    """
+    """Raise the priority of all threads that the process has at the moment, and lower it again."""
     policy, nice = os.sched_getscheduler(0) & ~_RESET, os.getpriority(os.PRIO_PROCESS, 0)
     if policy != os.SCHED_OTHER or nice > 0:
         yield Priority(f"as it was started: {_named(policy, nice)}")

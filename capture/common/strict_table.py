@@ -137,8 +137,6 @@ class Faults:
 
         Args:
             key: Where it is, e.g. ``joints[3].plane``.
-            found: What stands there.
-            valid: What would be valid.
         """
         self._faults[Fault(key, found, valid)] = None
 
@@ -151,7 +149,6 @@ class Table:
     """One TOML table, with optional defaults behind it.
 
     Attributes:
-        values: The parsed table.
         faults: Where its faults are noted.
     """
 
@@ -165,9 +162,7 @@ class Table:
         """Wrap a table.
 
         Args:
-            values: The parsed table.
             where: Its key in the file, empty for the top.
-            faults: Where faults are noted.
             defaults: Looked into for keys that this table lacks.
         """
         self.values = values
@@ -197,8 +192,6 @@ class Table:
         """Note a fault of one key.
 
         Args:
-            key: Key in this table.
-            valid: What would be valid.
             found: What stands there; by default the value itself, ``nothing`` when absent.
         """
         where, value = self.look(key)
@@ -314,7 +307,6 @@ class Table:
         """An array of different strings; empty when absent, without the bad ones after a fault.
 
         Args:
-            key: Key in this table.
             valid: The words to choose from; any string when None.
         """
         value = self.look(key)[1]

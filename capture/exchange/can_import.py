@@ -46,14 +46,9 @@ def import_can(
 
     Args:
         source: The log: candump, ASC, BLF, TRC, python-can CSV or SQLite, MF4.
-        output: The session to write.
         robot: The robot that made the log.
         bus: The bus to decode; the first one in the log if None.
-        force: Replace an existing file.
         stop: Ends the import early, with a whole file of what was read so far.
-
-    Returns:
-        What was done.
 
     Raises:
         ImportFormatError: If the log can't be read or has no such bus.

@@ -176,9 +176,6 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
     Args:
         path: The file, with one of :data:`SUFFIXES`.
 
-    Yields:
-        The log.
-
     Raises:
         ImportFormatError: If there is no such file, its format isn't known or isn't what its
             suffix says, or it holds no frames; also while its blocks are taken.
@@ -227,9 +224,6 @@ def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Itera
 
 def log_suffix(path: Path) -> str:
     """The suffix that tells the format, in lower case: that before ``.gz``, if compressed.
-
-    Args:
-        path: The file.
 
     Returns:
         E.g. ``.asc``.

@@ -51,7 +51,6 @@ def read_candump(path: Path, lines: Iterator[str]) -> FrameLog:
     """Read a candump log.
 
     Args:
-        path: The file, for messages.
         lines: Its lines, with their line ends.
 
     Returns:
@@ -146,7 +145,6 @@ def candump_lines(
 
     Args:
         frames: The frames, classic or CAN FD, in the order wanted, shape (n,).
-        buses: Interface names.
         bus: Index into ``buses`` for each frame, shape (n,).
         directions: Whether to write ``R`` and ``T``.
         nanoseconds: Whether times have nine decimals rather than six, as candump has them; if

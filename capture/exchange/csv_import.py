@@ -64,7 +64,6 @@ class Column:
         column: Its name in the header.
         joint: The joint it belongs to.
         quantity: What it is of that joint.
-        unit: Its unit.
         wrap: Period of its jumps, in ``unit``; 0 if it doesn't wrap around.
         scale: Applied to the unwrapped cell.
         offset: Added after ``scale``, in ``unit``.
@@ -112,11 +111,7 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     """Read a map from its TOML file.
 
     Args:
-        path: The file.
         robot: The robot whose joints it names.
-
-    Returns:
-        The map.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.
@@ -138,9 +133,6 @@ def column_map_from_options(options: Sequence[str], robot: Robot) -> ColumnMap:
     Args:
         options: One a column, as the module describes.
         robot: The robot whose joints they name.
-
-    Returns:
-        The map.
 
     Raises:
         UsageError: If they have faults; lists all of them.
@@ -235,9 +227,6 @@ _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 def is_frame_csv(path: Path) -> bool:
     """Whether a CSV file holds CAN frames, as python-can writes them.
 
-    Args:
-        path: The file.
-
     Returns:
         False for any other table; also for a file that can't be read.
     """
@@ -266,14 +255,8 @@ def import_csv(
 
     Args:
         source: The log, with a header line.
-        output: The session to write.
         robot: The robot that made the log.
-        column_map: What its columns mean.
-        force: Replace an existing file.
         stop: Ends the import early, with a whole file of what was written so far.
-
-    Returns:
-        What was done.
 
     Raises:
         ImportFormatError: If the log lacks a column or a cell is no number; names row and column.

@@ -43,9 +43,6 @@ class ExportReport:
     """What an export of frames did.
 
     Attributes:
-        source: The session.
-        output: The trace.
-        title: Name of its format.
         buses: Bus to number of frames written.
         warnings: What the format doesn't hold, or the session doesn't give, one sentence each.
     """
@@ -73,15 +70,10 @@ def export_log(
     report. A candump log that was imported comes back bit for bit.
 
     Args:
-        source: The session.
         output: The trace to write; its suffix is one of
             :data:`.capture.exchange.frame_formats.FRAME_FORMATS`.
         bus: The bus to write; all if None.
-        force: Replace an existing file.
         stop: Ends the export, with nothing left behind.
-
-    Returns:
-        What was done.
 
     Raises:
         UsageError: If the suffix is no format that can be written, or the output is the session.
@@ -127,10 +119,6 @@ def export_log(
 def refuse_same(source: Path, output: Path) -> None:
     """Check that an export doesn't replace its own session.
 
-    Args:
-        source: The session.
-        output: The file to write.
-
     Raises:
         UsageError: If they are one file.
     """
@@ -152,9 +140,6 @@ class ColumnReport:
     """What an export of columns did.
 
     Attributes:
-        source: The session.
-        output: The table.
-        columns: Names of its columns.
         rows: Topic to number of rows.
         warnings: What is missing or doubtful, one sentence each.
     """
@@ -171,8 +156,6 @@ class RowBlock:
     """Rows of one topic.
 
     Attributes:
-        topic: The topic.
-        names: Joint names.
         joint: Index into ``names`` for each row, shape (n,).
         t_ns: Sampling times [Unix ns], shape (n,).
         values: Column name to values, shape (n,); NaN where a sample has none.
@@ -195,7 +178,6 @@ class TableFormat(Protocol):
         """Create a table.
 
         Args:
-            path: The file.
             columns: Names of the quantities' columns.
 
         Returns:
@@ -221,14 +203,9 @@ def export_columns(
     One topic is held in memory at a time.
 
     Args:
-        source: The session.
         output: The table to write; its suffix is one of :data:`TABLE_FORMATS`.
         topics: JointState topics; if none, those of :data:`DEFAULT_TOPICS` that are there.
-        force: Replace an existing file.
         stop: Ends the export, with nothing left behind.
-
-    Returns:
-        What was done.
 
     Raises:
         UsageError: If the suffix is no format that can be written, the output is the session, or

@@ -149,7 +149,6 @@ class FrameFacts:
     """What is known of a session's frames before any is written.
 
     Attributes:
-        session_id: Of the session.
         counts: Bus to number of classic frames, in the order of the bus indices.
         directions: Whether the frames' directions were recorded.
         start_ns: Earliest time of a frame [Unix ns]; 0 where there is none.
@@ -176,11 +175,7 @@ def chosen_buses(session: SessionView, bus: str | None) -> list[str]:
     """The buses to export.
 
     Args:
-        session: The session.
         bus: The one wanted; all if None.
-
-    Returns:
-        Their names.
 
     Raises:
         MissingChannelError: If the session has no raw frames, or no such bus.
@@ -218,8 +213,6 @@ def frame_blocks(
     then the order of ``buses`` holds.
 
     Args:
-        session: The session.
-        buses: Names of the buses.
         fd: Whether CAN FD frames are wanted, too.
 
     Yields:
@@ -270,15 +263,7 @@ def _block(topics: Sequence[_Topic], found: Sequence[FrameArray], done: float) -
 
 
 def frame_facts(session: SessionView, buses: Sequence[str]) -> FrameFacts:
-    """Look once over all frames.
-
-    Args:
-        session: The session.
-        buses: Names of the buses.
-
-    Returns:
-        The facts.
-    """
+    """Look once over all frames."""
     counts, fd_counts = np.zeros((2, len(buses)), dtype=np.int64)
     times: list[int] = []
     nanoseconds = False

@@ -198,9 +198,6 @@ class FrameFormat(Protocol):
     def notes(self, facts: FrameFacts) -> list[str]:
         """What the format can't say about the trace as a whole.
 
-        Args:
-            facts: Of the trace.
-
         Returns:
             One sentence each.
         """
@@ -208,10 +205,6 @@ class FrameFormat(Protocol):
 
     def open(self, path: Path, facts: FrameFacts) -> AbstractContextManager[WriteFrames]:
         """Create a file.
-
-        Args:
-            path: The file.
-            facts: Of the trace.
 
         Returns:
             A ``with`` block around what writes frames, which must have been through :meth:`kept`.
@@ -357,9 +350,6 @@ FRAME_FORMATS: dict[str, FrameFormat] = {
 
 def channel_numbers(buses: Sequence[str]) -> list[int]:
     """Numbers for buses in formats that have no names, counted from 0 as python-can does.
-
-    Args:
-        buses: Their names.
 
     Returns:
         N for a bus ``canN``, so that an import names it the same; the lowest free number for any

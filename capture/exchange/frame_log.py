@@ -92,19 +92,12 @@ class LogBlock:
         )
 
     def first_bus(self) -> int:
-        """Index of the bus of the first frame.
-
-        Returns:
-            The index.
-        """
+        """Index of the bus of the first frame."""
         starts_fd = self.is_fd is not None and bool(self.is_fd[0])
         return int((self.fd_bus if starts_fd else self.bus)[0])
 
     def of_bus(self, bus: int) -> FrameArray:
         """All frames of one bus, in the order of the log.
-
-        Args:
-            bus: Its index.
 
         Returns:
             Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, or of
@@ -208,9 +201,6 @@ class BlockBuilder:
         Args:
             t_ns: Its time [Unix ns].
             id_flags: Identifier with the flags of :mod:`.capture.log.messages.frames`.
-            dlc: Length code.
-            way: Direction.
-            bus: Index of its bus.
             data: Up to 8 bytes.
         """
         self._is_fd.append(False)
@@ -233,8 +223,6 @@ class BlockBuilder:
             t_ns: Its time [Unix ns].
             id_flags: Identifier with the flags of :mod:`.capture.log.messages.frames`.
             fd_flags: Flags that CAN FD alone has.
-            way: Direction.
-            bus: Index of its bus.
             data: Up to 64 bytes.
         """
         self._is_fd.append(True)
@@ -247,9 +235,6 @@ class BlockBuilder:
 
         Args:
             done: How much of the log's file has been read, 0 to 1.
-
-        Returns:
-            The block.
         """
         fd_count = len(self._fd_flags)
         frames, fd_frames = empty_frames(len(self) - fd_count), empty_fd_frames(fd_count)

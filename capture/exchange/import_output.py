@@ -22,9 +22,6 @@ class ImportReport:
     """What an import did.
 
     Attributes:
-        source: The foreign log.
-        output: The session.
-        robot: Name of the robot.
         start_ns: First sample or frame [Unix ns].
         end_ns: Last sample or frame [Unix ns].
         frames: Number of raw frames kept; None where the log has none.
@@ -74,9 +71,6 @@ class ImportReport:
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal.
 
-    Args:
-        path: The file.
-
     Returns:
         64 digits.
     """
@@ -100,15 +94,9 @@ def imported_session(
     no path of this machine enters the file.
 
     Args:
-        source: The foreign log.
-        output: The session file.
         robot: The robot that made the log.
         epoch_ns: Time of its first sample [Unix ns].
         facts: For the session's metadata.
-        force: Replace an existing file.
-
-    Yields:
-        The writer.
 
     Raises:
         OutputExistsError: If the output is there and ``force`` is not given.

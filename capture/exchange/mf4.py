@@ -51,7 +51,6 @@ def readable(path: Path, what: str) -> Generator[None]:
     """Turn whatever asammdf raises for a damaged file into our error with the file.
 
     Args:
-        path: The file.
         what: How the error begins, e.g. ``can't be read``.
 
     Yields:

@@ -94,8 +94,6 @@ def effort_there(
     in step with its command, one that moves in step with its own lag behind it.
 
     Args:
-        motion: The joint.
-        judged: Its judged windows.
         main: What it shows, and when.
         usual: Effort of the joints that follow.
 
@@ -132,7 +130,6 @@ def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
 
     Args:
         judged: All joints that are driven, in chain order.
-        k: Index of the joint.
 
     Returns:
         The symptom, if the joint shows it.

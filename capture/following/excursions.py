@@ -86,7 +86,6 @@ class Excursions:
         residual: Position less what the usual response gives [rad], shape (n,).
         expected: What the usual response gives [rad], shape (n,).
         amplitude: Usual amplitude of the response [rad].
-        spans_s: The departures.
         record_s: Start and end of what was searched [s].
     """
 
@@ -104,8 +103,6 @@ def find_holds(
     """Find the times at which a joint stands still for a cycle or more.
 
     Args:
-        motion: The joint.
-        response: Its windowed response.
         still: Windows in which it stands still, shape (w,).
         loaded: Whether its neighbours are held back by a load: then it may be, for a while.
 
@@ -150,8 +147,6 @@ def find_excursions(
     """Find the times at which a joint leaves its usual response.
 
     Args:
-        motion: The joint.
-        response: Its windowed response.
         follows: Windows that follow the command, shape (w,).
         ratio: Its usual H.
         offset: Its usual offset [rad].
@@ -196,7 +191,6 @@ def departures(
 
     Args:
         response: The joint's windowed response.
-        found: All its departures.
         alone: Of each, whether no other joint departs at the same time.
         loaded: Whether its neighbours are held back by a load: then it may be, for a while.
 

@@ -35,7 +35,6 @@ class Fault:
     """One joint that does not follow its command.
 
     Attributes:
-        joint: Joint name.
         kinds: The kinds of :data:`KINDS` that fit and that the data can't tell apart.
         spans_s: When it holds, from the common origin [s].
         since_s: Start of the first span [s]; None where it holds from the beginning.

@@ -89,9 +89,6 @@ SPIKES = 0.003
 def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     """Find joints whose positions are missing or repeated more than the others'.
 
-    Args:
-        motions: All joints.
-
     Returns:
         Joint name to symptoms; only joints that have some.
     """
@@ -129,9 +126,6 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
 
 def wraps(each: JointMotion) -> Symptom | None:
     """Find the steps of a counter that wraps around.
-
-    Args:
-        each: The joint.
 
     Returns:
         The symptom, if steps of one size, both up and down or again and again, are larger than
@@ -227,10 +221,6 @@ NEAR = 0.2
 
 def swapped_pairs(judged: Sequence[Judged], common: complex) -> dict[str, str]:
     """Find pairs of joints that answer each other's command.
-
-    Args:
-        judged: The driven joints.
-        common: Their common response.
 
     Returns:
         Joint name to its partner's, both ways.

@@ -92,13 +92,9 @@ def fault_of(
     """Turn the symptoms of one joint into its fault.
 
     Args:
-        motion: The joint.
         judged: Its judged windows; None where it could not be judged.
         symptoms: What it shows, at least one.
         usual: Effort of the joints that follow.
-
-    Returns:
-        The fault.
     """
     main = symptoms[0]
     begin, end = record_span(motion)

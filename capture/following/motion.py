@@ -62,7 +62,6 @@ class JointMotion:
     """What was recorded of one joint; None for a quantity that was not.
 
     Attributes:
-        name: Joint name.
         command: Commanded position [rad].
         position: Measured position [rad].
         velocity: [rad/s].
@@ -93,9 +92,6 @@ class JointMotion:
 
 def cycle_s(command: Samples) -> float:
     """Median length of the command's cycles.
-
-    Args:
-        command: The command.
 
     Returns:
         Time from one upward crossing of its middle to the next, with hysteresis [s]; a tenth of
@@ -227,7 +223,6 @@ def predicted(
     """The position that a response would give.
 
     Args:
-        motion: The joint.
         period_s: Cycle of its command T [s].
         ratio: H.
         offset: Mean of the position less that of the command [rad].
@@ -260,9 +255,6 @@ def within(t_s: FloatArray, spans: tuple[Span, ...]) -> BoolArray:
 
 def record_span(motion: JointMotion) -> Span:
     """The span of a joint's record.
-
-    Args:
-        motion: The joint.
 
     Returns:
         First and last time of its positions, or else of its commands [s].
@@ -341,9 +333,6 @@ class Judged:
 def own_response(response: Response) -> complex | None:
     """The usual response of one joint.
 
-    Args:
-        response: Its windows.
-
     Returns:
         Median of H over the windows that it explains; None where it explains too few, which is
         no response.
@@ -359,7 +348,6 @@ def neighbours(values: Sequence[_Value], k: int) -> list[_Value]:
 
     Args:
         values: One of each driven joint, e.g. its response, in chain order.
-        k: Index of the joint.
 
     Returns:
         Up to ``NEIGHBOURS`` values: the gain of a loaded chain changes along the body.
@@ -390,12 +378,7 @@ def judge(motion: JointMotion, response: Response, common: complex) -> Judged:
     """Judge each window of one joint.
 
     Args:
-        motion: The joint.
-        response: Its windows.
         common: The response that its neighbours have in common.
-
-    Returns:
-        The judged windows.
     """
     relative = response.ratio / common
     coherent = response.explained > COHERENT
@@ -419,7 +402,6 @@ def marked_spans(response: Response, marked: BoolArray) -> tuple[Span, ...]:
     """Marked windows as time spans, neighbours joined.
 
     Args:
-        response: The windows.
         marked: Which of them, shape (w,).
 
     Returns:
@@ -438,7 +420,6 @@ def whole_or(spans: tuple[Span, ...], response: Response) -> tuple[Span, ...]:
     """Nothing where the spans cover (nearly) the whole record, i.e. a permanent fault.
 
     Args:
-        spans: Of a symptom.
         response: The windows of its joint.
 
     Returns:
@@ -457,8 +438,5 @@ def complex_median(values: ComplexArray) -> complex:
 
     Args:
         values: One or more, shape (n,).
-
-    Returns:
-        Both together.
     """
     return complex(np.median(values.real), np.median(values.imag))

@@ -26,9 +26,6 @@ QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference
 def faults_in_session(session: SessionView) -> tuple[Fault, ...]:
     """Find the joints of a session that do not follow their command.
 
-    Args:
-        session: An open session.
-
     Returns:
         The faults, in chain order, times from the session's start; none where the session lacks
         commands or states. Of a session with breaks the longest unbroken stretch is looked at.
@@ -74,10 +71,8 @@ def motions_of(
     """Take the recorded signals of joints, times from the session's start.
 
     Args:
-        session: The session.
         columns: ``command``, ``position`` and whichever of ``velocity``, ``effort``, ``current``
             and ``reference`` there are, to signals by joint name.
-        names: Joints, in chain order.
         window_ns: Half-open window [Unix ns]; None for all.
 
     Returns:

@@ -30,10 +30,6 @@ from .source_clock import SourceClock
 def robot_of(settings: RecordSettings, sources: Sequence[Source]) -> Robot | None:
     """The robot that is recorded: named by the settings, or brought by a source.
 
-    Args:
-        settings: The settings.
-        sources: The sources.
-
     Returns:
         The robot; None where nobody says which.
 
@@ -62,8 +58,6 @@ def decoded_source(
 
     Args:
         settings: The settings; ``bus`` names it.
-        sources: The sources.
-        robot: The robot.
 
     Returns:
         Its name; None where no frames can be decoded.
@@ -112,8 +106,6 @@ class BusRecorder:
         """Open the bus.
 
         Args:
-            name: Name of the source.
-            writer: The session.
             clock: Maps the device's times onto the session's clock.
             robot: Whose bus this is: its frames are decoded. None: they are only kept.
             directions: Whether the frames tell sent from received.

@@ -57,9 +57,6 @@ def _no_constant(name: str) -> None:
 def reply_line(reply: Reply) -> bytes:
     """Write one line.
 
-    Args:
-        reply: Plain JSON values.
-
     Returns:
         The line, its newline at the end.
 
@@ -71,14 +68,7 @@ def reply_line(reply: Reply) -> bytes:
 
 
 def refusal(error: str) -> bytes:
-    """The reply to what can't be done.
-
-    Args:
-        error: Why.
-
-    Returns:
-        The line.
-    """
+    """The reply to what can't be done."""
     return reply_line({"ok": False, "error": error})
 
 
@@ -86,7 +76,6 @@ class Connection:
     """One client.
 
     Attributes:
-        socket: Its socket, non-blocking.
         heard: The poll in which it last said something.
         incoming: Bytes of requests that are not answered yet.
         outgoing: Bytes of replies that it has not taken yet.
@@ -100,7 +89,6 @@ class Connection:
         """Nothing has come yet.
 
         Args:
-            connection: The socket.
             number: The poll in which it connected.
         """
         self.socket = connection

@@ -39,9 +39,6 @@ Identity = tuple[int, int]
 def socket_folder(environ: Mapping[str, str]) -> Path:
     """Where a recorder puts its socket: one folder a user, so that a client finds them all.
 
-    Args:
-        environ: The environment.
-
     Returns:
         ``$RUNTIME_DIRECTORY`` (a service: below ``/run/undulog``), else
         ``$XDG_RUNTIME_DIR/undulog``, else ``undulog-UID`` among the temporary files.
@@ -56,10 +53,6 @@ def socket_folder(environ: Mapping[str, str]) -> Path:
 
 def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Path]:
     """The usual sockets of a recording, named after its output; makes the folder.
-
-    Args:
-        output: The session.
-        environ: The environment.
 
     Returns:
         The path, e.g. ``/run/user/1000/undulog/run.sock``, and the one to use where a recorder
@@ -84,9 +77,6 @@ def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Pat
 def find_sockets(environ: Mapping[str, str]) -> list[Path]:
     """The control sockets of running recorders that this user can see.
 
-    Args:
-        environ: The environment.
-
     Returns:
         Those where somebody listens, sorted; of this user, and of services.
     """
@@ -104,7 +94,6 @@ def listen(
     recorders from replacing each other's.
 
     Args:
-        path: Where.
         backlog: How many callers may wait.
         patience_s: Longest wait for another recorder that is at it just now [s].
 
@@ -144,8 +133,6 @@ def release(path: Path, listener: socket.socket, identity: Identity) -> None:
     """Close the socket and remove its file, if that is still ours.
 
     Args:
-        path: The file.
-        listener: The socket.
         identity: What :func:`listen` said of it.
     """
     with suppress(OSError):  # a folder that has gone took the file along
@@ -215,7 +202,6 @@ class ControlClient:
         """Connect.
 
         Args:
-            path: The control socket.
             patience_s: Longest wait for a reply [s]; None for ever.
 
         Raises:

@@ -110,7 +110,6 @@ class OperatorLog:
         """Nothing is written yet; channels open with their first message.
 
         Args:
-            writer: The session.
             say: Writes to ``/rosout``: level, who, text.
             now_ns: The session's clock [Unix ns].
         """
@@ -123,7 +122,6 @@ class OperatorLog:
 
         Args:
             level: ``info``, ``warn`` or ``error``.
-            text: What to say.
 
         Raises:
             LogWriteError: If it can't be written.
@@ -182,11 +180,7 @@ def request_handler(actions: RecorderActions, log: OperatorLog) -> Handler:
     """What a :class:`~.capture.recorder.control.ControlServer` hands its requests to.
 
     Args:
-        actions: The recorder.
         log: Where notes, modes and gaits go.
-
-    Returns:
-        The handler.
     """
 
     def handle(request: Mapping[str, Any]) -> Any:

@@ -123,11 +123,9 @@ class LiveHealth:
         """Hear of a message; it is looked at when the next update comes.
 
         Args:
-            channel_id: Its channel.
             log_time_ns: When it was recorded [Unix ns].
             publish_time_ns: When it was sampled [Unix ns].
             sequence: The channel's own counter.
-            payload: Its bytes.
         """
         self._pending[channel_id].append((log_time_ns, sequence, payload))
 
@@ -266,7 +264,6 @@ class LiveHealth:
         """A source when all were last looked at.
 
         Args:
-            source: The source.
             address: As the command line named it.
             clock: Maps its times; None for a source that writes its own channels.
 

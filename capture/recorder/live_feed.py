@@ -153,7 +153,6 @@ class LiveCounts:
     """What became of the messages.
 
     Attributes:
-        sent: Sent to a relay.
         dropped: Dropped because the relay was too slow, or gone while they waited.
         thinned: Left out because their channel speaks more often than is shown.
         too_big: Left out because they don't fit a datagram, definitions included.
@@ -254,11 +253,9 @@ class LiveFeed:
         """Take one message, if anybody watches.
 
         Args:
-            channel_id: Its channel.
             log_time_ns: When it was recorded [Unix ns].
             publish_time_ns: When it was sampled [Unix ns].
             sequence: The channel's own counter.
-            payload: Its bytes.
         """
         due = self._due.get(channel_id)
         if channel_id in self._states:

@@ -60,12 +60,10 @@ class LiveMessage(NamedTuple):
     """One message of the feed.
 
     Attributes:
-        channel_id: Its channel.
         sequence: The channel's own counter.
         log_time_ns: When it was recorded [Unix ns].
         publish_time_ns: When it was sampled [Unix ns].
         offered_ns: When the feed took it, on the machine's monotonic clock [ns].
-        payload: Its bytes.
     """
 
     channel_id: int
@@ -81,7 +79,6 @@ class DatagramHead:
     """What stands before the records.
 
     Attributes:
-        kind: What the datagram holds.
         messages: How many messages it has.
         feed_id: Random, one a recording: another one says that the recorder was started anew.
         dropped: Messages that the feed has dropped so far.
@@ -99,9 +96,6 @@ def pack_datagram(head: DatagramHead, records: Iterable[bytes]) -> bytes:
     Args:
         head: What stands before the records.
         records: As :func:`pack_message` and :func:`pack_description` give them.
-
-    Returns:
-        Its bytes.
     """
     packed = _HEAD.pack(_MAGIC, _VERSION, head.kind, head.messages, head.feed_id, head.dropped)
     return b"".join([packed, *records])
@@ -112,9 +106,6 @@ def pack_message(message: LiveMessage | tuple[int, int, int, int, int, bytes]) -
 
     Args:
         message: The message, or a tuple of the same fields.
-
-    Returns:
-        Its bytes.
     """
     channel_id, sequence, log_ns, publish_ns, offered_ns, payload = message
     length = len(payload)
@@ -129,9 +120,6 @@ def pack_description(record: Description) -> bytes:
 
     Args:
         record: E.g. a channel.
-
-    Returns:
-        Its bytes.
     """
     kind, body = pack_definition(record)
     payload = zlib.compress(body)
@@ -140,9 +128,6 @@ def pack_description(record: Description) -> bytes:
 
 def read_head(data: bytes) -> DatagramHead:
     """The head of a datagram.
-
-    Args:
-        data: The datagram.
 
     Returns:
         Its head.
@@ -254,7 +239,6 @@ class LiveWords:
 
         Args:
             record: The definition; it replaces one of the same name or number.
-            packed: The same, packed.
         """
         key = _key(record)
         if key is None:

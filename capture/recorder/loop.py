@@ -54,7 +54,6 @@ class Ending:
     """Why a recording ended.
 
     Attributes:
-        reason: One sentence.
         failed: Whether it had to end.
     """
 
@@ -90,7 +89,6 @@ class Recorder:
         Args:
             writer: The session; the recorder doesn't close it.
             clock: The session's clock.
-            sources: What to record.
             context: What the sources are given.
             robot: The robot that is recorded, or None.
             decoded: The source that is the robot's bus; None to keep all frames raw.
@@ -133,8 +131,6 @@ class Recorder:
 
         Args:
             level: ``info``, ``warn`` or ``error``.
-            name: Who says it.
-            text: One sentence.
             t_ns: When [Unix ns]; now by default.
 
         Raises:
@@ -155,7 +151,6 @@ class Recorder:
         """Record until something ends it.
 
         Args:
-            stop: Looked at every tick.
             duration_s: Ends by itself after this time [s].
 
         Returns:
@@ -414,11 +409,7 @@ class Recorder:
 
 
 def _check(polled: Polled) -> None:
-    """Refuse what a plug-in may give and no source gives.
-
-    Raises:
-        TypeError: If it isn't what :class:`Polled` says.
-    """
+    """Refuse what a plug-in may give and no source gives."""
     for frames in (*polled.frames, *polled.fd_frames):
         if frames.dtype not in (FRAME_DTYPE, FD_FRAME_DTYPE):
             raise TypeError(f"poll() gave frames of the type {frames.dtype}")

@@ -49,9 +49,6 @@ def free_space(path: Path) -> int:
     Args:
         path: The file, which need not be there yet.
 
-    Returns:
-        Free bytes.
-
     Raises:
         LogWriteError: If the folder can't be asked.
     """
@@ -69,14 +66,10 @@ class RecordReport:
 
     Attributes:
         files: The session's files, in order.
-        session_id: Its id.
         robot: Name of the robot, or None.
         duration_s: Time from start to end [s].
-        messages: Messages accepted.
-        size: Bytes of the files.
         verdict: ``good``, ``degraded`` or ``bad``.
         reasons: Why it is not better.
-        ending: Why it ended.
         sources: By name: what became of the frames.
         recorder: Of the recorder itself: ticks and so on.
     """
@@ -132,7 +125,6 @@ class Recording:
 
         Args:
             settings: What to record, and how.
-            stop: Ends the recording.
             notifier: Is told that it has begun, and then that it is alive.
 
         Raises:
@@ -208,10 +200,6 @@ class Recording:
     def warn(self, name: str, text: str) -> None:
         """Write a warning into the session; for what happens beside the recording.
 
-        Args:
-            name: Who says it.
-            text: One sentence.
-
         Raises:
             LogWriteError: If it can't be written.
         """
@@ -274,9 +262,6 @@ class Recording:
 
     def split(self) -> Mapping[str, Any]:
         """Begin a new part.
-
-        Returns:
-            Its number and file.
 
         Raises:
             UsageError: If a ring is kept.

@@ -77,7 +77,6 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
     """Draw a recording.
 
     Args:
-        snapshot: The recording.
         width: Characters in a line; no line is longer.
         height: Lines on the screen; topics that don't fit are counted. None for no end.
 
@@ -109,9 +108,6 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
 def plain_line(snapshot: RecorderSnapshot) -> str:
     """The recording in one line, for what is no terminal.
 
-    Args:
-        snapshot: The recording.
-
     Returns:
         Time, verdict, size, the sources, the heaviest reason.
     """
@@ -133,11 +129,7 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
 
 
 def event_line(event: EventLine) -> str:
-    """An event in one line, for what is no terminal.
-
-    Args:
-        event: The event.
-    """
+    """An event in one line, for what is no terminal."""
     return plain(f"{event.level}: {event.name}: {event.text}")
 
 
@@ -339,7 +331,6 @@ class Terminal:
 
         Args:
             stream: Where to, e.g. ``sys.stderr``.
-            quiet: Show nothing at all.
         """
         self._stream = stream
         self._quiet = quiet
@@ -349,11 +340,7 @@ class Terminal:
         self._thread: threading.Thread | None = None
 
     def show(self, snapshot: RecorderSnapshot) -> None:
-        """Hand over the latest state; returns at once, also where the terminal is stuck.
-
-        Args:
-            snapshot: The recording.
-        """
+        """Hand over the latest state; returns at once, also where the terminal is stuck."""
         if self._quiet:
             return
         with self._wake:

@@ -46,7 +46,6 @@ class ClockEstimate:
         drift_uncertainty_ppm: Its standard deviation [ppm].
         jitter_s: Standard deviation of arrival minus mapped time [s].
         delay_p99_s: 99 % point of arrival minus mapped time [s], within 9 %.
-        samples: Samples mapped.
         resets: How often the device's clock was set or restarted.
         out_of_range: Samples whose device time is impossible.
     """

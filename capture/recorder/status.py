@@ -64,7 +64,6 @@ class EachSecond:
         """Begin in a second from now, in the order given.
 
         Args:
-            tasks: What to do.
             now_ns: A monotonic clock [ns].
         """
         self._tasks = tuple(tasks)
@@ -96,7 +95,6 @@ class TickTimes:
     """Durations of ticks.
 
     Attributes:
-        count: Number of ticks.
         p50_s: Median [s], 0 without ticks.
         p99_s: 99 % point [s], to 6 %.
         max_s: Longest [s].
@@ -145,8 +143,6 @@ class TopicSnapshot:
     """One topic.
 
     Attributes:
-        topic: Its name.
-        count: Messages so far.
         rate_hz: Messages a second over the last seconds; None before there is a rate.
         age_s: Time since the last message [s].
         gaps: Gaps in the rhythm so far; None where there is no steady rhythm.
@@ -178,7 +174,6 @@ class SourceSnapshot:
     Attributes:
         name: What the session calls it.
         address: As the command line named it.
-        connected: Whether data can come.
         finished: Whether nothing will come any more.
         frames: Frames so far; None for a source that writes topics of its own.
         rate_hz: Frames a second over the last seconds; None before there is a rate.
@@ -214,8 +209,6 @@ class EventLine:
     Attributes:
         t_ns: When [Unix ns].
         level: ``debug``, ``info``, ``warn``, ``error`` or ``fatal``.
-        name: Who says it.
-        text: One sentence.
     """
 
     t_ns: int
@@ -229,15 +222,12 @@ class RecorderSnapshot:
     """The recording.
 
     Attributes:
-        session_id: Its id.
         path: The file, or the part that is being written.
         robot: Name of the robot, or None.
         state: What the recorder does: ``recording``, ``waiting`` (a ring that waits for its
             trigger), ``stopping``.
         now_ns: The session's clock [Unix ns].
         elapsed_s: Time since the start [s].
-        messages: Messages accepted.
-        size: Bytes written.
         byte_rate: Bytes written a second, over the last while; None before there is a rate.
         free: Free bytes where the file is; None where that can't be said.
         part: Number of the part, from 1; None where the session is not split.
@@ -245,7 +235,6 @@ class RecorderSnapshot:
         reasons: Why it is not better, heaviest first.
         notes: What is worth knowing and no fault.
         sources: In the order of the command line.
-        topics: By name.
         events: The latest ones, oldest first.
         tick_p99_s: 99 % point of the recorder's ticks [s].
         tick_max_s: The longest tick [s].
@@ -302,9 +291,6 @@ _REASONS = 8
 
 def statuses(snapshot: RecorderSnapshot) -> tuple[DiagnosticStatus, ...]:
     """The statuses of one moment.
-
-    Args:
-        snapshot: The recording.
 
     Returns:
         The recorder, the session, each source, each group of topics.
@@ -390,9 +376,6 @@ def _source(source: SourceSnapshot) -> DiagnosticStatus:
 
 def source_state(source: SourceSnapshot) -> tuple[int, str]:
     """What a source's state is called.
-
-    Args:
-        source: The source.
 
     Returns:
         Level of :mod:`.capture.log.messages.definitions` and a few words.

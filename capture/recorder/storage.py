@@ -21,11 +21,7 @@ class Listener(Protocol):
     """Is told of records after the sink has accepted them; must not wait and must not fail."""
 
     def define(self, record: Description) -> None:
-        """Hear of what explains later messages.
-
-        Args:
-            record: The record.
-        """
+        """Hear of what explains later messages."""
         ...
 
     def offer(
@@ -57,9 +53,6 @@ class TappedSink:
 
     def define(self, record: Description) -> None:
         """Take what explains later messages.
-
-        Args:
-            record: The record.
 
         Raises:
             LogWriteError: If the sink can't keep it.
@@ -163,9 +156,6 @@ class RingStorage:
     def mark(self, text: str = "") -> Mapping[str, Any]:
         """Write what the ring holds.
 
-        Args:
-            text: Why.
-
         Returns:
             The file that is being written, and how much is in it.
 
@@ -246,9 +236,6 @@ class Storage(Protocol):
     def mark(self, text: str = "") -> Mapping[str, Any]:
         """Mark this moment.
 
-        Args:
-            text: Why.
-
         Returns:
             What there is to say of it.
 
@@ -279,9 +266,6 @@ class DiskStorage:
 
     def __init__(self, settings: RecordSettings) -> None:
         """Create the first file.
-
-        Args:
-            settings: Output and parts.
 
         Raises:
             OutputExistsError: If it is there and ``force`` is not given.
@@ -347,19 +331,12 @@ class DiskStorage:
         return (("error", f"the next part could not be begun, this one goes on: {trouble}"),)
 
     def mark(self, text: str = "") -> Mapping[str, Any]:
-        """Nothing to do: everything is written, the mark with it.
-
-        Args:
-            text: Why.
-        """
+        """Nothing to do: everything is written, the mark with it."""
         del text
         return {}
 
     def split(self) -> Mapping[str, Any]:
         """Begin the next part.
-
-        Returns:
-            Its number and file.
 
         Raises:
             LogWriteError: If it can't be created; the recording goes on in the one before.
@@ -375,12 +352,6 @@ class DiskStorage:
 
 def open_storage(settings: RecordSettings) -> Storage:
     """Create what the settings ask for.
-
-    Args:
-        settings: The settings.
-
-    Returns:
-        The storage.
 
     Raises:
         OutputExistsError: If the output is there and ``force`` is not given.

@@ -165,9 +165,6 @@ def unit_text(program: Path) -> str:
 def installed_program() -> Path:
     """The ``undulog`` command beside the interpreter that runs this.
 
-    Returns:
-        Its absolute path.
-
     Raises:
         UsageError: If there is none: not installed as a package.
     """
@@ -179,9 +176,6 @@ def installed_program() -> Path:
 
 def hidden_folder(program: Path) -> str | None:
     """The folder above a program that the unit hides, so that the service could not start.
-
-    Args:
-        program: Path of the command.
 
     Returns:
         One of :data:`HIDDEN`, or None.

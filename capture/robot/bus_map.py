@@ -108,9 +108,6 @@ SESSION_UNIT: dict[Quantity, str] = {
 def valid_units(quantity: Quantity) -> tuple[str, ...]:
     """Names of the units that fit a quantity.
 
-    Args:
-        quantity: The quantity.
-
     Returns:
         The names, the session's own unit first.
     """
@@ -124,9 +121,6 @@ def unit_for(name: str, quantity: Quantity) -> Unit:
     Args:
         name: Unit name, e.g. ``deg``.
         quantity: What is measured in it.
-
-    Returns:
-        The unit.
 
     Raises:
         UsageError: If there is no such unit or it measures something else; lists the valid ones.

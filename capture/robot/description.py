@@ -55,9 +55,7 @@ def note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
     """Note names that occur more than once; empty ones are faults already.
 
     Args:
-        faults: Where they are noted.
         what: What has these names, e.g. ``links``.
-        names: The names.
     """
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         faults.add(what, f"{names.count(name)} times {name}", "every name once")
@@ -71,7 +69,6 @@ def read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
     """Read ``joints``, or a ``chain`` of like ones, with ``defaults`` of joint and servo.
 
     Args:
-        top: The description.
         defaults: Its ``defaults``.
 
     Returns:
@@ -113,10 +110,6 @@ def _chain(top: Table) -> list[Table]:
 def numbered(word: str, count: int) -> list[str]:
     """Names of like parts that sort as they stand in the chain.
 
-    Args:
-        word: What they are.
-        count: How many.
-
     Returns:
         ``joint01``, ``joint02``, ...; three digits for more than 99.
     """
@@ -128,9 +121,7 @@ def read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...
     """Read ``links``, or make one more than joints as ``defaults`` say.
 
     Args:
-        top: The description.
         defaults: Its ``defaults``.
-        joint_count: Number of joints.
 
     Returns:
         The links, the head first.
@@ -162,10 +153,6 @@ def _link(table: Table) -> Link:
 def read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
     """Read ``safety``, and what single joints have otherwise.
 
-    Args:
-        top: The description.
-        joints: Its joints.
-
     Returns:
         The limits that are given; None without the table.
     """
@@ -193,12 +180,8 @@ def read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[
     """Read ``sensors``, with ``defaults`` of each kind.
 
     Args:
-        top: The description.
         defaults: Its ``defaults``.
         links: The links that may carry them.
-
-    Returns:
-        The sensors.
     """
     common = {kind: defaults.table(kind) for kind in SensorKind}
     used: set[SensorKind] = set()
@@ -269,9 +252,6 @@ def load_robot(name_or_path: str | Path) -> Robot:
         name_or_path: A name of :func:`robot_names`, or the path of a TOML file; the DBC files that
             it lists lie beside it.
 
-    Returns:
-        The robot.
-
     Raises:
         UsageError: If no robot has that name.
         InputFileError: If it is a path, and the file isn't there or can't be read.
@@ -290,13 +270,9 @@ def parse_robot(text: str, source: str | Path, databases: Mapping[str, str]) -> 
     """Read a robot description from text.
 
     Args:
-        text: The TOML text.
         source: Where it comes from, for messages.
         databases: DBC file name to text; those that the description lists are used. Meshes are
             left out.
-
-    Returns:
-        The robot.
 
     Raises:
         RobotFileError: If the description has faults; lists all of them.
@@ -309,7 +285,6 @@ def robot_in_session(attachments: Mapping[str, bytes], source: str | Path) -> Ro
 
     Args:
         attachments: The session's attached files, by name.
-        source: The session, for messages.
 
     Returns:
         The robot with its databases and those of its meshes that are there; None if no

@@ -26,9 +26,6 @@ MESH_TYPES = {
 def is_mesh(name: str) -> bool:
     """Whether a file is a mesh, by its name.
 
-    Args:
-        name: File name.
-
     Returns:
         Whether its suffix is one of :data:`MESH_TYPES`.
     """
@@ -37,9 +34,6 @@ def is_mesh(name: str) -> bool:
 
 def mesh_type(name: str) -> str | None:
     """Media type of a mesh file.
-
-    Args:
-        name: File name.
 
     Returns:
         The type, None for a file of another kind.
@@ -53,7 +47,6 @@ def read_meshes(
     """Read the mesh files that the links name, each once.
 
     Args:
-        links: The links.
         faults: Where files that can't be read are noted.
         read: Bytes of a file of that name, None where it can't be read.
 

@@ -79,7 +79,6 @@ class Safety:
 
         Args:
             limit: One of :data:`JOINT_LIMITS`.
-            joint_names: The joints.
 
         Returns:
             Shape (m,); NaN where there is none.
@@ -170,12 +169,10 @@ class Joint:
     """One actuated joint.
 
     Attributes:
-        name: Unique in the robot.
         plane: The plane in which it bends the body.
         lower: Lower limit [rad].
         upper: Upper limit [rad].
         max_velocity: Rate limit [rad/s].
-        servo: Its servo.
     """
 
     name: Name
@@ -196,7 +193,6 @@ class Link:
     """One rigid link, a capsule along x.
 
     Attributes:
-        name: Unique in the robot.
         length: Joint to joint [m].
         radius: [m].
         mass: [kg].
@@ -221,7 +217,6 @@ class Sensor:
 
     Attributes:
         name: Unique in the robot; an IR sensor ``ir01`` is logged on ``/ir/01``.
-        kind: What it measures.
         link: Name of the link that carries it.
         position: Mount point in the link's frame [m].
         rpy: Roll, pitch, yaw of the sensor's frame in the link's frame [rad]; rays leave along x.
@@ -291,8 +286,6 @@ class BusSignal:
     get it in SI.
 
     Attributes:
-        message: DBC message name.
-        signal: DBC signal name.
         direction: Way of the frame; a request and its reply may share one identifier.
         target: Name of the joint or sensor.
         quantity: What it is of that target.
@@ -322,7 +315,6 @@ class BusPoll:
     """A request that makes a servo or a sensor tell its state, and moves nothing.
 
     Attributes:
-        message: DBC message name.
         signals: Signal names with their raw numbers, before the DBC's scale; others are 0.
     """
 
@@ -337,7 +329,6 @@ class Bus:
     Attributes:
         databases: DBC file names, relative to the robot TOML.
         bitrate: [bit/s].
-        signals: The map.
         polls: What has to be asked in each control tick; empty where the robot tells unasked.
     """
 
@@ -353,11 +344,9 @@ class Robot:
 
     Attributes:
         name: Short name, e.g. ``snake25``.
-        description: One sentence.
         clock: Whose clock stamps its samples.
         links: From the head; one more than joints.
         joints: From the head.
-        sensors: In any order.
         bus: The bus map, or None.
         toml: The text it was read from; stored in every session.
         databases: DBC file name to text, for the session's attachments.
@@ -392,9 +381,6 @@ class Robot:
 
     def joint_indices(self, plane: Plane) -> IntArray:
         """Indices of the joints of one plane, head to tail.
-
-        Args:
-            plane: The plane.
 
         Returns:
             Indices into ``joints``, shape (number of joints in that plane,).

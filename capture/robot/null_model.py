@@ -53,11 +53,8 @@ class NullModel:
     """A null model of m driven joints and K shared parameters; arrays are read-only.
 
     Attributes:
-        robot: Name of the robot.
-        frequency_hz: Of the gait.
         joints: Driven joints, head to tail.
         command: Complex amplitudes of their commands, up to a common phase [rad], shape (m,).
-        parameters: theta.
         covariance: Of x, what is known of theta beforehand, shape (K, K).
         response: y_0, shape (m,).
         slope: dy/dx, shape (K, m).
@@ -117,7 +114,6 @@ def write_null_model(path: Path, model: NullModel) -> None:
 
     Args:
         path: The file, replaced if it is there.
-        model: The model.
 
     Raises:
         LogWriteError: If it can't be written.
@@ -145,12 +141,6 @@ def write_null_model(path: Path, model: NullModel) -> None:
 
 def read_null_model(path: Path) -> NullModel:
     """Read a null model, strictly.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The model.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.

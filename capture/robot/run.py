@@ -113,10 +113,6 @@ def run_from_record(facts: Mapping[str, str]) -> Run:
 def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> Run | None:
     """Read the attached scenario of a session without the record.
 
-    Args:
-        text: The scenario.
-        joint_names: Joints of the robot.
-
     Returns:
         The facts; None if they can't be read.
     """

@@ -19,10 +19,6 @@ _NO = {"0", "false", "no", "off"}
 def only(address: SourceAddress, valid: Iterable[str]) -> None:
     """See that there are no other options than these.
 
-    Args:
-        address: The address.
-        valid: Names of the options.
-
     Raises:
         UsageError: If there is another one; lists those that are valid.
     """
@@ -36,8 +32,6 @@ def number(address: SourceAddress, key: str, default: int) -> int:
     """A whole number.
 
     Args:
-        address: The address.
-        key: Name of the option.
         default: If it isn't given.
 
     Returns:
@@ -58,8 +52,6 @@ def flag(address: SourceAddress, key: str, *, default: bool) -> bool:
     """Yes or no.
 
     Args:
-        address: The address.
-        key: Name of the option.
         default: If it isn't given.
 
     Returns:
@@ -163,9 +155,6 @@ def open_source(address: SourceAddress) -> Source:
 
     Args:
         address: From :func:`.capture.sources.address.parse_address`.
-
-    Returns:
-        The source.
 
     Raises:
         UsageError: If there is no such scheme or its options are wrong.

@@ -61,11 +61,7 @@ def bus_class(text: str, interface: str) -> type[can.BusABC]:
     """The class of an interface.
 
     Args:
-        text: The address, for messages.
         interface: E.g. ``pcan``; one that is known.
-
-    Returns:
-        The class.
 
     Raises:
         SourceError: If what it needs is not installed.
@@ -84,8 +80,6 @@ class PythonCanLink:
         """Take over a bus.
 
         Args:
-            bus: Open.
-            tally: Where to count.
             device_time: Whether the messages' times are the device's.
             detail: What is worth telling of it.
         """
@@ -162,9 +156,6 @@ def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool)
         messages: Arrival [Unix ns] and message, of at most 8 bytes.
         device_time: Whether to take the messages' times, to the microsecond, as the device's; those
             that are negative, not finite or out of range are replaced by the arrival's.
-
-    Returns:
-        The frames.
     """
     frames = empty_frames(len(messages))
     _fill(frames, messages, device_time=device_time)
@@ -178,9 +169,6 @@ def fd_frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bo
     Args:
         messages: Arrival [Unix ns] and message, of at most 64 bytes.
         device_time: Whether to take the messages' times, to the microsecond, as the device's.
-
-    Returns:
-        The CAN FD frames.
     """
     frames = empty_fd_frames(len(messages))
     _fill(frames, messages, device_time=device_time)
@@ -218,14 +206,7 @@ def _fill(
 
 
 def failure(error: Exception) -> OSError:
-    """An error of a driver as the loss of a connection.
-
-    Args:
-        error: What was raised.
-
-    Returns:
-        The same, as OSError.
-    """
+    """An error of a driver as the loss of a connection."""
     if isinstance(error, OSError):
         return error
     code = getattr(error, "error_code", None)
@@ -237,12 +218,7 @@ def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) ->
     """Open a bus.
 
     Args:
-        text: The address, for messages.
-        bus: Its class.
         options: What to give it, the channel among them.
-
-    Returns:
-        The open bus.
 
     Raises:
         OSError: If it can't be opened now.
@@ -275,7 +251,6 @@ def python_can_source(
     """Make the source of a python-can interface.
 
     Args:
-        address: What was asked for.
         interface: E.g. ``pcan``; one that is known.
         options: What to give it, the channel among them.
         facts: For the session's metadata.
@@ -357,9 +332,6 @@ def check_interface(text: str, interface: str) -> None:
 
 def known_options(bus: type[can.BusABC]) -> set[str]:
     """The options that an interface's class names in its signature or its documentation.
-
-    Args:
-        bus: The class.
 
     Returns:
         Their names, without the channel.

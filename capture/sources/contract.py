@@ -114,7 +114,6 @@ class SourceEvent:
     Attributes:
         t_ns: When [ns], on the session's clock.
         level: ``info``, ``warn`` or ``error``.
-        text: One sentence.
     """
 
     t_ns: int
@@ -131,7 +130,6 @@ class Polled:
             came. ``t_host_ns`` is the arrival on the session's clock, ``t_device_ns`` the device's
             own time, on the device's own clock and below :data:`DEVICE_TIMES_END_NS`, or equal to
             ``t_host_ns`` where it gives none.
-        events: What happened.
         fd_frames: The same of CAN FD frames: records of :data:`.FD_FRAME_DTYPE`.
     """
 
@@ -145,7 +143,6 @@ class SourceCounts:
     """What became of a source's frames, since the start.
 
     Attributes:
-        frames: Frames taken.
         dropped: Frames that the source's own sequence numbers or counters prove lost before us;
             None where the source has no such thing.
         malformed: Packets or lines that could not be read, frames with impossible device times.
@@ -225,20 +222,13 @@ class Source(Protocol):
     def start(self, context: SourceContext) -> None:
         """Begin: connect, or begin to try.
 
-        Args:
-            context: The recording.
-
         Raises:
             SourceError: If it can never work: no such device type, a path that is not ours.
         """
         ...
 
     def poll(self) -> Polled:
-        """Take what has come; returns at once.
-
-        Returns:
-            Frames and events.
-        """
+        """Take what has come; returns at once."""
         ...
 
     def stop(self) -> None:

@@ -54,7 +54,6 @@ class EventLog:
         Args:
             level: ``info``, ``warn`` or ``error``.
             text: One sentence, the same for the same kind of event: no numbers that change.
-            count: How often it happened.
         """
         now = self._now_ns()
         with self._lock:
@@ -114,7 +113,6 @@ class Tally:
     Attributes:
         now_ns: The session's clock [Unix ns].
         counts: What became of the frames.
-        events: What happened.
     """
 
     now_ns: Callable[[], int]
@@ -129,7 +127,6 @@ class Tally:
         """Count what could not be read, and say so.
 
         Args:
-            text: What it was.
             count: How many; nothing happens for none.
         """
         if count:

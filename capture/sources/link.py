@@ -178,8 +178,6 @@ class LinkedSource:
         """Describe the source; nothing is opened.
 
         Args:
-            address: What was asked for.
-            open_link: Opens the connection.
             place: What it is connected to, for messages.
             clock: Whose clock the frames' device times are on.
             facts: What the session's metadata say of it.
@@ -239,9 +237,6 @@ class LinkedSource:
     def start(self, context: SourceContext) -> None:
         """Begin to connect, and wait a moment for what is there to answer.
 
-        Args:
-            context: The recording.
-
         Raises:
             SourceError: If it can never work. What is only absent is waited for.
         """
@@ -256,11 +251,7 @@ class LinkedSource:
                 raise
 
     def poll(self) -> Polled:
-        """Take what has come.
-
-        Returns:
-            Frames and events.
-        """
+        """Take what has come."""
         if self._finished:
             return Polled((), self._tally.events.flush())
         now = self._tally.now_ns()

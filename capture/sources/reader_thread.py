@@ -126,7 +126,6 @@ class _Rows:
     """Room for packets.
 
     Attributes:
-        room: The buffers.
         count: How many rows were filled in the end; None while the kernel fills them.
     """
 
@@ -179,9 +178,6 @@ class ReceiveThread:
 
     def take(self, most: int) -> list[Batch]:
         """Take what has come.
-
-        Args:
-            most: About so many packets.
 
         Returns:
             The packets in order; good until the next call.

@@ -109,9 +109,6 @@ class ReceiveMany:
     def receive(self, fileno: int) -> Batch:
         """Take what a socket has, up to the capacity, without waiting.
 
-        Args:
-            fileno: The socket.
-
         Returns:
             The packets; none if there are none.
 
@@ -125,9 +122,6 @@ class ReceiveMany:
 
         Meanwhile :meth:`arrived` and :meth:`batch` give another thread what is there already.
         :meth:`clear` comes before.
-
-        Args:
-            fileno: The socket, blocking.
 
         Returns:
             How many rows are filled: fewer after a signal or in front of an error.
@@ -150,18 +144,12 @@ class ReceiveMany:
 
         Args:
             start: Rows known to be filled.
-
-        Returns:
-            Rows that are filled.
         """
         empty = self._sizes[start:] == _EMPTY
         return start + int(empty.argmax()) if empty.any() else self.capacity
 
     def sizes(self, count: int) -> list[int]:
         """Sizes of the first packets.
-
-        Args:
-            count: How many.
 
         Returns:
             Bytes of each.
@@ -170,15 +158,7 @@ class ReceiveMany:
         return sizes
 
     def batch(self, start: int, stop: int) -> Batch:
-        """Packets that are there.
-
-        Args:
-            start: Of these rows,
-            stop: up to this one.
-
-        Returns:
-            The packets.
-        """
+        """Packets that are there."""
         if start == stop:
             return Batch(self._packets[:0], [], [], [], None)
         heads = self._heads[start:stop]
@@ -263,10 +243,8 @@ def enlarge_buffer(sock: socket.socket, force: int, option: int, size: int) -> N
     """Make a socket's buffer as large as we may.
 
     Args:
-        sock: The socket.
         force: :data:`SO_SNDBUFFORCE` or :data:`SO_RCVBUFFORCE`.
         option: ``SO_SNDBUF`` or ``SO_RCVBUF``, which the system limits.
-        size: Bytes wanted.
     """
     try:
         sock.setsockopt(socket.SOL_SOCKET, force, size)

@@ -35,11 +35,7 @@ class FrameSender:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Note where the recorder listens; the first :meth:`send` connects.
-
-        Args:
-            path: The socket.
-        """
+        """Note where the recorder listens; the first :meth:`send` connects."""
         self.path = Path(path)
         self.accepted = 0
         """Frames handed over, over all connections."""

@@ -81,7 +81,6 @@ class SlcanText:
         """Take what was read.
 
         Args:
-            chunk: The bytes.
             t_ns: When they were read [Unix ns].
             tally: Where to count what is malformed.
 
@@ -214,7 +213,6 @@ class SlcanSettings:
 
     Attributes:
         bitrate: Of the bus [bit/s]; None leaves the adapter's own.
-        listen_only: Neither acknowledge nor transmit.
         timestamps: Ask the adapter to stamp frames.
         tty_baud: Speed of the serial line [bit/s]; without meaning for USB.
         rtscts: Hardware handshake on the serial line.
@@ -247,14 +245,7 @@ class SlcanLink:
     """An open adapter."""
 
     def __init__(self, fileno: int, first: bytes, settings: SlcanSettings, tally: Tally) -> None:
-        """Take over a terminal device.
-
-        Args:
-            fileno: Open, raw, non-blocking.
-            first: What it sent already.
-            settings: How it was opened.
-            tally: Where to count.
-        """
+        """Take over a terminal device."""
         rate = "" if settings.bitrate is None else f", {settings.bitrate} bit/s"
         self.detail = ("listen-only" if settings.listen_only else "acknowledges frames") + rate
         self._fileno: int | None = fileno
@@ -305,14 +296,6 @@ class SlcanLink:
 def open_slcan(path: str, settings: SlcanSettings, tally: Tally) -> SlcanLink:
     """Open an adapter: bit rate, time stamps, then the channel.
 
-    Args:
-        path: The device.
-        settings: How.
-        tally: Where to count.
-
-    Returns:
-        The open link.
-
     Raises:
         OSError: If it isn't there, doesn't take commands, or refuses one.
         SourceError: If it is no terminal device.
@@ -350,9 +333,7 @@ def slcan_source(
     """Make the source of an adapter.
 
     Args:
-        address: What was asked for.
         path: The device, e.g. ``/dev/ttyACM0``.
-        settings: How to open it.
         facts: For the session's metadata.
 
     Returns:

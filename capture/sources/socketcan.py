@@ -106,12 +106,7 @@ class SocketcanLink:
     detail = "never transmits"
 
     def __init__(self, sock: socket.socket, tally: Tally) -> None:
-        """Take over a bound socket.
-
-        Args:
-            sock: The socket.
-            tally: Where to count.
-        """
+        """Take over a bound socket."""
         self._socket = sock
         self._tally = tally
         self._receive = ReceiveMany(_PACKETS, CANFD_MTU + 1)
@@ -171,10 +166,6 @@ def open_socketcan(interface: str, tally: Tally) -> SocketcanLink:
 
     Args:
         interface: E.g. ``can0``.
-        tally: Where to count.
-
-    Returns:
-        The open link.
 
     Raises:
         OSError: If there is no such interface, or it is down: it may come.
@@ -209,7 +200,6 @@ def socketcan_source(
     """Make the source of an interface.
 
     Args:
-        address: What was asked for.
         channel: The interface, e.g. ``can0``.
         facts: For the session's metadata.
         directions: Whether this computer is the robot's own: then the frames that it sends are

@@ -62,7 +62,6 @@ class SocketcandText:
         """Take what was read at once.
 
         Args:
-            chunk: The bytes.
             t_ns: When they were read [Unix ns].
             tally: Where to count what is malformed.
 
@@ -77,7 +76,6 @@ class SocketcandText:
         """Take what came in pieces.
 
         Args:
-            pieces: The bytes.
             times_ns: When each piece came [Unix ns].
             tally: Where to count what is malformed.
 
@@ -198,9 +196,7 @@ class SocketcandLink:
         """Take over a connection.
 
         Args:
-            sock: In raw mode.
             first: What came already behind the last answer.
-            tally: Where to count.
         """
         self._first = first
         self._text = SocketcandText()
@@ -246,9 +242,6 @@ def server_of(address: SourceAddress) -> tuple[str, int]:
     Args:
         address: E.g. of ``can:socketcand:can0?host=192.168.7.2``.
 
-    Returns:
-        Host and TCP port.
-
     Raises:
         UsageError: If an option is unknown or has no valid value.
     """
@@ -264,12 +257,7 @@ def open_socketcand(host: str, port: int, channel: str, tally: Tally) -> Socketc
 
     Args:
         host: Name or address.
-        port: TCP port.
         channel: The bus, as the server calls it.
-        tally: Where to count.
-
-    Returns:
-        The open link.
 
     Raises:
         OSError: If the server isn't there, has no such bus, or speaks something else.
@@ -288,7 +276,6 @@ def connect(host: str, port: int) -> tuple[socket.socket, bytes]:
 
     Args:
         host: Name or address.
-        port: TCP port.
 
     Returns:
         The socket, with a time limit, and what came already behind the greeting.
@@ -314,8 +301,6 @@ def enter_raw_mode(sock: socket.socket, rest: bytes, channel: str) -> bytes:
     """Open a bus and go to raw mode.
 
     Args:
-        sock: Connected and greeted.
-        rest: What came already.
         channel: The bus, as the server calls it.
 
     Returns:
@@ -336,9 +321,7 @@ def socketcand_source(
     """Make the source of a served bus.
 
     Args:
-        address: What was asked for.
         host: Name or address of the server.
-        port: Its TCP port.
         channel: The bus, as the server calls it.
         facts: For the session's metadata.
 
@@ -356,10 +339,6 @@ def socketcand_source(
 
 def read_answer(sock: socket.socket, rest: bytes) -> tuple[str, bytes]:
     """Wait for an answer.
-
-    Args:
-        sock: With a time limit.
-        rest: What came already.
 
     Returns:
         What stands in its brackets, blanks around it removed, and what came behind it.

@@ -139,9 +139,6 @@ class UnixSource:
     def start(self, context: SourceContext) -> None:
         """Listen.
 
-        Args:
-            context: The recording.
-
         Raises:
             SourceError: If something else is at the path, another program listens there, or it
                 can't be made.

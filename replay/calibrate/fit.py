@@ -47,7 +47,6 @@ class Search:
     Attributes:
         module: The joint that fits best with a servo of its own.
         p: Family-wise p-value.
-        tried: How many modules were.
     """
 
     module: str
@@ -112,8 +111,6 @@ class Wanted:
     Attributes:
         only: Names of shared parameters; all if empty.
         module: A joint whose stall torque is its own, or None.
-        search: Try every module.
-        delay: Fit a dead time.
         spread: Prior standard deviation of each ln theta.
         within: A parameter is determined if its 95 % interval is no wider than this to either side,
             as a share of it; of a dead time: of a control period.
@@ -134,12 +131,9 @@ class Fitted:
     """One parameter; values in its unit, of a module its factor on the shared one.
 
     Attributes:
-        name: Its name.
         label: How it is called in text.
         unit: SI.
         module: The joint whose own it is, or None.
-        start: Where the fit started.
-        value: Where it ended.
         ci95: 95 % interval; None where the twin doesn't fit, since it would hold for noise alone.
         determined: Whether the session tells it.
     """
@@ -159,19 +153,14 @@ class Calibration:
     """What came of a fit.
 
     Attributes:
-        session: The file.
         world: Scenario that it started from.
         scenario: That scenario with the fitted values.
-        parameters: All that were fitted.
         ridges: Directions that the session leaves open.
-        would_tell: What else to record.
-        before, after: Joint to misfit.
         search: What came of the search for a module, if there was one.
         lack: Whether the twin fits at all.
         memory: Autocorrelation time of what is left, in samples; 1 is white noise.
         iterations: Of the last fit.
         converged: Whether it came to an end.
-        runs: Of the twin.
         speed: Simulated seconds a second.
     """
 
@@ -210,9 +199,6 @@ def calibrate(
         kernels: What computes the force laws.
         on_tick: Called at every tick of every run; may raise to end the fit.
         on_iteration: Told each iteration, the residuals' RMS [rad] and the real-time factor.
-
-    Returns:
-        The calibration.
 
     Raises:
         UsageError: If no world is known, or what is wanted isn't there.

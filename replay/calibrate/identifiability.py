@@ -143,7 +143,6 @@ class Alternative:
     Attributes:
         label: What it is, e.g. ``transeth friction`` or ``play at joint02``.
         size: Its weight, or the play [rad].
-        error: Standard error.
         p: Of 'it is 0', alone.
         shift: Change of x with it, shape (K,).
         covariance: Of x with it, shape (K, K).
@@ -169,7 +168,6 @@ def alternatives(answers: Answers, solution: Solution) -> tuple[Alternative, ...
 
     Args:
         answers: The twin under the commands; one run for each law of the ground.
-        solution: The fit.
 
     Returns:
         Those that could be run, in no order.

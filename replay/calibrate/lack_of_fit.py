@@ -65,10 +65,6 @@ def misfit(times_s: FloatArray, measured: FloatArray, twin: FloatArray) -> Misfi
     Args:
         times_s: Sampling times [s], shape (n,).
         measured: Less the mean [rad], shape (n,).
-        twin: Likewise.
-
-    Returns:
-        What is between them.
     """
     rms = float(np.sqrt(np.mean((measured - twin) ** 2)))
     if np.sqrt(np.mean(twin**2)) < _STILL or np.unique(times_s).size < times_s.size:
@@ -99,7 +95,6 @@ class JointFit:
     """What is left at one joint.
 
     Attributes:
-        p: Of 'nothing but noise'.
         periodic_rad: RMS of what comes back every cycle, noise taken off [rad]; None without gait.
     """
 
@@ -129,7 +124,6 @@ class LackOfFit:
     Attributes:
         joints: Joint to what is left there.
         unfitted: The halves; None where one is too short.
-        alternatives: Other laws.
         gait_hz: Frequency that was looked at; None where there is no steady gait.
     """
 
@@ -178,9 +172,6 @@ def lack_of_fit(
         omega: Of the gait [rad/s]; None where there is none.
         unfitted: From :func:`halves`.
         others: From :func:`.replay.calibrate.identifiability.alternatives`.
-
-    Returns:
-        The tests.
     """
     found: dict[str, JointFit] = {}
     for joint, t, angle, rest in zip(

@@ -124,11 +124,7 @@ def module_unknown(scenario: Scenario, joint: str, spread: float) -> Unknown:
 
     Args:
         scenario: Where the commands will be given.
-        joint: Its joint.
         spread: Prior standard deviation of the factor's logarithm.
-
-    Returns:
-        The unknown.
 
     Raises:
         UsageError: If there is no such joint.
@@ -202,7 +198,6 @@ def read_measured(session: SessionView, settle_s: float, end_s: float) -> Measur
     """Read what the joints did.
 
     Args:
-        session: Open, with commands.
         settle_s: The first part to leave out [s] since the first command.
         end_s: Where the commands end [s].
 
@@ -243,7 +238,6 @@ class Answers:
         measured: Which joints are asked for, and when.
         kernels: What computes the force laws.
         on_tick: Called at every tick; may raise to end the run.
-        runs: So far.
         work_s: What they took [s].
     """
 
@@ -281,9 +275,6 @@ class Answers:
 
     def run(self, scenario: Scenario) -> CubicHermiteSpline:
         """Run the twin without noise.
-
-        Args:
-            scenario: What to run.
 
         Returns:
             Joint angles over time [rad], through angles and rates at the control ticks.

@@ -33,9 +33,6 @@ from .parameters import DELAY
 def robot_text(calibration: Calibration) -> str:
     """The robot description with the fitted servo.
 
-    Args:
-        calibration: The fit.
-
     Returns:
         TOML: the former description, its comments kept, under a head that says what was fitted.
 
@@ -76,12 +73,8 @@ def scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Pat
     """The scenario in which the session can be run again.
 
     Args:
-        calibration: The fit.
         robot_file: Where the robot description is.
         scenario_file: Where the scenario will be.
-
-    Returns:
-        TOML.
     """
     scenario = calibration.scenario
     own = {
@@ -107,8 +100,6 @@ def write_calibration(
     """Write the robot, and what its description lists, and the scenario if it is wanted.
 
     Args:
-        calibration: The fit.
-        robot_file: The robot description.
         scenario_file: The scenario, or None.
 
     Raises:
@@ -144,9 +135,6 @@ NOT_NOISE = 3.0
 def told(calibration: Calibration) -> Iterator[str]:
     """Lines for a terminal.
 
-    Args:
-        calibration: The fit.
-
     Yields:
         The answer first, joints last.
     """
@@ -181,9 +169,6 @@ def told(calibration: Calibration) -> Iterator[str]:
 
 def reported(calibration: Calibration) -> dict[str, Any]:
     """The calibration as plain JSON values.
-
-    Args:
-        calibration: The fit.
 
     Returns:
         SI units; ``within`` of intervals as pairs.

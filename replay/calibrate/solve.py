@@ -207,7 +207,6 @@ class Solution:
         columns: J at x, shapes (n_j, K).
         sigma: Standard deviation of each joint's residual [rad], shape (r,).
         memory: Autocorrelation time of the residuals, in samples.
-        iterations: How many there were.
         converged: Whether the last step was small against the standard errors.
     """
 
@@ -247,11 +246,7 @@ def solve(
         answers: The twin under the commands.
         unknowns: K of them.
         start: x to start from; theta_0 if None.
-        most: Iterations.
         on_iteration: Told each iteration and the residuals' RMS [rad].
-
-    Returns:
-        The solution.
 
     Raises:
         SimulationError: If the twin fails at the start.

@@ -41,8 +41,6 @@ class Sources:
     """What is known of the session before anything is drawn.
 
     Attributes:
-        session: The session.
-        found: What it holds.
         warnings: What is missing or was assumed, a sentence each; grows while it is drawn.
     """
 
@@ -55,11 +53,7 @@ class Sources:
         """Look through a session.
 
         Args:
-            session: The session.
             found: What it holds, where that is known; None to go through it.
-
-        Returns:
-            The sources.
 
         Raises:
             DataError: If the session holds nothing that can be drawn.
@@ -90,9 +84,6 @@ class Sources:
 def clock_of(session: SessionView) -> Clock:
     """The session's timelines.
 
-    Args:
-        session: The session.
-
     Returns:
         Its clock, with the phase of its gait where one was logged.
     """
@@ -117,9 +108,6 @@ class Drawing:
         """Write how things look, and what doesn't move.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
-            sources: The session.
             named: Modules that tests name, to be marked.
             span: The part of the session that is at hand: the body's path is read and drawn no
                 further before :meth:`widen`.
@@ -141,11 +129,7 @@ class Drawing:
         return None if self._head is None else self._sources.found.power_limit_w
 
     def write(self, stretch: Stretch) -> None:
-        """Draw a stretch.
-
-        Args:
-            stretch: Its samples.
-        """
+        """Draw a stretch."""
         self._plots.write(stretch)
         if self._scene is not None:
             self._scene.write(stretch)
@@ -154,7 +138,6 @@ class Drawing:
         """Go on with a further part of a session of which the beginning is drawn.
 
         Args:
-            found: What the session holds.
             span: The part of the head's trail that isn't drawn yet.
         """
         self._sources = replace(self._sources, found=found)
@@ -217,7 +200,6 @@ class Drawing:
         """Write the session in words; what was written before is replaced.
 
         Args:
-            session: All of the session.
             layer: What is known of it.
             content: What the recording holds, or will.
             awaited: Whether its numbers are still to come.

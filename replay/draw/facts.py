@@ -26,9 +26,6 @@ _MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
 def escaped(text: str) -> str:
     """Text with names from a log, as part of Markdown.
 
-    Args:
-        text: Any text.
-
     Returns:
         One line of Markdown that shows it and marks nothing up.
     """
@@ -37,9 +34,6 @@ def escaped(text: str) -> str:
 
 def code(text: str) -> str:
     """A name from a log as code in Markdown, in a table too.
-
-    Args:
-        text: Any text.
 
     Returns:
         A code span of one line; the text itself where it has a backtick.
@@ -61,17 +55,11 @@ def markdown(
     """What a reader needs beside the picture.
 
     Args:
-        session: The session.
         analysis: Its analysis, or None where there is none.
         notes: What is missing or was assumed, a sentence each.
         colors: What the body's colours mean.
-        content: What the recording holds.
-        named: Modules that tests name.
         has_cycles: Whether there is a timeline of gait cycles.
         awaited: Whether its analysis is still to come.
-
-    Returns:
-        Markdown.
     """
     facts = (
         code(session.session_id),
@@ -123,12 +111,7 @@ def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
 
 
 def log_facts(rec: rr.RecordingStream, text: str) -> None:
-    """Write the session's facts.
-
-    Args:
-        rec: The recording.
-        text: Markdown.
-    """
+    """Write the session's facts."""
     import rerun as rr
 
     rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)

@@ -67,9 +67,6 @@ def open_film(
         fps: Frames a second.
         samples: A few of the frames to come, which a GIF's colours are chosen from.
 
-    Yields:
-        What takes the frames.
-
     Raises:
         UsageError: If this kind of file can't hold such frames.
         LogWriteError: If it can't be written.
@@ -89,7 +86,6 @@ def check_film(kind: str, size: tuple[int, int], fps: int) -> None:
     """Check what a kind of file can hold, before any work is done.
 
     Args:
-        kind: Suffix of its name.
         size: Width and height [pixels].
         fps: Frames a second.
 
@@ -244,12 +240,6 @@ class Shot:
 def scene_only(content: Content) -> rrb.Blueprint:
     """The layout of a clip: the body's view and nothing else.
 
-    Args:
-        content: What the recording holds.
-
-    Returns:
-        The blueprint.
-
     Raises:
         DataError: If there is no body to see.
     """
@@ -282,15 +272,10 @@ def film(
     """Film a recording that was laid out by :func:`scene_only`.
 
     Args:
-        recording: The .rrd file.
-        shot: What of it.
         output: The clip, ``.gif`` or ``.mp4``; an existing one is replaced when this one is whole.
         legend: What the colours say, written into every frame above its time.
         on_frame: Called with the number of frames done.
         stop: Ends the work early; nothing is written then.
-
-    Returns:
-        Number of frames.
 
     Raises:
         LogWriteError: If the clip can't be written, or an end was asked for.

@@ -45,7 +45,6 @@ class Analysing:
         """Prepare it.
 
         Args:
-            path: The session.
             topics: JointState topics of its commands and responses.
         """
         self._arguments = [str(path), *topics]
@@ -124,7 +123,6 @@ def computed(session: SessionView, options: Options | None = None) -> Layer:
     """Analyse a session now; one without a gait can be seen too.
 
     Args:
-        session: The session, open.
         options: Where its joints are; None for the topics of the log contract.
 
     Returns:
@@ -146,7 +144,6 @@ def saved(session: SessionView, paths: Sequence[Path], options: Options | None =
     """Read what was found of a session before.
 
     Args:
-        session: The session, open.
         paths: Results, JSON: of the session, of an experiment or a comparison that it is part of.
         options: As for :func:`computed`, where no result holds numbers.
 
@@ -166,7 +163,6 @@ def found_before(session: SessionView, paths: Sequence[Path]) -> Layer:
     """Read what was found of a session before, and compute nothing.
 
     Args:
-        session: The session, open.
         paths: As for :func:`saved`.
 
     Returns:

@@ -95,10 +95,6 @@ def foreseen(content: Content, rhythm: Rhythm | None) -> Content:
 def same_arrangement(first: Content, other: Content) -> bool:
     """Whether two contents have the same views, so that one's layout does for the other.
 
-    Args:
-        first: What a recording holds.
-        other: What another one holds.
-
     Returns:
         Whether their views differ in nothing but titles.
     """
@@ -156,7 +152,6 @@ class Task:
     """What is to be shown.
 
     Attributes:
-        session: The session, open.
         known: What results say of it; its numbers are computed where they don't.
         analysing: Its analysis, not started.
         front: The tab in front once its views are filled; until then it is the session's.
@@ -187,15 +182,7 @@ class _Sink:
         return rec
 
     def connect(self, rec: rr.RecordingStream, layout: rrb.Blueprint) -> None:
-        """Give the viewer its layout, and then the stream: else it makes a layout of its own.
-
-        Args:
-            rec: The recording.
-            layout: How it is laid out at first.
-
-        Raises:
-            UndulogError: If the viewer doesn't start.
-        """
+        """Give the viewer its layout, and then the stream: else it makes a layout of its own."""
         self.viewer.wait_until_it_listens()
         self._attended(lambda: rec.connect_grpc(self.viewer.address, default_blueprint=layout))
         # The default alone would give way to the last one; an active one is the user's own.
@@ -226,12 +213,7 @@ class _Sink:
             raise failed[0]
 
     def look(self) -> None:
-        """Whether it is still wanted.
-
-        Raises:
-            NoLongerWantedError: If it isn't.
-            UndulogError: If the viewer has failed.
-        """
+        """Whether it is still wanted."""
         if self.stop.requested:
             raise NoLongerWantedError
         if self.viewer.ended:
@@ -239,15 +221,7 @@ class _Sink:
             raise NoLongerWantedError
 
     def hand_over(self, rec: rr.RecordingStream) -> None:
-        """Wait until the viewer has taken all of it, as long as it is wanted.
-
-        Args:
-            rec: The recording.
-
-        Raises:
-            NoLongerWantedError: If it isn't.
-            UndulogError: If the viewer has failed, or takes nothing any more.
-        """
+        """Wait until the viewer has taken all of it, as long as it is wanted."""
         while True:
             self.look()
             begun = time.monotonic()
@@ -265,9 +239,6 @@ class _Sink:
 
 def steps(session: SessionView) -> int:
     """How many steps it takes.
-
-    Args:
-        session: The session.
 
     Returns:
         The number: one a stretch, and one for the analysis.

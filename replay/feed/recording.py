@@ -41,9 +41,7 @@ class Recording:
     """What was written.
 
     Attributes:
-        path: The .rrd file.
         recording_id: Follows from the session id.
-        content: What it holds.
         warnings: What is missing or was assumed, a sentence each.
     """
 
@@ -78,7 +76,6 @@ def write_recording(
     """Convert a session.
 
     Args:
-        session: The session, open.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         analysis: The session's analysis, for the response bars and the cycles; None leaves them
             out.
@@ -86,9 +83,6 @@ def write_recording(
         named: Modules that tests name, to be marked.
         notes: What the caller has to say about the session, a sentence each.
         layout: Makes the blueprint from what the recording holds.
-
-    Returns:
-        What was written.
 
     Raises:
         DataError: If the session holds nothing that can be drawn.
@@ -126,9 +120,6 @@ def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStrea
     Args:
         identity: The recording's id.
         in_file: Cut chunks by their size alone: those that a clock cuts differ from run to run.
-
-    Returns:
-        The stream.
     """
     rr.set_strict_mode(True)
     batching = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if in_file else None
@@ -141,12 +132,7 @@ def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStrea
 
 
 def send_properties(rec: rr.RecordingStream, session: SessionView) -> None:
-    """Say whose recording it is.
-
-    Args:
-        rec: The recording.
-        session: The session.
-    """
+    """Say whose recording it is."""
     rec.send_recording_name(session.session_id)
     rec.send_recording_start_time_nanos(session.start_ns)
 
@@ -174,7 +160,6 @@ def require_whole(draft: Path, path: Path) -> None:
     """Check that a recording has its footer: Rerun only logs that its disk was full.
 
     Args:
-        draft: The file.
         path: What it will be called, for the message.
 
     Raises:

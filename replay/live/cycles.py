@@ -113,7 +113,6 @@ class CycleMeter:
         """Take new samples.
 
         Args:
-            batch: The samples.
             robot: The robot, which says what plane a joint is of; None where it isn't known.
 
         Returns:

@@ -47,7 +47,6 @@ class Batch:
     """New samples.
 
     Attributes:
-        columns: Of JointStates.
         head: Of the head's pose, or None.
         ranges: Topic to sampling times [ns], shape (n,), and distances [m], shape (n,).
         modes: When a gait mode was said [ns], and which.
@@ -150,9 +149,6 @@ class LiveLog:
 
         Args:
             messages: In the order of their sequence numbers.
-
-        Returns:
-            Their samples.
         """
         by_channel: dict[int, list[LiveMessage]] = {}
         batch = Batch()

@@ -67,11 +67,7 @@ class Window:
         return tuple(self._tracks.get((topic, field), {}).values())
 
     def add(self, batch: Batch) -> None:
-        """Take new samples, and forget the oldest.
-
-        Args:
-            batch: The new samples.
-        """
+        """Take new samples, and forget the oldest."""
         for key, tracks in batch.columns.items():
             own = self._tracks.setdefault(key, {})
             for track in tracks:
@@ -112,12 +108,8 @@ class Fresh:
         """Which samples are new; they count as drawn from now on.
 
         Args:
-            name: What they are of.
             t_ns: Their times [ns], ascending, shape (n,).
             upto_ns: The last time that can be drawn [ns]; None for all.
-
-        Returns:
-            The new rows.
         """
         start = int(np.searchsorted(t_ns, self._until_ns.get(name, -1), side="right"))
         stop = t_ns.size
@@ -133,8 +125,6 @@ class Fresh:
         """The new samples of tracks.
 
         Args:
-            name: What they are of.
-            tracks: The tracks.
             upto_ns: The last time that can be drawn [ns]; None for all.
 
         Returns:
@@ -175,7 +165,6 @@ class Datagram(NamedTuple):
 
     Attributes:
         head: Its head.
-        data: All its bytes.
     """
 
     head: DatagramHead
@@ -234,11 +223,7 @@ class Inbox:
             return
 
     def take(self) -> list[Datagram]:
-        """What has come since the last time, in order.
-
-        Returns:
-            The datagrams.
-        """
+        """What has come since the last time, in order."""
         with self._lock:
             taken = list(self._queue)
             self._queue.clear()

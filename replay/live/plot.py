@@ -32,12 +32,7 @@ class LiveStream(rr.RecordingStream):
     """A recording stream that says a static thing once, and again only when it has changed."""
 
     def __init__(self, application_id: str, recording_id: str) -> None:
-        """Make a stream that isn't connected yet.
-
-        Args:
-            application_id: The application.
-            recording_id: The recording.
-        """
+        """Make a stream that isn't connected yet."""
         super().__init__(application_id, recording_id=recording_id, send_properties=False)
         self._said: dict[tuple[str, str], Any] = {}  # Arrow arrays
 
@@ -52,9 +47,6 @@ class LiveStream(rr.RecordingStream):
         """Log, unless it is static and known already.
 
         Args:
-            entity_path: Where to.
-            entity: What.
-            extra: What else.
             static: Whether it has no time.
             strict: Whether to raise on data that can't be logged.
         """
@@ -121,9 +113,6 @@ class LivePlot:
         """Write new samples.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
-            tracks: The new samples.
             palette: Colour by joint name; None for the grey of everything commanded.
         """
         by_name = {track.name: track for track in tracks if track.t_ns.size}
@@ -211,11 +200,7 @@ class CycleBars:
         )
 
     def take(self, cycle: Cycle) -> None:
-        """Take a cycle, to be drawn a quantity at a time, so that no batch is late for it.
-
-        Args:
-            cycle: The cycle.
-        """
+        """Take a cycle, to be drawn a quantity at a time, so that no batch is late for it."""
         for quantity, values in (
             (GAIN, 100.0 * (cycle.gain - 1.0)),
             (LAG, np.degrees(cycle.lag_rad)),
@@ -235,8 +220,6 @@ class CycleBars:
         """Draw what waits, at the time at which its cycle started.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
             palette: Colour by joint name, head to tail.
             everything: Whether to draw all of it rather than one quantity of one cycle.
         """

@@ -40,9 +40,6 @@ _SERVER = "--server-memory-limit=256MB"
 def open_window() -> Viewer:
     """Open the native viewer, empty.
 
-    Returns:
-        The viewer.
-
     Raises:
         UndulogError: If it doesn't start.
     """
@@ -54,9 +51,6 @@ def open_server(tell: Callable[[str], None]) -> Viewer:
 
     Args:
         tell: Called with the address to open, once it is served.
-
-    Returns:
-        The server.
 
     Raises:
         UndulogError: If it doesn't start.
@@ -99,7 +93,6 @@ class RelayReport:
 
     Attributes:
         sessions: Session ids, in the order they came.
-        shown: Messages drawn.
         dropped: Messages that the recorder or the relay dropped because drawing took too long.
         unread: Messages and datagrams that could not be read.
         lag_s: From the recorder's taking a message to Rerun's taking what was drawn of it [s]:
@@ -286,7 +279,6 @@ def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayRep
     """Draw sessions in a viewer until it is closed or we are told to stop.
 
     Args:
-        path: The socket to make.
         viewer: The viewer, if it is a process of ours.
         address: Where it takes data, e.g. ``rerun+http://127.0.0.1:9876/proxy``.
 
@@ -306,7 +298,6 @@ def relay_to_file(path: Path, output: Path) -> RelayReport:
     """Draw one session to a file, which appears when the session ends or we are told to stop.
 
     Args:
-        path: The socket to make.
         output: The .rrd file; one of that name is replaced.
 
     Returns:

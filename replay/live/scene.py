@@ -56,7 +56,6 @@ class LiveScene:
         """Draw nothing yet.
 
         Args:
-            rec: Where to draw.
             log: What is known of the recording.
             session_id: The session's id.
             epoch_ns: Where ``session_time`` starts [Unix ns].
@@ -117,7 +116,6 @@ class LiveScene:
         """Draw new samples.
 
         Args:
-            batch: The samples.
             dropped: Messages that could not be shown so far.
         """
         self._window.add(batch)

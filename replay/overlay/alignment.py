@@ -66,12 +66,7 @@ class Ruler:
 
 @dataclass(frozen=True)
 class Aligned:
-    """A session with its place on the common timelines.
-
-    Attributes:
-        side: The session.
-        ruler: Its place.
-    """
+    """A session with its place on the common timelines."""
 
     side: Side
     ruler: Ruler
@@ -87,13 +82,6 @@ class Aligned:
 
 def align(sides: Sequence[Side], how: Align) -> tuple[Aligned, ...]:
     """Put sessions on common timelines.
-
-    Args:
-        sides: The sessions.
-        how: What happens at once.
-
-    Returns:
-        Each with its place.
 
     Raises:
         UsageError: If a session has no gait to be aligned by.
@@ -120,8 +108,6 @@ def counterparts(a: Aligned, b: Aligned, how: Align, t_ns: IntArray) -> tuple[In
 
     Args:
         a: The session that the times are of.
-        b: The other one.
-        how: What happens at once.
         t_ns: Times in ``a`` [Unix ns], shape (n,).
 
     Returns:
@@ -226,7 +212,6 @@ def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
     Args:
         a: The session whose world stays.
         b: The one that is moved.
-        how: What happens at once.
 
     Returns:
         The placement, or None where either has no body at any shared moment.
@@ -254,7 +239,6 @@ def told_placed(placed: Placement, name: str, first: str) -> str:
     """A placement in words.
 
     Args:
-        placed: The placement.
         name: The session that is moved.
         first: The one it is laid on.
 
@@ -278,7 +262,6 @@ def head_distance(
     Args:
         a: One session, with a head.
         b: The other, with a head.
-        how: What happens at once.
         placed: How ``b`` is moved.
         t_ns: Times in ``a`` [Unix ns], shape (n,).
 

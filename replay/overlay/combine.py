@@ -33,13 +33,9 @@ def bring_together(
         files: Two or more sessions; differences are from the first.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         names: What they are called, or None for the files' names.
-        how: What happens at once.
         place: Where the bodies are drawn.
         on_step: Told before each of :func:`steps` how many are done, and what comes.
         stop: Looked at now and then; once an end is asked for, nothing is written.
-
-    Returns:
-        What was written.
 
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
@@ -73,12 +69,5 @@ def bring_together(
 
 
 def steps(count: int) -> int:
-    """How many steps it takes.
-
-    Args:
-        count: Number of sessions.
-
-    Returns:
-        The number.
-    """
+    """How many steps it takes."""
     return count + 2

@@ -42,12 +42,7 @@ _WIDTH = 2.0
 
 @dataclass(frozen=True)
 class Dashes:
-    """A dashed line's rhythm in samples.
-
-    Attributes:
-        drawn: Samples in a dash.
-        left_out: Samples in a space.
-    """
+    """A dashed line's rhythm in samples."""
 
     drawn: int
     left_out: int
@@ -73,7 +68,6 @@ def dashed(values: FloatArray, dashes: Dashes) -> FloatArray:
 
     Args:
         values: Shape (n, k).
-        dashes: Their rhythm.
 
     Returns:
         Shape (n, k), NaN in the spaces.
@@ -86,9 +80,7 @@ def places_in(other: Side, first: Places | None, own: Places | None) -> Places |
     """The joints of another session that stand for its body.
 
     Args:
-        other: The session.
         first: The first session's joints.
-        own: Its own.
 
     Returns:
         The first session's where the other has them too, else its own.
@@ -101,8 +93,6 @@ def log_lines(rec: rr.RecordingStream, one: Aligned, rank: int, places: Places |
     """Write head, middle and tail of a session in degrees.
 
     Args:
-        rec: The recording.
-        one: The session.
         rank: Which session it is, 0 for the first, whose lines are solid.
         places: The joints, or None.
 
@@ -128,7 +118,6 @@ def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None
     """Name the bodies' power after their sessions; the first keeps its colour.
 
     Args:
-        rec: The recording.
         powers: Sessions whose power was written, by their place, 0 for the first.
     """
     for place, side in powers.items():
@@ -154,7 +143,6 @@ class Quantity:
 
     Attributes:
         key: As the comparison calls it; also the last part of the entity's path.
-        title: With unit.
         difference: Title of its differences, with unit.
         baseline: Where the sessions' bars start, in SI.
         scale: From SI to the unit shown.
@@ -188,7 +176,6 @@ def log_bars(rec: rr.RecordingStream, sides: Sequence[tuple[Side, Seen]]) -> tup
     """Write the sessions' bars next to each other.
 
     Args:
-        rec: The recording.
         sides: The sessions that could be analysed, in their order.
 
     Returns:
@@ -215,10 +202,7 @@ def log_differences(
     """Write how a session's joints answer otherwise than the first one's.
 
     Args:
-        rec: The recording.
         first: The first session.
-        other: The other one.
-        comparison: Of the two.
 
     Returns:
         Quantities of which there is a difference.

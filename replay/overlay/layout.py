@@ -43,7 +43,6 @@ class Found:
 
     Attributes:
         comparison: Numbers, or None where there are none.
-        why_not: Why there are none.
         changed: What the two sessions say of themselves, and say otherwise.
     """
 
@@ -66,8 +65,6 @@ def answer(first: Side, other: Side, found: Found) -> str:
 
     Args:
         first: The first session, A.
-        other: The other one, B.
-        found: Their comparison.
 
     Returns:
         One sentence without its full stop.
@@ -77,15 +74,7 @@ def answer(first: Side, other: Side, found: Found) -> str:
 
 
 def changed_between(first: Side, other: Side) -> tuple[Change, ...]:
-    """What two sessions say of how they were made, and say otherwise.
-
-    Args:
-        first: Side A.
-        other: Side B.
-
-    Returns:
-        The changes.
-    """
+    """What two sessions say of how they were made, and say otherwise."""
     return changes([first.facts], [other.facts])
 
 
@@ -101,15 +90,10 @@ def markdown(
     """What a reader needs beside the picture.
 
     Args:
-        sides: The sessions.
         found: What the comparison with the first says, by the others' names.
-        how: What happens at once.
         has_cycles: Whether there is a timeline of gait cycles.
         legend: How the bodies are told apart.
         notes: How the bodies were placed, what is missing, what was assumed, a sentence each.
-
-    Returns:
-        Markdown.
     """
     first, *others = sides
     parts = [f"**{escaped(answer(first, other, found[other.name]))}.**" for other in others]
@@ -168,7 +152,6 @@ class Shown:
     """What was written of a session.
 
     Attributes:
-        side: The session.
         content: Its own recording's.
         body: Whether its body is drawn.
         lines: Whether its head, middle or tail was measured.
@@ -244,11 +227,7 @@ def all_views(
     Args:
         shown: What was written of each session, the first one first.
         bars: Quantities whose bars stand next to each other.
-        how: What happens at once.
         title: Name of the bodies' view.
-
-    Returns:
-        The blueprint.
     """
     bodies = [one for one in shown if one.body]
     views = [*([_scene(bodies, title)] if bodies else []), *_words(shown), *_both(shown)]

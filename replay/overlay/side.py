@@ -36,7 +36,6 @@ class Side:
     Attributes:
         name: What it is called, e.g. ``twin``.
         path: The session's file.
-        session_id: Its id.
         start_ns: Time of its first sample [Unix ns].
         end_ns: Time of its last one [Unix ns].
         verdict: Health of the recording, or None where nobody judged it.
@@ -83,7 +82,6 @@ def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, 
     """What the sessions are called.
 
     Args:
-        files: Their files.
         wanted: Names that were asked for, or None for the files' own.
 
     Returns:
@@ -111,15 +109,7 @@ def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, 
 
 
 def read_side(session: SessionView, name: str) -> Side:
-    """Read what side by side needs of a session.
-
-    Args:
-        session: The session, open.
-        name: What it is called.
-
-    Returns:
-        The side.
-    """
+    """Read what side by side needs of a session."""
     wanted = {topic: ["position"] for topic in _TOPICS if topic in wanted_fields(session)}
     columns = read_columns(session, wanted)
     measured = columns.get(("/joint_states", "position"), ())
@@ -144,10 +134,6 @@ def read_side(session: SessionView, name: str) -> Side:
 
 def convert(session: SessionView, path: Path) -> tuple[Recording, Seen | None]:
     """Write the session's own recording, and take from it what a comparison needs.
-
-    Args:
-        session: The session, open.
-        path: Where its recording goes.
 
     Returns:
         The recording, and the analysis, or None where the session can't be analysed; why is

@@ -39,9 +39,6 @@ def tint(place: int) -> Color:
 
     Args:
         place: 0 for the first session.
-
-    Returns:
-        sRGB and opacity.
     """
     return _WHITE if place == 0 else _TINTS[(place - 1) % len(_TINTS)]
 
@@ -52,10 +49,8 @@ def log_look(rec: rr.RecordingStream, entity: str, place: int, robot: Robot | No
     What is static shadows the colours of each moment, which stay in the recording.
 
     Args:
-        rec: The recording.
         entity: The session's path.
         place: Which session it is, 1 for the second.
-        robot: Its robot.
     """
     mesh, wire = _WIRES[(place - 1) % len(_WIRES)]
     look = rr.Capsules3D.from_fields(
@@ -75,9 +70,7 @@ def log_placement(rec: rr.RecordingStream, entity: str, placed: Placement) -> No
     """Move a session's world.
 
     Args:
-        rec: The recording.
         entity: The session's path.
-        placed: How it is moved.
     """
     moved = rr.Transform3D(
         translation=(placed.x, placed.y, 0.0), quaternion=rr.Quaternion(xyzw=placed.quaternion)
@@ -91,11 +84,8 @@ def log_name(
     """Write the session's name over its head.
 
     Args:
-        rec: The recording.
-        one: The session.
         place: Which session it is, 0 for the first: names of bodies at one place lie in tiers.
         head: The head's path.
-        robot: The robot.
     """
     entity = f"{one.side.entity}{NAME}"
     look = rr.Points3D.from_fields(
@@ -116,12 +106,7 @@ def log_name(
 
 
 def log_ends(rec: rr.RecordingStream, sessions: Sequence[Aligned]) -> None:
-    """Take each body away when its session is over and others go on.
-
-    Args:
-        rec: The recording.
-        sessions: All of them.
-    """
+    """Take each body away when its session is over and others go on."""
     for timeline in (SESSION_TIME, GAIT_CYCLE):
         ends = {one.side.entity: _end(one, timeline) for one in sessions}
         last = max(end for end in ends.values() if end is not None) if any(ends.values()) else 0

@@ -62,7 +62,6 @@ def chunks_of(
     """A recording's chunks under a path of their own.
 
     Args:
-        recording: The .rrd file.
         entity: Path to put in front of every entity's, e.g. ``/twin``.
         later_ns: Added to ``session_time`` [ns].
         more_cycles: Added to ``gait_cycle``.
@@ -85,10 +84,6 @@ def send(rec: rr.RecordingStream, streams: Sequence[LazyChunkStream]) -> None:
 
     Left to itself the reader runs ahead of the writer, and hours of chunks, unpacked, wait in
     between; so now and then it waits until all are written.
-
-    Args:
-        rec: The recording.
-        streams: The chunks.
     """
     count = 0
 
@@ -120,8 +115,6 @@ def angle_differences(a: Aligned, b: Aligned, how: Align) -> tuple[Track, ...]:
 
     Args:
         a: The session that is subtracted, and whose times count.
-        b: The other one.
-        how: What happens at once.
 
     Returns:
         A track [rad] for each joint that both have; ``b`` is taken on the straight line between
@@ -152,14 +145,9 @@ def log_differences(
     """Write differences as the angles of the session that was subtracted are drawn.
 
     Args:
-        rec: The recording.
         a: The session that was subtracted.
-        entity: Where to.
         differences: The differences [rad].
         drawn: Its measured angles; joints of one series are drawn at common times.
-
-    Returns:
-        What was written.
     """
     known = {track.name: track for track in differences}
     parts = [[known[name] for name in one.names if name in known] for one in drawn]
@@ -201,7 +189,6 @@ class Converted:
 
     Attributes:
         aligned: The session and its place on the timelines.
-        recording: Its own recording.
         seen: What a comparison takes from it, or None where it can't be analysed.
     """
 
@@ -215,7 +202,6 @@ class Beside:
     """What was written.
 
     Attributes:
-        path: The .rrd file.
         recording_id: Follows from the sessions' ids and names, and how they are aligned and placed.
         shown: What it holds of each session.
         found: What the comparison with the first session says, by the others' names.
@@ -245,13 +231,9 @@ def write_beside(
     Args:
         sessions: Two or more; differences are from the first.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
-        how: What happens at once.
         place: Where the bodies are drawn.
         stop: Looked at now and then; once an end is asked for, nothing is written.
         layout: Makes the blueprint from what was written.
-
-    Returns:
-        What was written.
 
     Raises:
         LogWriteError: If the file can't be written, or an end was asked for.
@@ -320,7 +302,6 @@ class _Pair:
 
     Attributes:
         rank: Which session it is, 1 for the second.
-        found: Their comparison.
         placed: How its body is moved, or None.
     """
 

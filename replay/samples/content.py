@@ -28,8 +28,6 @@ class Series:
     """An entity with one plotted line a joint.
 
     Attributes:
-        entity: Its path.
-        names: The lines' names.
         component: The component that is plotted.
     """
 
@@ -62,7 +60,6 @@ class Quantity:
 
     Attributes:
         key: Last part of its entity's path, with the unit.
-        name: Its name.
         unit: The unit in which it is shown.
     """
 
@@ -81,7 +78,6 @@ class CycleTable:
     """One quantity of m joints that share their c cycles.
 
     Attributes:
-        quantity: What it is.
         names: The joints, head to tail.
         start_s: Start of each cycle, from the session's start [s], shape (c,).
         stop_s: Its end [s], shape (c,).
@@ -107,7 +103,6 @@ class HeatMap:
     """One map.
 
     Attributes:
-        table: What it shows.
         places: Number of each joint along the body, the head's joint is 1.
         low: Value at the low end of the colours.
         high: Value at the high end.
@@ -152,7 +147,6 @@ class Bar:
     Attributes:
         joint: The joint's name.
         place: Its number along the body, the head's joint is 1.
-        value: Height.
         far: The end of its 95 % interval that is farther from the baseline, or None.
     """
 
@@ -203,7 +197,6 @@ class Named:
     """A module that a test names.
 
     Attributes:
-        joint: Its joint.
         why: What is said of it, without a stop.
     """
 
@@ -232,9 +225,6 @@ class Layer:
 
         Args:
             computed: The session's analysis, or a note why there is none.
-
-        Returns:
-            Both.
         """
         notes = (*self.notes, *computed.notes)
         return Layer(computed.analysis, computed.steady, self.named, notes)
@@ -261,10 +251,6 @@ _UNITS = {"degC": "°C"}
 def signal_title(topic: str, unit: str) -> str:
     """A title short enough for a tab.
 
-    Args:
-        topic: A JointState topic.
-        unit: Of its values.
-
     Returns:
         For example ``Current [A]``; another make's topics keep their names.
     """
@@ -277,7 +263,6 @@ class Signal:
 
     Attributes:
         title: What it is, with unit.
-        series: Where it was written.
         of_joints: Whether its lines are the robot's joints, known by their colours; other lines
             need a legend.
     """
@@ -305,7 +290,6 @@ class AwaitedMap:
     """A map that is still to be computed.
 
     Attributes:
-        entity: Path of its entities.
         title: What it will show, with unit.
     """
 
@@ -322,14 +306,9 @@ class Content:
         start: Where the robot starts, or None where no body is drawn.
         power_limit_w: Power at which a segment's colour is full [W]; None if coloured by place.
         places: Joints that stand for the body, or None without joints.
-        commanded: Commanded angles.
-        measured: Measured angles.
-        errors: Tracking errors.
         has_power: Whether the body's total power was written.
         joint_power: Mechanical power of the joints.
-        charts: Response bars.
         modes: How often a gait mode began; 0 where none was logged.
-        has_events: Whether events were written.
         signals: Further quantities of the joints.
         live: Whether it still grows: the views follow its end.
         cycles: Quantities that were written cycle by cycle, each with where.

@@ -68,10 +68,6 @@ def electrical_power(columns: Columns) -> tuple[Track, ...]:
 def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ...]:
     """Product of two quantities of each joint.
 
-    Args:
-        first: Gives the sampling times.
-        second: Taken at those times.
-
     Returns:
         A track for each joint that has both; NaN where either is missing.
     """

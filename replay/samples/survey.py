@@ -77,7 +77,6 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
     """Go through a session.
 
     Args:
-        session: The session.
         rate_hz: How many drawing times a second are kept, at most.
         brief: Of a long session, read the first stretch and a little of some others only.
 

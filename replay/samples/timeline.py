@@ -53,9 +53,6 @@ class Span:
 
         Args:
             t_ns: Their times [ns], ascending, shape (n,).
-
-        Returns:
-            The rows.
         """
         first, last = np.searchsorted(t_ns, [self.start_ns, self.stop_ns])
         return slice(int(first), int(last))
@@ -63,12 +60,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Samples of a span, and of a little before and after it.
-
-    Attributes:
-        span: What is drawn.
-        columns: The samples.
-    """
+    """Samples of a span, and of a little before and after it."""
 
     span: Span
     columns: Columns
@@ -80,8 +72,6 @@ def stretches(
     """Read a session stretch by stretch.
 
     Args:
-        session: The session.
-        wanted: JointState topic to fields.
         context_ns: How much is read before and after each stretch [ns]: what a line between two
             samples, a held command and the search for gaps need.
 
@@ -110,7 +100,6 @@ def stretch_length_ns(session: SessionView, least_ns: int = 0) -> int:
     """Length of the stretches that a session is read in.
 
     Args:
-        session: The session.
         least_ns: Shortest length wanted [ns].
 
     Returns:

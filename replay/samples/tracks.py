@@ -66,9 +66,6 @@ MOST_TOPICS = 100
 def drawn_topics(session: SessionView) -> tuple[list[str], int]:
     """The JointState topics of a picture.
 
-    Args:
-        session: The session.
-
     Returns:
         At most :data:`MOST_TOPICS`, the contract's before others, in the session's order; and how
         many are left out.
@@ -85,9 +82,6 @@ def drawn_topics(session: SessionView) -> tuple[list[str], int]:
 
 def wanted_fields(session: SessionView) -> dict[str, list[str]]:
     """What a picture needs of a session's JointState topics.
-
-    Args:
-        session: The session.
 
     Returns:
         Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
@@ -108,7 +102,6 @@ def read_columns(
     """JointState topics of a session.
 
     Args:
-        session: The session.
         wanted: Topic to fields; None for all of :func:`wanted_fields`.
         start_ns: First sampling time wanted [Unix ns]; None for the session's start.
         stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
@@ -150,9 +143,6 @@ def without_filler(track: Track) -> Track:
 
     A robot that reports one quantity, or one servo, a message fills the other places with NaN.
     Where half of a joint's samples or more are NaN they say nothing; fewer are a gap.
-
-    Args:
-        track: The track as logged.
 
     Returns:
         The track without its NaN where they are half or more, else the track itself.

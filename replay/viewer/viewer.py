@@ -48,9 +48,6 @@ _GRACE_S = 3.0
 def viewer_binary() -> Path:
     """The viewer that came with the installed Rerun.
 
-    Returns:
-        Path of the executable.
-
     Raises:
         MissingExtraError: If Rerun is not installed.
     """
@@ -197,9 +194,6 @@ def open_window(*options: str) -> Viewer:
 
     Args:
         options: More of its command line.
-
-    Returns:
-        The viewer, which starts.
     """
     return Viewer(["--hide-welcome-screen", "--expect-data-soon", _PASSING_ON, *options])
 
@@ -222,9 +216,6 @@ def open_server(*options: str) -> tuple[Viewer, str]:
 def show(recording: Path) -> None:
     """Open a recording in the native viewer and wait until its window is closed.
 
-    Args:
-        recording: The .rrd file.
-
     Raises:
         UndulogError: If the viewer fails.
     """
@@ -236,7 +227,6 @@ def serve(recording: Path, tell: Callable[[str], None]) -> None:
     """Serve a recording to browsers on this machine until interrupted.
 
     Args:
-        recording: The .rrd file.
         tell: Called with the address to open.
 
     Raises:
@@ -250,14 +240,7 @@ def serve(recording: Path, tell: Callable[[str], None]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of this machine that nobody listens on at the moment.
-
-    Args:
-        count: How many.
-
-    Returns:
-        Different ports.
-    """
+    """Ports of this machine that nobody listens on at the moment."""
     with ExitStack() as stack:
         held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
         return [int(one.getsockname()[1]) for one in held]
@@ -323,7 +306,6 @@ class HeadlessViewer:
         """Show a recording in its own layout, standing still, instead of what was shown before.
 
         Args:
-            recording: The .rrd file.
             seconds: Place on ``session_time`` [s].
         """
         again = bool(self._client.get_state().recordings)
@@ -372,9 +354,6 @@ class HeadlessViewer:
         Args:
             view: Name of a view in front, or None for the whole window.
 
-        Returns:
-            PNG.
-
         Raises:
             ConnectionError: If the view is behind a tab.
             UndulogError: If the picture doesn't come to rest.
@@ -386,9 +365,6 @@ class HeadlessViewer:
 
         Args:
             view_id: As :attr:`views` has it, or None for the whole window.
-
-        Returns:
-            PNG.
 
         Raises:
             ConnectionError: If the view is behind a tab.
@@ -421,7 +397,6 @@ def client_of(
     """Wait until a viewer answers.
 
     Args:
-        address: Where it takes data.
         ended: Whether it has ended, so that waiting is in vain.
         look_s: How often to look [s].
 

@@ -44,8 +44,6 @@ class AdaptiveGait:
         Args:
             generator: Makes the wave; it must drive the horizontal plane.
             controller: What to react to, and how.
-            course: Where to go.
-            robot: The robot.
         """
         roles = layout(robot)
         self._generator = generator
@@ -80,9 +78,6 @@ class AdaptiveGait:
         Args:
             time_s: Time since the start [s], never less than in the call before.
             readings: What the robot has told by then.
-
-        Returns:
-            Commands and values.
         """
         if self._wave is None:  # the first tick tells phase and lag; from the next on it reacts
             tick = self._generator.step(time_s, readings)

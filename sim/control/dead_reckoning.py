@@ -32,7 +32,6 @@ class SlipOdometry:
         """Take the body's lengths.
 
         Args:
-            robot: The robot.
             slip_ratio: K.
         """
         self._lengths = np.array([link.length for link in robot.links])
@@ -100,7 +99,6 @@ class Reckoning:
 
         Args:
             calibration: Of this robot's gait on this ground.
-            robot: The robot.
         """
         self._odometry = SlipOdometry(robot, calibration.slip_ratio)
         self._path = PathHeading(calibration.turn_gain)
@@ -114,9 +112,6 @@ class Reckoning:
             phase: The gait's phase [rad].
             offset: Of the head, as the last tick set it [rad].
             readings: What the encoders have told by now; nothing moves until they have.
-
-        Returns:
-            The pose.
         """
         if not np.isnan(readings.angle).any():
             motion = self._odometry.velocity(readings.angle, readings.velocity) * elapsed_s

@@ -136,7 +136,6 @@ class BodyWave:
         """Start with a straight body.
 
         Args:
-            joint_count: Joints of the plane.
             lag: Phase from one joint of the plane to the next, of either sign [rad].
         """
         self._delays: FloatArray = np.arange(joint_count, dtype=np.float64) * abs(lag)

@@ -35,9 +35,6 @@ class Course(Protocol):
     def step(self, now: Moment) -> float:
         """Advance to a tick.
 
-        Args:
-            now: The tick.
-
         Returns:
             Offset of the head [rad], positive to the right.
         """
@@ -53,9 +50,6 @@ class StraightOn:
     def step(self, now: Moment) -> float:  # noqa: ARG002 - straight whatever is known
         """Go straight on.
 
-        Args:
-            now: The tick.
-
         Returns:
             0.
         """
@@ -68,12 +62,7 @@ class RandomCourse:
     names = ("course.offset",)
 
     def __init__(self, parameters: RandomTurns, seed: int) -> None:
-        """Start; the first bend is drawn at the first step.
-
-        Args:
-            parameters: What to draw.
-            seed: Of the scenario.
-        """
+        """Start; the first bend is drawn at the first step."""
         self._parameters = parameters
         self._random = np.random.default_rng([seed, RANDOM_STREAM])
         self._until_s = -math.inf
@@ -86,9 +75,6 @@ class RandomCourse:
 
     def step(self, now: Moment) -> float:
         """Go on, or draw anew.
-
-        Args:
-            now: The tick.
 
         Returns:
             Offset of the head [rad].
@@ -122,7 +108,6 @@ class TargetCourse:
         """Start where the head is.
 
         Args:
-            parameters: How to steer.
             target: From the head's start, along magnetic north and to the left of it [m].
             target_radius_m: How near it must come [m].
             turn_radius_m: Of the turn with the largest offset [m].
@@ -145,9 +130,6 @@ class TargetCourse:
 
     def step(self, now: Moment) -> float:
         """Steer to where the target must be.
-
-        Args:
-            now: The tick.
 
         Returns:
             Offset of the head [rad]; 0 before the compass has told anything.

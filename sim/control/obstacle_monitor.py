@@ -75,9 +75,6 @@ class Distances:
     def nearest(self, names: Iterable[str]) -> float:
         """The nearest obstacle of some sensors.
 
-        Args:
-            names: The sensors.
-
         Returns:
             Distance [m]; +inf where none of them sees anything.
         """
@@ -107,7 +104,6 @@ class Lookout:
         Args:
             parameters: How wide the way is, and how long echoes are kept.
             layout: Who looks where.
-            robot: The robot.
         """
         self._parameters = parameters
         self._mounts = [
@@ -121,9 +117,6 @@ class Lookout:
 
     def step(self, now: Moment) -> InTheWay:
         """Look, and forget what is old.
-
-        Args:
-            now: The tick.
 
         Returns:
             What is in the way: echoes within 45 degrees of it and not beside it.

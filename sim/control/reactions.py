@@ -76,11 +76,7 @@ class Steering:
     names = ("steer.offset", "steer.distance", "steer.side")
 
     def __init__(self, parameters: HeadSteering) -> None:
-        """Start straight.
-
-        Args:
-            parameters: How to steer.
-        """
+        """Start straight."""
         self._law = parameters
         self._latch = SideLatch(parameters.margin_m, parameters.hold_s)
         self._filter = LowPass(parameters.filter_s, 0.0)
@@ -92,7 +88,6 @@ class Steering:
         """Steer; :attr:`avoiding` says whether an obstacle is in the way.
 
         Args:
-            now: The tick.
             seen: What is in the way.
             course: The offset that the course wants [rad]; it fades as an obstacle comes near.
 
@@ -118,9 +113,7 @@ class Shrinking:
         """Start with full amplitude.
 
         Args:
-            parameters: How to shrink.
             layout: Who looks where.
-            robot: The robot.
         """
         self._law = parameters
         self._sides = [side.name for side in layout.sides]
@@ -143,7 +136,6 @@ class Shrinking:
         the last gait period.
 
         Args:
-            now: The tick.
             distances: What is beside the body.
 
         Returns:
@@ -168,7 +160,6 @@ class Haste:
         """Start without haste.
 
         Args:
-            parameters: How to hasten.
             layout: Who looks where.
         """
         self._law = parameters
@@ -181,11 +172,7 @@ class Haste:
         """Hasten; :attr:`hastening` says whether an obstacle is near the tail.
 
         Args:
-            now: The tick.
             distances: What is around the tail.
-
-        Returns:
-            Factor of omega.
         """
         law = self._law
         distance = distances.nearest(self._layout.tail)

@@ -69,9 +69,7 @@ class DryRun:
     """How a dry run went.
 
     Attributes:
-        driven: What was driven.
         kind: ``gait``, ``plan`` or ``commands``.
-        robot: Whose twin it was.
         world: The scenario that it was in.
         planned_s: How long it was to be [s].
         duration_s: How long the gait commanded [s].
@@ -153,18 +151,13 @@ def dry_run(
     """Run it in the twin, and say what it would take.
 
     Args:
-        driven: What to drive.
         robot: On which robot; the one that it was made for if None.
         world: Where; by default the world that it was made for, and flat ground if that is not
             known.
         duration_s: How long [s]; its own length if None.
         output: The session of the twin to write, or None.
-        force: Replace an existing session.
         stop: Looked at in each tick: the dry run ends.
         on_time: Told of the gait's time in each tick [s].
-
-    Returns:
-        What it would take.
 
     Raises:
         UsageError: If the world's robot lacks a plane, or the duration can't be.
@@ -260,9 +253,6 @@ class _Session:
 
 def nominal_world(robot: Robot) -> Scenario:
     """Flat ground, for a robot of which no world is known.
-
-    Args:
-        robot: The robot.
 
     Returns:
         A scenario in which nothing moves by itself, at a physics rate that the robot's gears need.

@@ -55,7 +55,6 @@ class JointDemand:
     """What is asked of one joint.
 
     Attributes:
-        name: The joint.
         lower: Its lower limit [rad].
         upper: Its upper limit [rad].
         least: Least command, before the gate [rad].
@@ -132,7 +131,6 @@ class DemandTally:
         """Nothing is asked yet.
 
         Args:
-            robot: Whose joints they are.
             limits: What the gate keeps to; infinite where there is no limit.
         """
         count = len(robot.joints)
@@ -241,12 +239,7 @@ class NotedGait:
     """A gait, and its first command, and what it had to cut itself."""
 
     def __init__(self, gait: Gait, robot: Robot) -> None:
-        """Wrap a gait.
-
-        Args:
-            gait: Who commands.
-            robot: Whose joints.
-        """
+        """Wrap a gait."""
         self._gait = gait
         self.first: FloatArray = np.full(len(robot.joints), np.nan)
         """Its first command [rad], shape (m,); NaN before it."""
@@ -268,10 +261,6 @@ class NotedGait:
 
         Args:
             time_s: Time since its start [s].
-            readings: For the gait.
-
-        Returns:
-            What it says.
         """
         said = self._gait.step(time_s, readings)
         if not self._asked:
@@ -284,7 +273,6 @@ class GatedGait:
     """Stands between a gait and the twin's servos; :meth:`attach` it before the twin runs.
 
     Attributes:
-        inner: The gait.
         tally: What it asks of each joint while it runs.
         remarks: What the gate had to say.
     """
@@ -293,8 +281,6 @@ class GatedGait:
         """Wrap a gait.
 
         Args:
-            gait: Who commands.
-            robot: Whose joints.
             limits: What the gate keeps to.
         """
         self.inner = NotedGait(gait, robot)
@@ -325,7 +311,6 @@ class GatedGait:
 
         Args:
             gate: The gate, before its first tick.
-            twin: The twin.
         """
         self._gate, self._twin = gate, twin
 

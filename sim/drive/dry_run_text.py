@@ -94,7 +94,6 @@ def told(run: DryRun, width: int) -> Iterator[str]:
     """Lines for a terminal.
 
     Args:
-        run: How it went.
         width: Characters in a line of the table.
 
     Yields:
@@ -189,9 +188,6 @@ def _approach(run: DryRun) -> str:
 
 def reported(run: DryRun) -> dict[str, Any]:
     """The dry run as plain JSON values.
-
-    Args:
-        run: How it went.
 
     Returns:
         SI units; what isn't known, or has no limit, is None.

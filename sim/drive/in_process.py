@@ -40,8 +40,6 @@ class FadingGait:
         """Wrap a gait.
 
         Args:
-            gait: Who commands.
-            robot: Whose joints.
             fade_s: T [s].
         """
         self._gait, self._fade_s = gait, fade_s
@@ -73,10 +71,6 @@ class FadingGait:
 
         Args:
             time_s: Time since the start [s], never less than in the call before.
-            readings: For the gait.
-
-        Returns:
-            Commands and values.
         """
         tick = self._gait.step(time_s, readings)
         if not self._asked:
@@ -106,15 +100,8 @@ def drive_twin(
     A stop request lets the gait come to rest first (:class:`Fading`), then the run ends.
 
     Args:
-        driven: What to drive.
         scenario: Where; from :meth:`.sim.drive.motion.Driven.scenario`.
-        path: The file to create.
-        force: Replace an existing file.
-        stop: Looked at between samples.
         on_sample: Told of each sample after it was written.
-
-    Returns:
-        What was recorded.
 
     Raises:
         SimulationError: If the twin's state becomes impossible.

@@ -283,7 +283,6 @@ class VirtualRobotLink:
     Attributes:
         place: What it is, for messages.
         clock: Whose clock the frames' device times are on: the twin's.
-        robot_name: Who is there.
         lockstep: Whether it waits for commands at each tick.
     """
 
@@ -301,10 +300,7 @@ class VirtualRobotLink:
 
         Args:
             place: What it is, for messages.
-            sock: In raw mode.
-            rest: What came already.
             tally: Where to count what is malformed.
-            robot_name: Who is there.
             lockstep: Whether it waits for commands at each tick.
         """
         self.place, self.robot_name, self.lockstep = place, robot_name, lockstep
@@ -317,9 +313,6 @@ class VirtualRobotLink:
 
     def receive(self) -> Sequence[FrameArray]:
         """Take what has come, without waiting; tick marks are passed over.
-
-        Returns:
-            Arrays of frames.
 
         Raises:
             SourceError: If the robot is gone.
@@ -410,7 +403,6 @@ def wait_until(earliest_ns: int, now_ns: Callable[[], int]) -> None:
 
     Args:
         earliest_ns: The moment [ns].
-        now_ns: The clock.
     """
     while (left_ns := earliest_ns - now_ns()) > 0:
         time.sleep(left_ns * 1e-9)

@@ -90,7 +90,6 @@ class WallPace:
         """The first tick is at once.
 
         Args:
-            link: The bus.
             rate_hz: Ticks a second.
         """
         self.overruns = 0
@@ -171,7 +170,6 @@ def why_stop(stop: StopRequest, *, console_gone: bool) -> str:
     """Why it is to stop.
 
     Args:
-        stop: What signals asked for.
         console_gone: Whether the terminal hung up.
 
     Returns:
@@ -210,10 +208,8 @@ class LoopTally:
     Attributes:
         loop_s: Time of the last tick, from the first [s].
         overruns: Ticks left out because the one before took too long.
-        sent: Frames sent.
         commanded: Whether a command was among them.
         untold: Ticks that the session could not take.
-        received: Frames that came.
         decoded: Frames of these with something that the robot's map names.
         late_s: How late each tick was [s], where the clock sets the pace.
     """
@@ -233,9 +229,6 @@ class CommandEncoder:
 
     def __init__(self, robot: Robot) -> None:
         """Compile.
-
-        Args:
-            robot: The robot.
 
         Raises:
             DataError: If it has no bus, or takes commands in frames that can't be sent.
@@ -272,9 +265,6 @@ class ControlLoop:
 
         Args:
             gate: Who decides what is sent.
-            robot: Whose bus it is.
-            link: The bus.
-            pace: When the ticks are.
             spacing: How closely commands may follow each other; None where the robot sets the
                 pace, and all ticks are a period apart.
             confirmation: What replies confirm; None where the robot sets the pace.

@@ -91,9 +91,6 @@ class RecordedCommands:
         Args:
             session: Open; it is not needed afterwards.
 
-        Returns:
-            Its commands.
-
         Raises:
             MissingChannelError: If it has none.
         """
@@ -152,7 +149,6 @@ class CommandReplay:
 
         Args:
             time_s: Time since the start [s].
-            readings: Not looked at.
 
         Returns:
             Commands, cut to the joint limits, and what was meant by them.
@@ -188,10 +184,8 @@ class Driven:
 
     Attributes:
         kind: ``gait``, ``plan`` or ``commands``.
-        name: What to call it.
         robot: Who it was made for.
         world: Finds the scenario that it was made for, None where that isn't known.
-        duration_s: How long it lasts.
         planes: The planes that it needs.
         make: Builds the gait, at time zero, for a robot; in a world if that is given, else in the
             one that it was made for.
@@ -235,9 +229,6 @@ class Driven:
 
     def check_fits(self, robot: Robot) -> None:
         """See that a robot on a bus is one that it can be driven on: the same joints, the planes.
-
-        Args:
-            robot: The robot.
 
         Raises:
             JointSetError: If its commands are of another joint set.
@@ -307,9 +298,6 @@ def find_driven(
         changes: Of recorded commands: what to change of the world that they were recorded in, see
             :func:`.sim.scenario.scenario_file.parse_scenario`.
         robot: Who takes recorded commands, whatever the session or the world say.
-
-    Returns:
-        What it is.
 
     Raises:
         UsageError: If there is no such thing.
@@ -416,20 +404,7 @@ def _commands(
 def _planned(
     told: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
 ) -> _Number:
-    """A number of the plan's record.
-
-    Args:
-        told: Metadata records.
-        key: Of the number.
-        kind: What reads it.
-        path: Of the session, for messages.
-
-    Returns:
-        The number; 0 where the record has none.
-
-    Raises:
-        DataError: If it is no finite number, or a negative count.
-    """
+    """A number of the plan's record."""
     text = told.get("undulog.plan", {}).get(key, "0")
     try:
         value = kind(text)

@@ -43,14 +43,9 @@ class BusPlan:
     """What to do over a bus.
 
     Attributes:
-        driven: What to drive.
-        robot: On which robot.
         limits: What that robot may do.
-        address: The bus.
         duration_s: Time of the gait's last tick.
-        output: The session to write.
         recorder: Control socket of a recorder that is told the gait, or None.
-        force: Replace an existing session.
     """
 
     driven: Driven
@@ -76,16 +71,10 @@ def bus_plan(
     """Check what was asked for.
 
     Args:
-        driven: What to drive.
         on: The bus, ``can:INTERFACE:CHANNEL[...]``.
         robot: On which robot; the one that it was made for if None.
         duration_s: How long [s]; its own length if None.
-        output: The session to write.
         recorder: Control socket of a recorder, or None.
-        force: Replace an existing session.
-
-    Returns:
-        The plan.
 
     Raises:
         UsageError: If the address is none, the robot has no bus or lacks limits, a joint can't
@@ -106,10 +95,6 @@ def bus_plan(
 
 def check_drivable(driven: Driven, robot: Robot) -> None:
     """See that it can be driven on a bus of the robot at all, armed or dry.
-
-    Args:
-        driven: What to drive.
-        robot: On which robot.
 
     Raises:
         UsageError: If the robot has no bus, a joint can't be commanded or tells no angle, or the
@@ -143,9 +128,6 @@ def bus_address(on: str) -> SourceAddress:
     Args:
         on: ``can:INTERFACE:CHANNEL[...]``.
 
-    Returns:
-        The address.
-
     Raises:
         UsageError: If it is something else.
     """
@@ -165,7 +147,6 @@ def drive_bus(
     """Drive over a bus.
 
     Args:
-        plan: What to do.
         stop: The drive ends as the robot's file says when it is requested; at once if again.
         on_tick: Told of each tick.
         console: The terminal whose loss ends the drive likewise, if there is one.

@@ -78,7 +78,6 @@ class Segment:
     """One part of a plan.
 
     Attributes:
-        duration_s: How long it lasts.
         planes: What each driven plane does once the transition is over.
         transition_s: How long the way there takes, from the segment's start; 0: a jump.
         mode: One word for what it is about.
@@ -95,8 +94,6 @@ class Plan:
     """A sequence of segments.
 
     Attributes:
-        name: Short name.
-        description: One sentence.
         scenario: Robot and world that it was written for.
         start: What each driven plane does at time zero; its ``phase`` is the phase there.
         ramp_s: Amplitude and offset grow from nothing over this time, smoothly.
@@ -123,7 +120,6 @@ class PlanGait(WaveGenerator):
         """Start at time zero with straight joints.
 
         Args:
-            plan: What to do.
             robot: Who is to do it.
             per_joint: Tell every joint's own values too, for a controller that sets them apart.
         """
@@ -136,15 +132,7 @@ class PlanGait(WaveGenerator):
         super().__init__(rhythms, robot, per_joint=per_joint)
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Advance to a time and say what to do from then on.
-
-        Args:
-            time_s: Time since the start [s], never less than in the call before.
-            readings: Not looked at.
-
-        Returns:
-            Commands, values, and the segment's mode.
-        """
+        """Advance to a time and say what to do from then on."""
         segment = bisect_right(self._starts, time_s) - 1
         return super().step(time_s, readings)._replace(mode=self._modes[segment])
 
@@ -190,9 +178,6 @@ def is_plan(text: str) -> bool:
 
     Args:
         text: The text. What is no TOML is no plan: a scenario's reader tells what is wrong with it.
-
-    Returns:
-        Whether it has segments.
     """
     try:
         return "segments" in read_toml(text)
@@ -204,11 +189,7 @@ def parse_plan(text: str, source: Path) -> Plan:
     """Read a plan.
 
     Args:
-        text: The TOML text.
         source: Where it comes from: for messages, for its name, and to find a scenario beside it.
-
-    Returns:
-        The plan.
 
     Raises:
         PlanError: If it has faults; lists all of them.

@@ -44,11 +44,7 @@ class _Complaints(logging.Handler):
     ("Got incomplete message"), and raises what fails."""
 
     def __init__(self, tally: Tally) -> None:
-        """Listen to it.
-
-        Args:
-            tally: Where to count.
-        """
+        """Listen to it."""
         super().__init__(logging.WARNING)
         self._tally = tally
         self._LOGGER.propagate = False
@@ -78,7 +74,6 @@ class PythonCanBus:
 
         Args:
             address: ``can:INTERFACE:CHANNEL``; its options are those of python-can's interface.
-            tally: Where to count.
 
         Raises:
             UsageError: If there is no such interface, or it has no such option.
@@ -116,9 +111,6 @@ class PythonCanBus:
 
     def receive(self) -> Sequence[FrameArray]:
         """Take what has come, without waiting; CAN FD frames carry nothing of a bus map.
-
-        Returns:
-            Arrays of frames.
 
         Raises:
             SourceError: If the bus is lost.
@@ -177,10 +169,6 @@ def open_link(address: SourceAddress, tally: Tally) -> VirtualRobotLink | Python
     Args:
         address: ``can:INTERFACE:CHANNEL``; for socketcand with ``plain=yes`` the server is not
             asked whether it is a virtual robot.
-        tally: Where to count.
-
-    Returns:
-        The bus.
 
     Raises:
         UsageError: If there is no such interface or option.

@@ -52,8 +52,6 @@ class BusReport:
     """How it went.
 
     Attributes:
-        outcome: The end.
-        tally: Of the loop.
         lockstep: Whether the robot set the pace.
         approach_s: Time from the first tick until the gait began [s]; None where it never did.
         gait_s: Time of the gait's last tick [s].
@@ -66,7 +64,6 @@ class BusReport:
         dropped: Frames that came and were not fetched in time.
         held_s: How long nothing was sent as the bus was silent [s].
         feedback: What supervised it; None where the robot set the pace, or it was never armed.
-        wall_s: How long it took.
         first_frames: The commands of the first tick, as candump writes frames.
         told: Samples of the gait that the recorder took.
         not_told: Why the recorder was not told all, or None.
@@ -94,9 +91,6 @@ class BusReport:
 
 def remarks_of(report: BusReport) -> list[Remark]:
     """What is worth a line of the log at the end.
-
-    Args:
-        report: How it went.
 
     Returns:
         The remarks; warnings are reasons for a verdict that is not good.
@@ -126,14 +120,7 @@ def remarks_of(report: BusReport) -> list[Remark]:
 
 
 def report_facts(report: BusReport) -> dict[str, Any]:
-    """A report for JSON.
-
-    Args:
-        report: How it went.
-
-    Returns:
-        Plain values.
-    """
+    """A report for JSON."""
     tally = report.tally
     return {
         "armed": True,
@@ -164,14 +151,7 @@ def report_facts(report: BusReport) -> dict[str, Any]:
 
 
 def report_lines(report: BusReport) -> list[str]:
-    """A report for people, what came of it left out.
-
-    Args:
-        report: How it went.
-
-    Returns:
-        Lines.
-    """
+    """A report for people, what came of it left out."""
     tally = report.tally
     pace = "in lockstep with the robot" if report.lockstep else "in real time"
     before = "" if report.approach_s is None else f", begun after {report.approach_s:.3g} s"

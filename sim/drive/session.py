@@ -74,7 +74,6 @@ class GaitTeller:
         """Leave a remark for ``/rosout``.
 
         Args:
-            text: What to say.
             level: ``info``, ``warn`` or ``error``.
         """
         self._held.append({"do": "note", "text": text, "level": level})
@@ -83,7 +82,6 @@ class GaitTeller:
         """Leave what the gait says, without waiting.
 
         Args:
-            tick: What it says.
             t_ns: From when on it holds [Unix ns].
         """
         if tick.mode != self._mode:
@@ -155,18 +153,14 @@ class BusSession:
         """Open the session.
 
         Args:
-            path: The file to create.
-            robot: Whose bus it is.
             bus: The bus's name.
             clock: Whose clock the frames' device times are on.
             epoch_ns: Unix time of its start [ns].
             gait_names: Names of the gait's values.
-            facts: For the metadata.
             settle_s: The first part of the gait that is not fit for steady-state analysis [s],
                 None where it isn't known.
             attachments: File name to TOML text that explains what is driven.
             records: Other metadata records that explain it, by name.
-            force: Replace an existing file.
 
         Raises:
             OutputExistsError: If the file is there and ``force`` is not given, or what a drive
@@ -215,7 +209,6 @@ class BusSession:
         """Write one tick.
 
         Args:
-            tick: What happened in it.
             t_ns: When it was [Unix ns].
 
         Raises:
@@ -278,26 +271,19 @@ class BusSession:
 
         Args:
             level: ``info``, ``warn`` or ``error``.
-            text: What happened.
         """
         if text not in self._said:
             self._said.add(text)
             self._events.write(self._t_ns, level, _EVENTS_OF, text)
 
     def note(self, name: str, facts: Mapping[str, str]) -> None:
-        """Write a metadata record.
-
-        Args:
-            name: Its name.
-            facts: Its entries.
-        """
+        """Write a metadata record."""
         self.writer.note(name, facts)
 
     def finish(self, outcome: Outcome, remarks: Sequence[Remark]) -> None:
         """Say how it went.
 
         Args:
-            outcome: The end.
             remarks: What is worth a line, the warnings among them as reasons for the verdict.
         """
         level = "error" if outcome.how is How.FAULT else "info"
@@ -312,11 +298,7 @@ class BusSession:
             self.writer.set_verdict("degraded" if reasons else "good", reasons)
 
     def fail(self, text: str) -> None:
-        """Say why it failed.
-
-        Args:
-            text: What happened.
-        """
+        """Say why it failed."""
         self.say("error", text)
         self.writer.set_verdict("bad", [text])
 
@@ -349,7 +331,6 @@ def stamped(tick: BusTick, t_ns: int) -> BusTick:
     """The same tick with its frames, both ways, at the tick's time.
 
     Args:
-        tick: The tick.
         t_ns: Its time [Unix ns].
 
     Returns:

@@ -44,14 +44,7 @@ class Readings:
 
     @classmethod
     def nothing(cls, robot: Robot) -> Readings:
-        """What is known before anything was reported.
-
-        Args:
-            robot: The robot.
-
-        Returns:
-            Readings without a value.
-        """
+        """What is known before anything was reported."""
         unknown = frozen(np.full(len(robot.joints), np.nan))
         return cls(unknown, unknown)
 
@@ -94,9 +87,6 @@ class Gait(Protocol):
         Args:
             time_s: Time since the start [s], never less than in the call before.
             readings: What the robot has told by then; an open-loop gait does not look.
-
-        Returns:
-            Commands and values.
         """
         ...
 

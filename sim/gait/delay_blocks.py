@@ -85,7 +85,6 @@ class DelayBlockGait(WaveGenerator):
         """Start at time zero with straight joints.
 
         Args:
-            parameters: What to do.
             robot: Who is to do it.
         """
         rhythms = {

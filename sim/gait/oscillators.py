@@ -125,7 +125,6 @@ def integrate(
 
     Args:
         rate: Of the time since the start [s] and the state.
-        state: At the start.
         span_s: How far [s].
         fastest: Bound of the rates of change [1/s]; sets the number of steps.
 
@@ -185,7 +184,6 @@ class PhaseOscillators:
 
         Args:
             theta: [rad], shape (n,).
-            coupling: What neighbours do.
         """
         self.theta, self._coupling = theta, coupling
         self.radius = np.ones_like(theta)
@@ -212,7 +210,6 @@ class HopfOscillators:
 
         Args:
             theta: [rad], shape (n,).
-            coupling: What neighbours do.
             attraction: alpha [1/s].
         """
         self.theta, self._coupling, self._attraction = theta, coupling, attraction
@@ -364,7 +361,6 @@ class OscillatorGait(WaveGenerator):
         """Start at time zero with straight joints.
 
         Args:
-            parameters: What to do.
             robot: Who is to do it.
         """
         rhythms = {

@@ -24,9 +24,6 @@ def smoothstep(x: float) -> float:
 
     Args:
         x: Where; clipped to 0 to 1.
-
-    Returns:
-        The value.
     """
     x = min(max(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
@@ -75,7 +72,6 @@ class Change(NamedTuple):
     Attributes:
         amplitude_factor: Multiplies each joint's amplitude, shape (n,).
         offset: Added to each joint's offset [rad], shape (n,).
-        frequency_factor: Multiplies omega.
     """
 
     amplitude_factor: FloatArray
@@ -227,8 +223,6 @@ class WaveGenerator:
         """Put the planes together.
 
         Args:
-            rhythms: The driven planes.
-            robot: Who is to move.
             per_joint: Tell every joint's own values too: for whoever sets joints apart, by the
                 rhythm itself or by :meth:`modulate`. Unlike limits within a plane set them apart
                 as well.
@@ -281,9 +275,6 @@ class WaveGenerator:
         Args:
             time_s: Time since the start [s], never less than in the call before.
             readings: What the robot has told by then.
-
-        Returns:
-            Commands and values.
         """
         modulation = self._modulation
         command = self._held.copy()
@@ -330,7 +321,6 @@ class SerpentineGait(WaveGenerator):
         """Start at time zero with straight joints.
 
         Args:
-            parameters: What to do.
             robot: Who is to do it.
             per_joint: Tell every joint's own values too, for a controller that sets them apart.
         """

@@ -245,11 +245,7 @@ class Watch:
     """Looks at each tick's readings and says what is wrong, the first time that it is."""
 
     def __init__(self, limits: GateLimits) -> None:
-        """Nothing is wrong yet.
-
-        Args:
-            limits: What is allowed.
-        """
+        """Nothing is wrong yet."""
         self._limits = limits
         self._bounds = {
             FaultKind.CURRENT: limits.current,
@@ -265,7 +261,6 @@ class Watch:
 
         Args:
             time_s: Now, on the loop's clock [s].
-            status: What the joints told.
             command: What they were commanded last [rad], shape (m,).
 
         Returns:

@@ -60,11 +60,9 @@ class Gate:
         """Begin by reading the pose.
 
         Args:
-            gait: Who wants to command.
             limits: What the robot may do.
             duration_s: Time of the gait's last tick.
             rate_hz: Control ticks a second.
-            place: The bus, for messages.
             listen_s: So long the bus is listened to at least before anything is sent, to see whose
                 it is and to measure its reply interval [s]; 0: it is the robot's, which waits for
                 each command, so that no command can be held up.
@@ -119,7 +117,6 @@ class Gate:
 
         Args:
             tick: Number of the control tick, from 0; never less than in the call before.
-            heard: What is known.
             stop: Why it is to stop, one sentence; empty: go on.
             at_once: Whether to stop without an ending.
 
@@ -152,19 +149,11 @@ class Gate:
         return GateStep(phase, given.command, wanted, gait, tuple(self._remarks))
 
     def report(self, fault: GateFault) -> None:
-        """Something beside the robot went wrong: the next step begins the ending.
-
-        Args:
-            fault: What it was.
-        """
+        """Something beside the robot went wrong: the next step begins the ending."""
         self._reported = fault
 
     def lost(self, why: str) -> None:
-        """The bus can't be used any more: nothing more is sent.
-
-        Args:
-            why: What happened.
-        """
+        """The bus can't be used any more: nothing more is sent."""
         if self.outcome is None or self.outcome.how is not How.FAULT:
             self.outcome = Outcome(
                 How.FAULT, why, "nothing more was sent", GateFault(FaultKind.BUS, why)

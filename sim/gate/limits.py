@@ -50,9 +50,6 @@ def missing_limits(robot: Robot) -> tuple[str, ...]:
     Rates, tracking error and the two times are always needed; limits of current, temperature and
     voltage where the robot tells these on its bus.
 
-    Args:
-        robot: The robot.
-
     Returns:
         Names of fields of :class:`Safety`, in its order; empty if there is nothing to add.
     """
@@ -92,7 +89,6 @@ class GateLimits:
     """What a drive keeps to; arrays have shape (m,), in the order of the robot's joints.
 
     Attributes:
-        joint_names: The joints.
         lower: Lower limits of commands [rad].
         upper: Upper limits of commands [rad].
         rate: Greatest rates of commands [rad/s], at most those of the joints' servos.
@@ -137,12 +133,6 @@ class GateLimits:
 
 def gate_limits(robot: Robot) -> GateLimits:
     """The limits of a robot's description.
-
-    Args:
-        robot: The robot.
-
-    Returns:
-        Its limits.
 
     Raises:
         UsageError: If it lacks one; names all that are missing, with an example.
@@ -271,7 +261,6 @@ class Clamp:
         """Start from a pose.
 
         Args:
-            limits: Position and rate limits.
             pose: The angles that the joints have [rad], shape (m,); finite.
             period_s: Control period [s].
 

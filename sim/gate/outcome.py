@@ -39,7 +39,6 @@ class GateFault:
     """Why a drive ends early.
 
     Attributes:
-        kind: What went wrong.
         text: One sentence: joint, value, limit.
         joint: The joint, empty if it is not one joint's.
         value: What was found; None where it is no number.
@@ -63,7 +62,6 @@ class Jitter:
     """Lateness of control ticks against deadlines that are anchored at the first one.
 
     Attributes:
-        ticks: Ticks.
         median_s: [s].
         p99_s: Of a hundred ticks one is later [s].
         worst_s: [s].
@@ -132,7 +130,6 @@ class Outcome:
     """The end of a drive.
 
     Attributes:
-        how: Its kind.
         why: One sentence; empty where it is complete.
         ended: What was commanded at the end, one sentence.
         fault: The fault, if one ended it.
@@ -197,8 +194,6 @@ class Heard:
     """What is known at a tick.
 
     Attributes:
-        readings: For the gait.
-        status: For the gate.
         trouble: What the bus itself told: bus-off, or somebody else's commands.
         another_robot: Why this can't be the robot, None if it may be.
         late_s: How late the tick is [s].

@@ -176,14 +176,7 @@ class CompiledBulletEngine(BulletEngine):
         self.read()
 
     def read(self, into: BodyState | None = None) -> BodyState:
-        """The present state.
-
-        Args:
-            into: Arrays to be filled in; new ones by default.
-
-        Returns:
-            Positions and velocities of links and joints, in these arrays.
-        """
+        """The present state."""
         state = into or BodyState.empty(len(self._half), len(self._joints))
         body, client = self._body, self._client
         self._place, turn = pybullet.getBasePositionAndOrientation(body, client)
@@ -196,20 +189,11 @@ class CompiledBulletEngine(BulletEngine):
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
-        """Apply forces to the links during the next step; calls add up.
-
-        Args:
-            force: In the world [N], shape (3, n).
-            point: Points of action in the world [m], shape (3, n).
-        """
+        """Apply forces to the links during the next step; calls add up."""
         gather(force, point, self._position, self._hinges, self._generalised)
 
     def step(self, torque: FloatArray) -> None:
-        """Advance the body by one step.
-
-        Args:
-            torque: Of the joints [N m], shape (m,).
-        """
+        """Advance the body by one step."""
         self._drive += torque
         load = self._generalised.tolist()
         self._generalised.fill(0.0)

@@ -66,8 +66,6 @@ def touch_ground(
 
     Args:
         row: A step, as :class:`.sim.physics.steps.Steps` has it; its body is there.
-        n: Number of links.
-        m: Number of joints.
         radius: Of the links [m], shape (n,).
         ground: k, d, mu_t, mu_n, eps, c_t, c_n, shape (7,).
         law: Number of the friction law in :data:`LAWS`.
@@ -109,8 +107,6 @@ def drive_joints(
 
     Args:
         row: A step; its body and rotors are there.
-        n: Number of links.
-        m: Number of joints.
         reference: Commanded joint angles q_ref [rad], shape (m,).
         servos: :attr:`.sim.physics.servo.Servos.table`.
     """
@@ -136,7 +132,6 @@ def rotor_friction(
 
     Args:
         servos: :attr:`.sim.physics.servo.Servos.table`.
-        j: The joint.
         speed: Rotor speed om at the step's start [rad/s].
         torque: Kt i - b om - t_g, all else that acts on the rotor [N m].
         dt: Step [s].
@@ -159,10 +154,7 @@ def advance_rotors(
     """Fill in the rotors one step later.
 
     Args:
-        before: A complete step.
         here: The step after it.
-        n: Number of links.
-        m: Number of joints.
         servos: :attr:`.sim.physics.servo.Servos.table`.
         dt: Step [s].
     """
@@ -195,9 +187,6 @@ def act(
 
     Args:
         before: The step before it, complete.
-        here: The step.
-        n: Number of links.
-        m: Number of joints.
         radius: Of the links [m], shape (n,).
         ground: k, d, mu_t, mu_n, eps, c_t, c_n, shape (7,).
         law: Number of the friction law in :data:`LAWS`.
@@ -218,8 +207,6 @@ def add_joint_flows(
 
     Args:
         table: k + 1 steps, as :class:`.sim.physics.steps.Steps` has them.
-        n: Number of links.
-        m: Number of joints.
         servos: :attr:`.sim.physics.servo.Servos.table`.
         dt: Step [s].
         flows: Added to: rows as :data:`.sim.physics.ledger.JOINT_TERMS` [J], shape (9, m).
@@ -259,8 +246,6 @@ def add_ground_flows(
 
     Args:
         table: k + 1 steps, as :class:`.sim.physics.steps.Steps` has them.
-        n: Number of links.
-        m: Number of joints.
         stiffness: Of the ground [N/m].
         dt: Step [s].
         flows: Added to: as :data:`.sim.physics.ledger.GROUND_TERMS` [J], shape (3,).
@@ -324,9 +309,7 @@ class CompiledLaws:
 
         Args:
             steps: The table that is filled in.
-            robot: Who.
             ground: What carries it, if anything does.
-            servos: Its servos.
             dt: Step [s].
         """
         surface = ground or Ground(stiffness=0.0, damping=0.0, drag_tangential=0.0, drag_normal=0.0)
@@ -345,11 +328,7 @@ class CompiledLaws:
         self._reference = np.zeros(steps.joint_count)
 
     def start(self, k: int) -> None:
-        """Complete a step whose body and rotors are there.
-
-        Args:
-            k: Its row.
-        """
+        """Complete a step whose body and rotors are there."""
         touch_ground(self._rows[k], *self._sizes, self._radius, self._ground, self._law)
         self.command(k, self._reference)
 

@@ -245,7 +245,6 @@ class GroundContact:
             ground: The ground, or None where there is none: no force at all.
             radius: Radii of the links [m], shape (n,).
             body: Where the body's state stands whenever :meth:`act` is called.
-            contact: What is filled in.
         """
         surface = ground or Ground(stiffness=0.0, damping=0.0)
         ones = np.ones((2, len(radius)))

@@ -44,9 +44,6 @@ class BodyState(NamedTuple):
         Args:
             link_count: n.
             joint_count: m.
-
-        Returns:
-            A state without meaning.
         """
         position, velocity, spin = np.empty((3, 3, link_count))
         quaternion, (angle, rate) = np.empty((4, link_count)), np.empty((2, joint_count))
@@ -105,15 +102,11 @@ class EngineType(Protocol):
         """Build the body, straight, its head above the origin.
 
         Args:
-            robot: The robot.
             gravity: Acceleration of gravity in the world [m/s^2], length 3.
             height: Height of the links' centres [m].
             heading: Direction of the head's x axis, about z [rad].
             velocity: Of the whole body [m/s], length 3.
             dt: Step [s].
-
-        Returns:
-            The engine.
 
         Raises:
             UsageError: If the engine cannot hold the robot.
@@ -131,11 +124,7 @@ def engine_type(kind: EngineKind, kernels: Kernels = Kernels.NUMPY) -> EngineTyp
     """Import an engine.
 
     Args:
-        kind: Which one.
         kernels: What computes the body's kinematics where the engine leaves it to us.
-
-    Returns:
-        What builds it.
 
     Raises:
         ImportError: If its package is not installed; the front door says which extra brings it.

@@ -23,11 +23,7 @@ class Laws(Protocol):
     """What fills in a step once its body is there."""
 
     def start(self, k: int) -> None:
-        """Complete a step whose body and rotors are there.
-
-        Args:
-            k: Its row.
-        """
+        """Complete a step whose body and rotors are there."""
         ...
 
     def follow(self, k: int) -> None:
@@ -58,9 +54,7 @@ class NumpyLaws:
 
         Args:
             steps: The table that is filled in.
-            robot: Who.
             ground: What carries it, if anything does.
-            servos: Its servos.
             dt: Step [s].
         """
         radius = np.array([link.radius for link in robot.links])
@@ -73,11 +67,7 @@ class NumpyLaws:
         self._reference = np.zeros(steps.joint_count)
 
     def start(self, k: int) -> None:
-        """Complete a step whose body and rotors are there.
-
-        Args:
-            k: Its row.
-        """
+        """Complete a step whose body and rotors are there."""
         self._ground[k].act()
         self.command(k, self._reference)
 
@@ -116,14 +106,8 @@ def laws_for(
 
     Args:
         steps: The table that is filled in.
-        robot: Who.
         ground: What carries it, if anything does.
-        servos: Its servos.
         dt: Step [s].
-        kernels: By what.
-
-    Returns:
-        The laws.
 
     Raises:
         ImportError: If numba is asked for and not installed.
@@ -139,7 +123,6 @@ class Plant:
     """A robot on its ground; :meth:`close` it after use.
 
     Attributes:
-        servos: Its servos.
         dt: Physics step [s].
     """
 

@@ -62,7 +62,6 @@ def joint_flows(steps: Steps, servos: Servos, dt: float) -> FloatArray:
 
     Args:
         steps: k + 1 steps; the last one closes the one before it.
-        servos: The servos.
         dt: Step [s].
 
     Returns:
@@ -199,14 +198,11 @@ class Ledger:
         """Open the ledger.
 
         Args:
-            robot: The robot.
-            servos: Its servos.
             gravity: Acceleration of gravity in the world [m/s^2], shape (3,).
             stiffness: Of the ground [N/m], 0 where there is none.
             obstacle_stiffness: Of the obstacles [N/m].
             dt: Step [s].
             start: The state at which all flows are zero.
-            kernels: What adds up.
         """
         self._kernels = kernels
         self._servos = servos
@@ -260,9 +256,6 @@ class Ledger:
 
     def stored(self, step: Step) -> FloatArray:
         """Energies stored at one instant.
-
-        Args:
-            step: The instant.
 
         Returns:
             Energies [J], as :data:`STORED_TERMS`, shape (6,).

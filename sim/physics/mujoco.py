@@ -48,7 +48,6 @@ class MujocoEngine:
         """Build the body, straight, its head above the origin.
 
         Args:
-            robot: The robot.
             gravity: Acceleration of gravity in the world [m/s^2], length 3.
             height: Height of the links' centres [m].
             heading: Direction of the head's x axis, about z [rad].

@@ -105,7 +105,6 @@ def obstacle_law(
 
     Args:
         obstacles: What stands in the way.
-        material: Of all of them.
         radius: Radii of the links [m], shape (n,).
         length: Lengths of the links, joint to joint [m], shape (n,).
         mass: Of the links [kg], shape (n,).

@@ -132,11 +132,7 @@ class Servos:
             reference: Commanded joint angles q_ref [rad], shape (m,).
             angle: Joint angles q [rad], shape (m,).
             rate: Joint rates q' [rad/s], shape (m,).
-            rotors: State of the rotors.
             out: Where the result goes; new arrays by default.
-
-        Returns:
-            Voltage, current and torque.
         """
         into_voltage, into_current, into_torque = out or (None, None, None)
         voltage = _clip(self._slope * (reference - angle), self.supply, out=into_voltage)
@@ -196,13 +192,9 @@ class Servos:
         """The rotors one step later, by the semi-implicit Euler rule that the body follows too.
 
         Args:
-            rotors: State of the rotors.
             drive: What the servos do during the step.
             dt: Step [s].
             out: Where the result goes; new arrays by default.
-
-        Returns:
-            Their next state.
         """
         into_angle, into_speed = out or (None, None)
         torque = self.torque_constant * drive.current - self.viscous * rotors.speed

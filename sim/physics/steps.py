@@ -73,9 +73,6 @@ class Steps(Sequence[Step]):
             count: k.
             link_count: n.
             joint_count: m.
-
-        Returns:
-            Steps of zeros.
         """
         width = 22 * link_count + 7 * joint_count
         return cls(np.zeros((count, width)), link_count, joint_count)
@@ -109,14 +106,7 @@ class Steps(Sequence[Step]):
         return self.motors[:, 2:]
 
     def taken(self, k: int) -> Step:
-        """One step, in arrays of its own.
-
-        Args:
-            k: Its row.
-
-        Returns:
-            A copy.
-        """
+        """One step, in arrays of its own."""
         step = _fields(self.table[k].copy(), self.link_count, self.joint_count)
         return step._replace(obstacles=self.obstacles[k])
 

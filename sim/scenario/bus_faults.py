@@ -74,7 +74,6 @@ class BusFault:
     """One fault.
 
     Attributes:
-        kind: What goes wrong.
         joint: The joint; empty for all, or for the whole bus.
         value: A probability, a current [A] or a time [s], as the kind has it; 0 where it has none.
         from_s: When it begins, after the start [s].
@@ -155,7 +154,6 @@ def parse_faults(texts: Iterable[str], robot: Robot) -> tuple[BusFault, ...]:
 
     Args:
         texts: E.g. ``lost:joint07:0.1``.
-        robot: Whose joints they name.
 
     Returns:
         The faults, in that order.

@@ -152,7 +152,6 @@ class Controller:
     """One controller, complete.
 
     Attributes:
-        kind: Which one.
         near_hold_s: How long a reading near a sensor's fold is believed [s].
         calibration: What it knows of its gait.
         lookout: What counts as in the way.
@@ -187,7 +186,6 @@ def read_controller(
     """Read ``[controller]``; faults are noted in the table.
 
     Args:
-        table: The table.
         robot: Who is to be controlled; None where that is a fault already.
         horizontal: Whether the gait drives the horizontal plane.
         target: Whether the world has a target.

@@ -29,13 +29,9 @@ def generator(parameters: GaitParameters, robot: Robot, *, per_joint: bool = Fal
     """The generator of a gait, at time zero with straight joints.
 
     Args:
-        parameters: What to do.
         robot: Who is to do it.
         per_joint: Tell every joint's own values too; a controller that sets joints apart asks for
             it, so that the log tells what each joint was meant to do.
-
-    Returns:
-        The generator.
     """
     if isinstance(parameters, DelayBlocks):
         return DelayBlockGait(parameters, robot)

@@ -53,9 +53,6 @@ def to_circles(
         half: Half of the segments [m], shape (2, p).
         centre: Of the circles [m], shape (2, p).
         radius: Of the circles [m], shape (p,).
-
-    Returns:
-        The closest points.
     """
     s = _place(middle, half, centre)
     away = middle + s * half - centre
@@ -93,8 +90,6 @@ def rectangle_gaps(middle: FloatArray, half: FloatArray, size: FloatArray) -> Fl
 
     Args:
         middle: As in :func:`to_rectangles`.
-        half: Likewise.
-        size: Likewise.
 
     Returns:
         Along the rectangle's axes and across the segment [m], negative where they overlap, shape
@@ -297,9 +292,6 @@ class Boxes(NamedTuple):
 def columns(obstacles: Sequence[Obstacle]) -> tuple[Cylinders, Boxes]:
     """Sort obstacles by shape, into arrays.
 
-    Args:
-        obstacles: In any order.
-
     Returns:
         Cylinders, and boxes with the walls among them, each in the order given.
     """
@@ -374,7 +366,6 @@ class RandomField:
     """Cylinders at random places in a rectangle, apart from each other.
 
     Attributes:
-        count: How many.
         size: Lengths of the rectangle along x and y [m].
         centre: Its centre, x and y [m].
         radius: Least and greatest radius [m].
@@ -413,7 +404,6 @@ class RandomField:
         Args:
             seed: The scenario's.
             body: Head and tail of the robot at its start, x and y [m].
-            target: The target.
             standing: Obstacles that are there already.
 
         Returns:

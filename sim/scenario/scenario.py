@@ -81,9 +81,6 @@ class Modules:
     def fitted(self, robot: Robot) -> Robot:
         """The robot with these modules.
 
-        Args:
-            robot: As it is described.
-
         Returns:
             As the scenario has it.
         """
@@ -115,11 +112,7 @@ def read_modules(top: Table, robot: Robot | None) -> Modules:
     """Read ``[servo]``, ``[servo_of.JOINT]`` and ``[link_of.LINK]`` of a scenario.
 
     Args:
-        top: The scenario.
         robot: The robot; None after a fault: then names can't be checked.
-
-    Returns:
-        The modules.
     """
     servo = _servo_fields(top.table("servo"))
     servos, links = top.table("servo_of"), top.table("link_of")
@@ -180,18 +173,12 @@ class Scenario:
     """One run of the twin, complete.
 
     Attributes:
-        name: Short name.
-        description: One sentence.
         robot_name: The robot as the scenario names it.
         robot: The robot, with the scenario's modules.
         gait: What it is commanded to do.
-        duration_s: Length of the run.
         settle_s: The first part of it that is not fit for steady-state analysis.
-        world: Where it is.
         noise: What the servos' readings carry.
-        sensing: How its sensors measure.
         modules: Its servos and links that differ from the robot's own.
-        disturbances: What pushes it.
         seed: Of all that is drawn at random.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
@@ -241,9 +228,6 @@ class Scenario:
         Args:
             duration_s: Length of the run; ``settle_s`` is cut to it.
             seed: Of the noise, and of a random field of obstacles without a seed of its own.
-
-        Returns:
-            The scenario.
 
         Raises:
             UsageError: If the length is not at least one control period, the seed negative, or the

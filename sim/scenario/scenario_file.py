@@ -122,9 +122,6 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         name_or_path: A name of :func:`scenario_names`, or the path of a TOML file.
         changes: Keys, with dots, to the values that they are to have instead.
 
-    Returns:
-        The scenario.
-
     Raises:
         UsageError: If no scenario has that name.
         InputFileError: If it is a path, and the file isn't there or can't be read.
@@ -144,16 +141,12 @@ def parse_scenario(
     """Read a scenario from text.
 
     Args:
-        text: The TOML text.
         source: Where it comes from: for messages, for the default name, and to find a robot's
             file beside it.
         robot: The robot that it names, where it is at hand already, as in a session that carries
             its description.
         changes: Keys, with dots, e.g. ``servo.stall_torque``, to the values that they are to have
             instead of the text's.
-
-    Returns:
-        The scenario.
 
     Raises:
         ScenarioError: If it has faults; lists all of them.

@@ -23,7 +23,6 @@ class SideSensor:
     """A sensor that looks sideways.
 
     Attributes:
-        name: The sensor.
         beside: The joints that it looks out for, shape (m,).
     """
 
@@ -56,9 +55,6 @@ def layout(robot: Robot) -> Layout:
     nearest sensor of each side, if that is no farther along the body than half the widest gap
     between two sensors of that side; a side's only sensor is beside all joints.
 
-    Args:
-        robot: The robot.
-
     Returns:
         Who looks where.
     """
@@ -82,9 +78,6 @@ def layout(robot: Robot) -> Layout:
 
 def bearing(sensor: Sensor) -> float:
     """Where a sensor looks in its link's horizontal plane.
-
-    Args:
-        sensor: The sensor.
 
     Returns:
         Direction from straight ahead, to the left positive [rad].
@@ -222,10 +215,6 @@ class SensorModels:
 
     Attributes:
         servo: Of the servos' own readings.
-        ir: Of infrared sensors.
-        sonar: Of sonars.
-        accelerometer: Of accelerometers.
-        compass: Of compasses.
         enabled: Whether the robot's sensors, beside the servos' own, are simulated.
     """
 
@@ -241,7 +230,6 @@ def read_sensing(table: Table, robot: Robot | None, period_s: float) -> SensorMo
     """Read ``[sensing]``.
 
     Args:
-        table: The table.
         robot: Whose sensors they are, None after a fault.
         period_s: Control period [s].
 

@@ -79,7 +79,6 @@ class Push:
     """A constant force on the centre of a link.
 
     Attributes:
-        link: Name of the link.
         force: In the world [N].
         start_s: When it begins [s].
         duration_s: How long it lasts [s].
@@ -97,7 +96,6 @@ def pushes_during(
     """Forces on all links at some times.
 
     Args:
-        pushes: The pushes.
         link_names: Names of the n links.
         times_s: Times of k physics steps [s], shape (k,).
 
@@ -118,11 +116,7 @@ def read_pushes(top: Table, robot: Robot | None) -> tuple[Push, ...]:
     """Read ``[[disturbances]]`` of a scenario.
 
     Args:
-        top: The scenario.
         robot: Who is pushed; None after a fault: then names can't be checked.
-
-    Returns:
-        The pushes.
     """
     return tuple(_read_push(table, robot) for table in top.tables("disturbances"))
 
@@ -183,7 +177,6 @@ class World:
         """The same world with a field of obstacles in it.
 
         Args:
-            field: The field.
             seed: The scenario's, unless the field has its own.
             body_length: From the middle of the robot's head link to its tail's end [m].
 
@@ -210,9 +203,6 @@ class World:
         Args:
             seed: The scenario's, unless the field has its own.
             body_length: From the middle of the robot's head link to its tail's end [m].
-
-        Returns:
-            The world.
 
         Raises:
             UsageError: If there is no room for so many with this seed.
@@ -265,7 +255,6 @@ def read_world(table: Table, robot: Robot | None, seed: int) -> World:
     """Read ``[world]``.
 
     Args:
-        table: The table.
         robot: Who will be in it, None after a fault.
         seed: The scenario's, that a field of obstacles is drawn with.
 
@@ -298,14 +287,7 @@ def read_world(table: Table, robot: Robot | None, seed: int) -> World:
 
 
 def world_table(world: World) -> dict[str, Any]:
-    """A world as the table that :func:`read_world` reads; a field is written as its obstacles.
-
-    Args:
-        world: The world.
-
-    Returns:
-        Values for TOML.
-    """
+    """A world as the table that :func:`read_world` reads; a field is written as its obstacles."""
     values = write(world)
     values.pop("field", None)
     values["surface"] = _Surface.NONE if world.ground is None else _Surface.FLAT
@@ -320,14 +302,7 @@ def world_table(world: World) -> dict[str, Any]:
 
 
 def body_length(robot: Robot) -> float:
-    """From the middle of the head link to the tail's end [m].
-
-    Args:
-        robot: The robot.
-
-    Returns:
-        The length.
-    """
+    """From the middle of the head link to the tail's end [m]."""
     return math.fsum(link.length for link in robot.links) - robot.links[0].length / 2
 
 

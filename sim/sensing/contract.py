@@ -68,7 +68,6 @@ class Mounts:
 
         Args:
             sensors: Some of the robot's.
-            robot: The robot.
         """
         numbers = {link.name: i for i, link in enumerate(robot.links)}
         self.link: IntArray = frozen(np.array([numbers[one.link] for one in sensors], np.int64))
@@ -159,7 +158,6 @@ class RangeSample(NamedTuple):
     """One measurement of an infrared sensor or a sonar.
 
     Attributes:
-        name: The sensor.
         time_s: When it was taken [s].
         distance: [m]; +inf where nothing is in range (REP 117).
     """
@@ -173,7 +171,6 @@ class VectorSample(NamedTuple):
     """One measurement of an accelerometer [m/s^2] or a compass [T].
 
     Attributes:
-        name: The sensor.
         time_s: When it was taken [s].
         vector: In the sensor's frame, NaN on an axis that it does not measure, shape (3,).
     """

@@ -48,12 +48,8 @@ class Accelerometer:
         """Start before the first control period.
 
         Args:
-            model: How they measure.
-            sensors: The sensors.
-            robot: Who carries them.
             gravity: Acceleration of gravity in the world [m/s^2], length 3.
             dt: Physics step [s].
-            seed: Of the noise.
         """
         self._names = [one.name for one in sensors]
         self._mounts = Mounts(sensors, robot)
@@ -122,9 +118,6 @@ class Accelerometer:
 def measured(sensors: Sequence[Sensor]) -> FloatArray:
     """Which axes sensors measure, as factors.
 
-    Args:
-        sensors: The sensors.
-
     Returns:
         1 for an axis that a sensor measures and NaN for another, shape (k, 3).
     """
@@ -159,11 +152,7 @@ class Compass:
         """Start before the first control period.
 
         Args:
-            model: How they measure.
-            sensors: The sensors.
-            robot: Who carries them.
             dt: Physics step [s].
-            seed: Of the noise.
         """
         self._names = [one.name for one in sensors]
         self._mounts = Mounts(sensors, robot)

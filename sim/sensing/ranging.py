@@ -156,9 +156,6 @@ class Ranging:
         """Look at a world.
 
         Args:
-            sensors: All of a kind.
-            robot: Who carries them.
-            caster: The world.
             schedule: When each is due.
             bundles: Unit vectors of each sensor's rays in its frame, shape (k, 3, r).
             sees_ground: Whether the ground stops the rays.
@@ -253,12 +250,7 @@ class Infrared:
         """Start before the first control period; the sensors' clocks are staggered evenly.
 
         Args:
-            model: How they measure.
-            sensors: The sensors.
-            robot: Who carries them.
-            caster: The world.
             dt: Physics step [s].
-            seed: Of the noise.
         """
         count = len(sensors)
         self._ranging = Ranging(
@@ -332,12 +324,7 @@ class Sonar:
         """Start before the first control period.
 
         Args:
-            model: How they measure.
-            sensors: The sensors.
-            robot: Who carries them.
-            caster: The world.
             dt: Physics step [s].
-            seed: Of the noise.
         """
         self._ranging = Ranging(
             sensors,

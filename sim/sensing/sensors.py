@@ -64,12 +64,9 @@ class JointPolling:
         """Start before the first control period.
 
         Args:
-            servos: How they are polled.
-            noise: What their readings carry.
             joint_count: m.
             period_steps: Physics steps in a control period, an even number.
             dt: Physics step [s].
-            seed: Of the noise.
         """
         self._offset_s = frozen(servos.slot_s * np.arange(joint_count, dtype=np.float64))
         self._at_once = servos.slot_s == 0.0
@@ -159,15 +156,7 @@ class JointPolling:
 
 
 def _between(series: FloatArray, at: FloatArray) -> FloatArray:
-    """Interpolate linearly, each joint at a place of its own.
-
-    Args:
-        series: Values at whole places, shape (k + 1, q, m).
-        at: Places, 0 to k, shape (m,).
-
-    Returns:
-        Shape (q, m).
-    """
+    """Interpolate linearly, each joint at a place of its own."""
     low: IntArray = at.astype(np.int64)
     high = np.minimum(low + 1, len(series) - 1)
     joint = np.arange(len(at))

@@ -26,9 +26,6 @@ def listen_on_loopback(host: str, port: int) -> socket.socket:
         host: A name or address of the loopback interface.
         port: TCP port; 0 for any that is free.
 
-    Returns:
-        The listener, non-blocking.
-
     Raises:
         UsageError: If the host is not loopback, or nobody can listen there.
     """
@@ -68,7 +65,6 @@ class PaceTally:
     """How well the twin kept up.
 
     Attributes:
-        ticks: Control ticks begun.
         overruns: Ticks begun a period or more after they were due.
         worst_s: The greatest delay of a tick [s].
         stood_still_s: How long simulated time stood still in all [s].
@@ -134,11 +130,7 @@ class Pacer:
         return self._start_ns[max(place, 0)] + elapsed_ns
 
     def wait_s(self, tick: int) -> float:
-        """How long to wait for a tick [s]; 0 when it is due.
-
-        Args:
-            tick: Its number.
-        """
+        """How long to wait for a tick [s]; 0 when it is due."""
         if self._fast:
             self._present_ns = self.clock_ns(tick * self.period_ns)
             return 0.0
@@ -146,9 +138,6 @@ class Pacer:
 
     def begin(self, tick: int) -> float:
         """Note that a tick begins.
-
-        Args:
-            tick: Its number.
 
         Returns:
             For how long simulated time stood still before it [s]; 0 nearly always.

@@ -39,9 +39,6 @@ class ReplyEncoder:
     def __init__(self, robot: Robot) -> None:
         """Compile.
 
-        Args:
-            robot: The robot.
-
         Raises:
             DataError: If it has no bus, or a message that is no classic CAN frame.
         """
@@ -178,7 +175,6 @@ class FaultLine:
 
         Args:
             faults: What is to go wrong.
-            robot: The robot.
             replies: Encodes what its joints report.
             seed: Of the random losses and errors.
         """
@@ -219,7 +215,6 @@ class FaultLine:
         """What the sensors tell.
 
         Args:
-            samples: What healthy ones would.
             time_s: Time since the start [s].
 
         Returns:

@@ -49,9 +49,6 @@ class CommandLatch:
     def __init__(self, robot: Robot) -> None:
         """Start without a command: straight joints, or as near to that as the limits allow.
 
-        Args:
-            robot: The robot.
-
         Raises:
             DataError: If it has no bus.
         """
@@ -173,8 +170,6 @@ class VirtualRobot:
 
         Args:
             scenario: The twin; its gait is not looked at.
-            bus: Its bus.
-            pacer: Its clock.
             faults: What is to go wrong, beside the scenario's own faults.
             lockstep: Wait at each tick until every servo has a command for it.
             wait: Begin with the first command; in lockstep it does so anyway.
@@ -218,9 +213,6 @@ class VirtualRobot:
 
         Args:
             ready: Called when the twin stands on the ground and the bus can be used.
-
-        Returns:
-            How it went.
 
         Raises:
             SimulationError: If the twin's state becomes impossible.

@@ -59,7 +59,6 @@ def sent_frame(kind: str, rest: str) -> bytes | None:
     """Read what follows ``send`` or ``sendrtr``.
 
     Args:
-        kind: Which of the two.
         rest: E.g. ``123 2 11 F1``; eight digits are a 29-bit identifier.
 
     Returns:
@@ -92,9 +91,6 @@ class ClientText:
     def feed(self, chunk: bytes) -> list[str]:
         """Take what was read.
 
-        Args:
-            chunk: The bytes.
-
         Returns:
             What stood in brackets, blanks around it removed, in order.
 
@@ -113,7 +109,6 @@ class Sent(NamedTuple):
     """A frame that a client sent.
 
     Attributes:
-        client: Number of the client.
         record: As :data:`.capture.sources.contract.pack_record` packs it, without times.
     """
 
@@ -126,7 +121,6 @@ class BusClient:
 
     Attributes:
         number: From 1, never used again.
-        sock: The connection, non-blocking.
         peer: What it is called in messages.
         text: Cuts what it sends into messages.
         bus_open: Whether it has opened the bus.
@@ -142,8 +136,6 @@ class BusClient:
         """Take over a connection.
 
         Args:
-            number: Its number.
-            sock: The connection.
             port: The client's own port.
         """
         self.number, self.sock = number, sock

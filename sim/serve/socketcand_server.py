@@ -305,7 +305,6 @@ class VirtualBus:
 
     Attributes:
         sent: Frames that the robot sent.
-        heard: Frames that clients sent.
     """
 
     def __init__(
@@ -351,7 +350,6 @@ class VirtualBus:
         """Tell clients that asked for it that all frames of a control tick are out.
 
         Args:
-            tick: Its number.
             state: The newest frames of the robot's state, for those who come later; None where they
                 soon hear newer ones.
         """
@@ -390,7 +388,6 @@ class VirtualBus:
         """Let everyone but their senders hear frames of clients.
 
         Args:
-            sent: What was pulled.
             t_ns: The robot's clock [ns]: their time on the bus.
 
         Returns:

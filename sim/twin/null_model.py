@@ -57,9 +57,6 @@ class Variant(NamedTuple):
 def steady_frequency(scenario: Scenario) -> float:
     """Frequency of a steady gait of identical modules.
 
-    Args:
-        scenario: The scenario.
-
     Returns:
         [Hz].
 
@@ -94,9 +91,6 @@ def steady_frequency(scenario: Scenario) -> float:
 def driven_joints(scenario: Scenario) -> list[int]:
     """The driven joints.
 
-    Args:
-        scenario: The scenario.
-
     Returns:
         Their indices, head to tail.
     """
@@ -106,9 +100,6 @@ def driven_joints(scenario: Scenario) -> list[int]:
 
 def shared_values(scenario: Scenario) -> dict[str, float]:
     """theta_0.
-
-    Args:
-        scenario: Of identical modules.
 
     Returns:
         The shared parameters that its robot and its ground have, by name; those that are 0 stay 0.
@@ -124,12 +115,7 @@ def varied(scenario: Scenario, values: Mapping[str, float], variant: Variant) ->
     """A scenario with identical modules, its parameters changed, and without noise.
 
     Args:
-        scenario: Of identical modules.
         values: theta_0.
-        variant: What to change.
-
-    Returns:
-        The scenario to run.
     """
     theta = {name: value * variant.shared.get(name, 1.0) for name, value in values.items()}
     servo = {**scenario.modules.servo, **{name: theta[name] for name in SERVO if name in theta}}
@@ -163,8 +149,6 @@ def response(
     """Run the twin: complex amplitudes of the driven joints' commands, and y.
 
     Args:
-        scenario: What to run.
-        frequency_hz: Of its gait.
         kernels: What computes the force laws.
 
     Returns:
@@ -217,9 +201,6 @@ def null_model(
         spread: Standard deviation of each ln theta, as known beforehand.
         kernels: What computes the force laws.
         on_run: Told the runs done and how many there will be.
-
-    Returns:
-        The model.
 
     Raises:
         UsageError: If the scenario's gait has no steady rhythm, or its modules differ.

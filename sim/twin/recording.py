@@ -27,11 +27,7 @@ from .twin import Sample, Twin
 
 @contextmanager
 def quick_collections() -> Generator[None]:
-    """Garbage is looked for among new objects only: all of them at once take longer than a tick.
-
-    Yields:
-        Nothing.
-    """
+    """Garbage is looked for among new objects only: all of them at once take longer than a tick."""
     gc.collect()
     gc.freeze()
     try:
@@ -45,7 +41,6 @@ class Recording:
     """What was recorded.
 
     Attributes:
-        path: The session file.
         session_id: Hash of scenario, seed and robot.
         sample_count: Samples of each joint.
         duration_s: Simulated time from the first sample to the last.
@@ -82,9 +77,6 @@ class Driver:
     def session_id(self, scenario: Scenario) -> str:
         """Hash of everything that decides what the run gives.
 
-        Args:
-            scenario: Where it runs.
-
         Returns:
             32 hexadecimal digits.
         """
@@ -107,11 +99,8 @@ def open_session(
     It appears under its name then; until then it is ``PATH.part``, which only a kill leaves behind.
 
     Args:
-        scenario: What is run.
-        path: The file to create.
         driver: Who commands the joints; the scenario's own gait if None.
         kernels: What computes the force laws.
-        force: Replace an existing file.
 
     Yields:
         The session, with everything that explains the run and no sample.
@@ -190,16 +179,9 @@ def record(
     samples), or by a failed simulation (then it holds what came before, and the failure).
 
     Args:
-        scenario: What to run.
-        path: The file to create.
         driver: Who commands the joints; the scenario's own gait if None.
-        force: Replace an existing file.
-        stop: Looked at between samples.
         on_sample: Told of each sample after it was written, e.g. to show progress.
         kernels: What computes the force laws.
-
-    Returns:
-        What was recorded.
 
     Raises:
         SimulationError: If the twin's state becomes impossible.

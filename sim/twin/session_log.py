@@ -50,9 +50,6 @@ _ALONG_X = "0 1.5707963267948966 0"  # a URDF cylinder lies along z
 def urdf(robot: Robot) -> str:
     """Write the robot as URDF.
 
-    Args:
-        robot: The robot.
-
     Returns:
         XML text. Masses and inertias are exact, joints have limits, stall torque as effort, no
         damping and no friction (the servos bring their own).
@@ -151,7 +148,6 @@ def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mappi
     """What the session's metadata says about the run.
 
     Args:
-        scenario: The scenario.
         kernels: What computes the force laws.
 
     Returns:
@@ -180,7 +176,6 @@ class SessionLog:
 
         Args:
             writer: The session; the log does not close it.
-            twin: What will be run.
             epoch_ns: Unix time of the first sample [ns]; that of the scenario by default.
         """
         scenario = self._scenario = twin.scenario
@@ -228,7 +223,6 @@ class SessionLog:
 
         Args:
             level: ``info``, ``warn`` or ``error``.
-            text: What happened.
         """
         if text not in self._said:
             self._said.add(text)

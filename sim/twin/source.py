@@ -38,7 +38,6 @@ class TwinSource:
 
         Args:
             address: The source as it was asked for.
-            scenario: What to run.
         """
         self.name = address.name
         self.clock = ClockDomain.SIMULATED
@@ -167,9 +166,6 @@ def open_twin(address: SourceAddress) -> TwinSource:
 
     Args:
         address: ``twin:SCENARIO``, a shipped name or a TOML file.
-
-    Returns:
-        The source.
 
     Raises:
         UsageError: If there is no such scenario, or an option is given.

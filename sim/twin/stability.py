@@ -60,7 +60,6 @@ def stability(scenario: Scenario, *, friction: bool = True) -> dict[Plane, Use]:
     """How much of their stability range the motions of the straight robot use.
 
     Args:
-        scenario: The scenario.
         friction: Count Coulomb's frictions, whose forces are bounded.
 
     Returns:
@@ -71,9 +70,6 @@ def stability(scenario: Scenario, *, friction: bool = True) -> dict[Plane, Use]:
 
 def warnings(scenario: Scenario) -> tuple[str, ...]:
     """What is too stiff for the step, or too soft for the robot.
-
-    Args:
-        scenario: The scenario.
 
     Returns:
         One sentence for each plane whose motion is unstable, and one where the ground is too soft.
@@ -89,9 +85,6 @@ def warnings(scenario: Scenario) -> tuple[str, ...]:
 
 def likely_cause(scenario: Scenario) -> str:
     """Name the stiffest part, or the link that the ground does not carry.
-
-    Args:
-        scenario: The scenario that failed.
 
     Returns:
         A clause for an error message.
@@ -157,9 +150,6 @@ def _chain(robot: Robot, plane: Plane) -> tuple[FloatArray, FloatArray]:
     """Small motions of the links across the straight body, by coordinate.
 
     The coordinates are those of the base, then the joints of the plane, then their rotors.
-
-    Returns:
-        Shift of the centres [m] and turn [rad] a unit of each coordinate, each of shape (n, d).
     """
     joints = robot.joint_indices(plane)
     half = np.array([[link.length / 2] for link in robot.links])

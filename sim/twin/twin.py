@@ -66,9 +66,7 @@ class Twin:
     """One robot in its world; use it in a ``with`` block, and run it with :meth:`samples`.
 
     Attributes:
-        scenario: What it runs.
         kernels: What computes the force laws.
-        gait: Its gait.
         sensed: Sensor samples that arrive by the present tick, there before the gait is asked: a
             gait that speaks over a bus hands them out first.
     """
@@ -83,7 +81,6 @@ class Twin:
         """Set the robot on the ground, straight, its servos at rest, in vertical balance.
 
         Args:
-            scenario: What to run.
             gait: Who commands the joints; the scenario's own gait if None.
             kernels: What computes the force laws.
 
@@ -160,15 +157,7 @@ class Twin:
         return self._sensing.flush()
 
     def _check(self, steps: Steps, start_s: float) -> None:
-        """Refuse an impossible state.
-
-        Args:
-            steps: A control period.
-            start_s: When it starts [s].
-
-        Raises:
-            SimulationError: If there is one.
-        """
+        """Refuse an impossible state."""
         motion, rotors = np.abs(steps.links[:, 7:10]), np.abs(steps.motors[:, 1])
         if motion.max() <= MAX_SPEED and rotors.max() <= MAX_ROTOR_SPEED:  # false for NaN
             return

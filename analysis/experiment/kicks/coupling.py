@@ -62,11 +62,6 @@ def kick_size(kicks: Sequence[Kick | None], answers: Answers, matrices: LocalMat
 
     Args:
         kicks: Of r runs, None of one of the base gait.
-        answers: Of the same runs.
-        matrices: What came of them.
-
-    Returns:
-        The verdict.
     """
     sizes = {
         kind: [abs(one.size) for one in kicks if one is not None and one.kind is kind]
@@ -189,9 +184,6 @@ def predict(
 def valid_to(predictions: Sequence[Prediction]) -> float | None:
     """Largest deviation up to which every held-out run is predicted at least ``BETTER`` better.
 
-    Args:
-        predictions: In any order.
-
     Returns:
         The size of the last good run before the first bad one; None where the smallest is bad, or
         there is none.
@@ -208,7 +200,6 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     """Estimate the local matrices, check them, and say how far they hold.
 
     Args:
-        experiment: Its runs.
         warn: Takes one sentence for each thing that is missing or doubtful.
 
     Returns:

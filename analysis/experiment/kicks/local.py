@@ -131,8 +131,6 @@ def central_differences(
 
     Args:
         kicks: Of r runs.
-        answers: Of the same runs.
-        kind: Which kicks are used.
 
     Returns:
         d psi and d ln|a|: P and R for ``Kind.PHASE``, S and G for ``Kind.AMPLITUDE``.
@@ -207,7 +205,6 @@ def nonlinearity(
         R: d ln|a| / d psi_c.
         G: d ln|a| / d ln|c|.
         S: d psi / d ln|c|.
-        seed: Of the noise draws.
         correlation: Of one run's errors, psi of all joints and then ln|a|, shape (2 m, 2 m); None
             where they are independent.
 
@@ -237,9 +234,6 @@ def stacked(blocks: Sequence[Sequence[Measured]], correlation: FloatArray | None
         blocks: Rows of matrices; those of one row answer the same way, those of one column are of
             the same kicks.
         correlation: Of a column's errors.
-
-    Returns:
-        The matrix.
     """
     value, error, dof = (
         np.block([[getattr(one, part) for one in row] for row in blocks])
@@ -291,7 +285,6 @@ def lti_reading(
         R: d ln|a| / d psi_c.
         response: Complex amplitudes a of the base gait, shape (m,).
         command: Complex amplitudes c of the base gait, shape (m,).
-        seed: Of the noise draws.
         correlation: Of one run's errors, psi of all joints and then ln|a|, or None.
 
     Returns:
@@ -363,7 +356,6 @@ class LocalMatrices:
         R: d ln|a| / d psi_c.
         G: d ln|a| / d ln|c|, or None.
         S: d psi / d ln|c|, or None.
-        errors: How much runs differ.
         steady_errors: The same from combinations of runs that no second order of a kick enters.
         phase_rows: Sums of rows of P, with errors that know nothing of these sums.
         gain_rows: Of R.
@@ -391,11 +383,7 @@ def local_matrices(
 
     Args:
         kicks: Of r runs, None of one of the base gait.
-        answers: Of the same runs.
         amplitude: Whether amplitudes are kicked both ways, too.
-
-    Returns:
-        The matrices.
     """
     kicked = [k for k, one in enumerate(kicks) if one is not None]
     each = [one for one in kicks if one is not None]

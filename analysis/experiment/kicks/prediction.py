@@ -52,9 +52,6 @@ def closed_loop(
         until_s: How long to follow it [s]; three times the slowest relaxation's if None, at most
             100 cycles.
 
-    Returns:
-        The prediction.
-
     Raises:
         UsageError: If eps isn't positive, the age or the time is negative, or there is no such
             joint.

@@ -47,8 +47,6 @@ class Kick:
     """One joint's command off the base gait.
 
     Attributes:
-        joint: Its index.
-        kind: What is kicked.
         size: Signed: d psi_c [rad] or d ln|c|.
     """
 
@@ -63,7 +61,6 @@ class KickedRuns:
 
     Attributes:
         base: Runs of the base gait, at least one.
-        kicks: Kicked runs.
         patterns: Runs in which several joints deviate.
         deviation: Of all runs from the first base run, ln|c| + j psi_c, NaN where a run is of
             another gait, shape (r, m).
@@ -101,7 +98,6 @@ def kick_of(deviation: ComplexArray, same: float = SAME, most: float = MOST_KICK
     Args:
         deviation: From :func:`deviation_of`, shape (m,).
         same: What deviates by less is the base's still.
-        most: The largest kick.
 
     Returns:
         The kick, or None where none, or more than one, part of a command deviates.
@@ -137,8 +133,6 @@ def sort_kicks_within(command: ComplexArray, same: float, most: float) -> Kicked
 
     Args:
         command: Complex amplitudes of r runs' commands, shape (r, m).
-        same: The smallest kick.
-        most: The largest kick.
 
     Returns:
         The runs sorted, or None where they are no kick experiment: fewer than two different kicks
@@ -166,8 +160,6 @@ def missing_kicks(kicks: Sequence[Kick], kind: Kind, names: Sequence[str]) -> tu
     """What central differences of one kind lack.
 
     Args:
-        kicks: All kicks.
-        kind: Which of them matter.
         names: Of the m joints.
 
     Returns:
@@ -219,7 +211,6 @@ class KickExperiment:
         lag_variance: Shape (r, m).
         dof: Shape (r, m).
         labels: File names, r.
-        frequency_hz: Of the base gait.
     """
 
     index: tuple[int, ...]
@@ -249,7 +240,6 @@ def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> Kick
     """Recognise a kick experiment by its commands.
 
     Args:
-        runs: All runs.
         gaits: Their fits, in the same order.
 
     Returns:

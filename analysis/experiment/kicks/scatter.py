@@ -94,9 +94,6 @@ def run_errors(
         derivatives: P - j R, and G + j S or None, shapes (m, m).
         pairs: Use kicks up and down together; they carry the second order of the kicks.
         rows: Use the sums of rows.
-
-    Returns:
-        The errors.
     """
     values = np.hstack([log.imag, log.real])
     foreseen = _foreseen(kicks, log.shape[1], derivatives)
@@ -209,7 +206,6 @@ def sides(kicks: Sequence[Kick | None], kind: Kind) -> list[tuple[list[int], lis
 
     Args:
         kicks: Of r runs, None of one of the base gait.
-        kind: Which kicks.
 
     Returns:
         Indices of runs, a pair for each joint.

@@ -135,9 +135,6 @@ def mirror_test(
             mirror images of each other whatever the floor. All runs are in one where it is None.
         seed: Of the random labellings, where there are too many to try all.
 
-    Returns:
-        The test.
-
     Raises:
         UsageError: If a way has fewer than ``MIN_RUNS`` runs in a stratum, or the joints are not
             as many.
@@ -217,9 +214,6 @@ class Strata:
             forward: Stratum of each run one way, any integers, shape (r1,).
             reverse: Stratum of each run the other way, shape (r2,).
 
-        Returns:
-            The strata.
-
         Raises:
             UsageError: If a stratum has fewer than ``MIN_RUNS`` runs of a way.
         """
@@ -258,9 +252,6 @@ class Strata:
 
     def labellings(self, seed: int = 1) -> BoolArray:
         """Ways to choose which runs of each stratum are called '+'.
-
-        Args:
-            seed: Of a random subset.
 
         Returns:
             True for '+', shape (k, r1 + r2), the observed labelling first. All of them, but where

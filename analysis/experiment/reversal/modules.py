@@ -95,13 +95,8 @@ def tilt_check(
     Args:
         forward: y of the runs one way, shape (r1, m).
         reverse: y of the runs the other way, shape (r2, m), joints from head to tail too.
-        test: Their reversal test.
         gravity_rad: Lean of recorded gravity along the body with its interval, None or empty where
             none is recorded.
-        seed: Of the bootstrap.
-
-    Returns:
-        The check.
     """
     ratio = common_ratio(forward, reverse, seed)
     excluded = ratio.ci95 is not None and ratio.ci95[1] < MODULE_RATIO
@@ -269,7 +264,6 @@ def variance_shares(forward: ComplexArray, reverse: ComplexArray, seed: int = 1)
     Args:
         forward: y of the runs one way, shape (r1, m), m >= 2, r1 >= 2.
         reverse: y of the runs the other way, shape (r2, m), r2 >= 2.
-        seed: Of the bootstrap.
 
     Returns:
         The shares. Intervals by bootstrap over runs, each way resampled for itself. A resample
@@ -355,9 +349,6 @@ def reversal_of(
         gravity_rad: Lean of the body along itself by recorded gravity, None where none is
             recorded.
 
-    Returns:
-        The result.
-
     Raises:
         UsageError: If a way has fewer than two runs.
     """
@@ -416,7 +407,6 @@ def ordered_pairs(names: Sequence[str], test: MirrorTest) -> tuple[OrderedPair, 
 
     Args:
         names: Of m joints, head to tail.
-        test: Of the same joints.
 
     Returns:
         The largest contrast first: a module changes what its neighbours do, but less.

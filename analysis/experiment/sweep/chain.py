@@ -53,9 +53,6 @@ class Phasors:
     def draws(self, seed: int) -> ComplexArray:
         """Errors that they may have.
 
-        Args:
-            seed: Of the draws.
-
         Returns:
             Student draws, shape (DRAWS, m, r).
         """
@@ -109,7 +106,6 @@ def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> Measur
     Args:
         command: C, of full rank, shape (m, r), r >= m.
         response: Y.
-        seed: Of the noise draws.
 
     Returns:
         H [rad/rad]. With C a DFT matrix of amplitude A and white noise sigma in N samples a run,
@@ -132,7 +128,6 @@ def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> Measured:
     Args:
         response: Y, of full rank.
         torque: T on the joints, positive in the direction of positive angles [N m].
-        seed: Of the noise draws.
 
     Returns:
         Z [N m/rad].
@@ -158,9 +153,6 @@ def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> Measured:
 def inverse(H: Measured) -> ComplexArray:
     """Errors that H^-1 may have.
 
-    Args:
-        H: Regular.
-
     Returns:
         Shape (DRAWS, m, m).
     """
@@ -173,7 +165,6 @@ def impedance_behind_servos(H: Measured, servos: ServoSide) -> Measured:
 
     Args:
         H: Of the commands as the servos hold them; regular.
-        servos: What they do.
 
     Returns:
         Z [N m/rad]; to first order var X_ij = sum_kl abs(X_ik)^2 var H_kl abs(X_lj)^2, columns of H
@@ -198,9 +189,6 @@ def servo_side(servos: Sequence[Servo], omega: float) -> ServoSide:
     Args:
         servos: Of m joints; their Coulomb friction and play are not in it.
         omega: Angular frequency [rad/s].
-
-    Returns:
-        D_r and D_q.
     """
     sides: list[tuple[complex, complex]] = []
     for one in servos:

@@ -50,7 +50,6 @@ def sweep_coupling(
         sweep: Which of the sessions are its runs.
         commanded: What each session commands.
         paths: The files of all sessions.
-        options: What the user chose.
         warn: Takes one sentence for each thing that is missing or doubtful.
 
     Returns:

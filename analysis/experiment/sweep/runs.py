@@ -92,7 +92,6 @@ def read_signals(session: SessionView, options: Options) -> Signals:
 
     Args:
         session: An open session, examined before: what it lacks has been told.
-        options: What the user chose.
 
     Returns:
         The signals of the analysed stretch.
@@ -122,11 +121,6 @@ def command_tones(
     session: SessionView, options: Options, examined: Examined
 ) -> CommandTones | None:
     """What a session commands, as tones.
-
-    Args:
-        session: An open session.
-        options: What the user chose.
-        examined: Its analysis.
 
     Returns:
         The gait's frequency alone, or the tones of a multisine; None of anything else.
@@ -218,7 +212,6 @@ class SweepData:
         torque: T of each tone [N m]; None where some joint's torque is missing in some run.
         beside: Responses beside the tones, where nothing is commanded; None where the records are
             too short for them.
-        torque_beside: Torques there.
         period_s: Of the commands: a servo holds each so long [s].
         contact: Whether the robot touched anything; None where its sessions don't say.
         drift: Largest drift of a run's responses per cycle, that noise doesn't explain; 0 if none.
@@ -259,10 +252,6 @@ def sweep_data(
         sweep: Which of the sessions they are.
         commanded: What each session commands.
         paths: The files of all sessions.
-        options: What the user chose.
-
-    Returns:
-        The phasors.
 
     Raises:
         DataError: If a driven joint's response is missing in a run, or too short.

@@ -55,10 +55,6 @@ class Beside:
 def sideband_energy(tones: tuple[Phasors, ...], beside: Beside) -> Estimate:
     """Energy at the free lines over that at the tones.
 
-    Args:
-        tones: Amplitudes at the tones.
-        beside: At the free lines.
-
     Returns:
         The ratio, noise taken off, with an interval of at least 95 %.
     """
@@ -71,7 +67,6 @@ def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
 
     Args:
         omega: Of the tone [rad/s].
-        tone: Its amplitudes.
         beside: Those of the free lines.
 
     Returns:
@@ -257,9 +252,6 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
         series: K channels.
         omega: Angular frequencies of the tones [rad/s], shape (L,).
         beside: Of the further lines, none of them a tone [rad/s], shape (S,).
-
-    Returns:
-        The fit.
 
     Raises:
         DataError: If a channel has too few samples, or too short a record to tell the lines apart.

@@ -46,12 +46,8 @@ def save(result: Shown, path: Path, *, force: bool) -> Path:
     """Write a result as JSON; see :meth:`.analysis.results.shown.Shown.save`.
 
     Args:
-        result: The result.
         path: A name that ends in .json.
         force: Replace the file if it exists.
-
-    Returns:
-        The path.
 
     Raises:
         UsageError: If the name ends in anything else.
@@ -67,12 +63,7 @@ def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
     """Write the tables as Parquet; see :meth:`.analysis.results.shown.Shown.to_parquet`.
 
     Args:
-        result: The result.
         folder: Made if it isn't there.
-        force: Replace files that exist.
-
-    Returns:
-        The files.
 
     Raises:
         OutputExistsError: If one is there and ``force`` is not given.
@@ -95,9 +86,6 @@ def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
 
 def load(path: Path | str) -> Shown:
     """Read a result that ``save`` wrote, or ``undulog analyse`` and ``compare`` with ``-o``.
-
-    Args:
-        path: The JSON file.
 
     Returns:
         The result, equal to the one that was written.

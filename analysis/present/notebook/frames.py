@@ -37,8 +37,6 @@ def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.Dat
     words are joined by spaces. Fields that hold other structures are left out.
 
     Args:
-        kind: The kind.
-        rows: The dataclasses.
         **more: Columns to put first, one value a row.
 
     Returns:
@@ -52,14 +50,7 @@ def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.Dat
 
 
 def row_of(one: Any) -> dict[str, Any]:
-    """One dataclass as a row.
-
-    Args:
-        one: The dataclass.
-
-    Returns:
-        Column to value.
-    """
+    """One dataclass as a row."""
     row: dict[str, Any] = {}
     for field in fields(one):
         value = getattr(one, field.name)
@@ -85,10 +76,6 @@ def ends(name: str) -> tuple[str, str]:
 
 def named(kind: type[Any], indices: Mapping[str, Any]) -> pd.DataFrame:
     """A mapping of dataclasses as a table, the keys first.
-
-    Args:
-        kind: Their kind.
-        indices: Name to dataclass.
 
     Returns:
         One row each.
@@ -135,9 +122,6 @@ def frames_of(result: object) -> Frames:
 
     Args:
         result: A result of this package.
-
-    Returns:
-        Name to table.
 
     Raises:
         TypeError: If it is no result.

@@ -79,9 +79,6 @@ class Picture:
             path: A name that ends in .svg.
             force: Replace the file if it exists.
 
-        Returns:
-            The path.
-
         Raises:
             UsageError: If the name ends in anything else.
             OutputExistsError: If it is there and ``force`` is not given.
@@ -94,14 +91,7 @@ class Picture:
 
 
 def of(drawing: Drawing) -> Picture:
-    """A figure of the report as a picture.
-
-    Args:
-        drawing: The figure.
-
-    Returns:
-        The picture.
-    """
+    """A figure of the report as a picture."""
     return Picture(drawing.svg, drawing.caption)
 
 
@@ -144,9 +134,6 @@ def picture_of(result: object, what: str | None = None) -> Picture:
     Args:
         result: A result of this package.
         what: Which picture; the first by default.
-
-    Returns:
-        The picture.
 
     Raises:
         UsageError: If there is no such picture; the message lists those that are.

@@ -130,9 +130,6 @@ def text_of(result: object) -> str:
     Args:
         result: A result of this package.
 
-    Returns:
-        Several lines.
-
     Raises:
         TypeError: If it is no result.
     """

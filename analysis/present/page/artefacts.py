@@ -55,9 +55,6 @@ class Trace:
 def chosen_joints(joints: Sequence[JointResult]) -> list[int]:
     """The joints to show: head, middle and tail end of the plane that is driven most.
 
-    Args:
-        joints: In chain order.
-
     Returns:
         Up to three indices, ascending; all joints count where none is driven.
     """
@@ -94,7 +91,6 @@ def read_traces(session: SessionView, analysis: Analysis) -> tuple[Trace, ...]:
     """Read what :func:`command_response` draws.
 
     Args:
-        session: Open.
         analysis: Of that session; its options say which topics were analysed.
 
     Returns:
@@ -144,7 +140,6 @@ def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> 
     """Command (grey) and response (coloured) of a few joints, one panel each.
 
     Args:
-        traces: At least one.
         joint_count: Joints in the chain, for their colours.
         prefix: For identifiers, unique in the page.
 
@@ -214,11 +209,7 @@ class ArtefactRow:
 
     Attributes:
         joints: Joint names, or how many there are.
-        where: Quantity and topic.
-        flag: Its name.
         meaning: What the values do, and what else is known.
-        about: Whose fault it is.
-        times: When it holds.
         line: A drawing of that along the session.
     """
 
@@ -233,9 +224,6 @@ class ArtefactRow:
 
 def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
     """The artefacts of a session, those that several joints have at the same time as one.
-
-    Args:
-        analysis: Its numbers.
 
     Returns:
         Rows: sensors first, then limits, then the record; each in chain order.
@@ -253,9 +241,6 @@ def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
 
 def flagged_joints(joints: Sequence[JointResult]) -> tuple[tuple[str, str], ...]:
     """Flags of the analysed cycles.
-
-    Args:
-        joints: In chain order.
 
     Returns:
         Flag, and the joints that have it.

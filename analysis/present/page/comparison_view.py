@@ -41,9 +41,7 @@ class Panel:
     """One quantity.
 
     Attributes:
-        label: With its unit.
         values: Of the joints, in that unit; those without a value are left out.
-        margin: In that unit.
     """
 
     label: str
@@ -57,13 +55,8 @@ def differences_drawing(
     """Differences of every joint, head to tail, one panel a quantity.
 
     Args:
-        names: Of the joints.
-        panels: At least one.
         title: What is subtracted from what.
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure.
     """
     colors = joint_hex(len(names))
     with drawing():
@@ -129,15 +122,11 @@ class ComparisonView:
     """All that the template shows of a comparison.
 
     Attributes:
-        comparison: The numbers.
-        sentence: The answer.
         sides: Letter and session, A first.
-        facts: Key figures.
         marks: Of the joints that answer differently.
         differences: Of every joint, as a picture; None where there are none.
         waveforms: Mean cycles, or None.
         trials: What is shown to be the same.
-        comparison_method: How it was made.
     """
 
     comparison: Comparison
@@ -152,14 +141,7 @@ class ComparisonView:
 
 
 def comparison_view(comparison: Comparison) -> ComparisonView:
-    """Prepare what the template shows of a comparison.
-
-    Args:
-        comparison: The numbers.
-
-    Returns:
-        The view.
-    """
+    """Prepare what the template shows of a comparison."""
     sides = (("A", comparison.a), ("B", comparison.b))
     return ComparisonView(
         comparison=comparison,
@@ -176,9 +158,6 @@ def comparison_view(comparison: Comparison) -> ComparisonView:
 
 def joints_of(comparison: Comparison) -> list[str]:
     """The joints that are compared.
-
-    Args:
-        comparison: The numbers.
 
     Returns:
         Names, head to tail where mean cycles say so, else by name.

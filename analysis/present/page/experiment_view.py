@@ -27,14 +27,7 @@ AGREE = 0.1
 
 
 def sweep_facts(coupling: LinearCoupling) -> list[Fact]:
-    """Key figures at the first tone.
-
-    Args:
-        coupling: Of a sweep.
-
-    Returns:
-        Six facts.
-    """
+    """Key figures at the first tone."""
     tone = coupling.tones[0]
     tones = ", ".join(f"{one.frequency_hz:.4g}" for one in coupling.tones)
     at = f"{tone.frequency_hz:.4g} Hz"
@@ -62,14 +55,7 @@ def sweep_facts(coupling: LinearCoupling) -> list[Fact]:
 
 
 def sweep_trials(coupling: LinearCoupling) -> list[Trial]:
-    """What must hold for the matrices to mean something.
-
-    Args:
-        coupling: Of a sweep.
-
-    Returns:
-        Trials.
-    """
+    """What must hold for the matrices to mean something."""
     drift = coupling.drift_per_cycle
     settled = "no drift beyond noise" if drift == 0 else f"drift {digits(100 * drift)} % a cycle"
     trials = [
@@ -134,28 +120,20 @@ class ExperimentView:
     """All that the template shows of an experiment.
 
     Attributes:
-        experiment: The numbers.
         runs: Each session's part, and its numbers.
         left_out: Sessions that have no part in it.
-        sentence: The answer.
-        detail: Sentences that qualify it.
-        facts: Key figures.
         answers: What each session says by itself.
         mirror: Both directions, or None.
         entries: Coupling matrices, the main one first.
-        matrices: Their pictures.
         told: What the coupling says besides, in sentences.
         modes: What oscillators that feel their servos would do, or None.
-        body_facts: Key figures of that.
         entrainment: The other reading of P, or None.
-        trials: Tests with their verdicts.
         indices: Whether any heterogeneity index has a value.
         shared: Warnings of single sessions, alike ones once, with the files that have them.
         notes: Notes of single sessions, likewise.
         flagged: Flag of a joint, with the files that have it.
         names: Joints that any run has a gain of.
         tables: Gain and lag of them in every run.
-        method: How it was made.
     """
 
     experiment: Experiment
@@ -183,14 +161,7 @@ class ExperimentView:
 
 
 def experiment_view(experiment: Experiment) -> ExperimentView:
-    """Prepare what the template shows of an experiment.
-
-    Args:
-        experiment: The numbers.
-
-    Returns:
-        The view.
-    """
+    """Prepare what the template shows of an experiment."""
     reversal, coupling, body = experiment.reversal, experiment.coupling, experiment.oscillators
     names = _known_joints(experiment)
     entries = entries_of(coupling, names)

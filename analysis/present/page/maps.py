@@ -35,7 +35,6 @@ class Map:
     """What one map shows.
 
     Attributes:
-        title: With its unit.
         names: Of the rows, head at the top, m.
         value: Means of the columns, NaN where all their cycles are missing, shape (m, k).
         holed: Whether any cycle of a column is missing, shape (m, k).
@@ -67,7 +66,6 @@ def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
     """Draw gain, lag and power.
 
     Args:
-        cycles: What to draw.
         prefix: For identifiers, unique in the page.
 
     Returns:

@@ -33,8 +33,6 @@ class Entries:
         columns: Names of the commanded joints, k.
         value: Shape (m, k); NaN where nothing is known.
         half: Half widths of the 95 % intervals, same shape; None where they are not known.
-        row: What a row is.
-        column: What a column is.
         verb: What the one does to the other.
         ends: Magnitude at the ends of the colours, where it is given by what stands beside it.
     """
@@ -64,8 +62,6 @@ class Entries:
         """One entry in words.
 
         Args:
-            i: Row.
-            j: Column.
             decimals: Digits after the point.
 
         Returns:
@@ -89,11 +85,7 @@ class Entries:
         return int(np.clip(1 - np.floor(np.log10(np.median(self.half))), 2, 6))
 
     def in_words(self) -> str:
-        """What a reader who can't see the picture should know.
-
-        Returns:
-            Two sentences.
-        """
+        """What a reader who can't see the picture should know."""
         m, k = self.value.shape
         return (
             f"{m} rows: {self.row}; {k} columns: {self.column}. The colours end at "
@@ -200,12 +192,8 @@ def matrix_picture(entries: Entries, prefix: str, *, small: bool = False) -> Dra
     """Draw a matrix.
 
     Args:
-        entries: What to draw.
         prefix: For identifiers, unique in the page.
         small: One of several beside a large one: no numbers in its cells, no focus on its rows.
-
-    Returns:
-        The picture.
     """
     m, k = entries.value.shape
     names = [short(name, 12) for name in entries.rows]

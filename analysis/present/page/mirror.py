@@ -63,11 +63,7 @@ def profiles(experiment: Experiment, reversal: Reversal) -> Profiles:
     """Collect what the runs of a reversal measured.
 
     Args:
-        experiment: All runs.
         reversal: Its reversal test, which says what joints took part.
-
-    Returns:
-        The profiles.
     """
     names = [one.name for one in reversal.joints]
 
@@ -97,8 +93,6 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
     """Profiles of both directions, and their differences with simultaneous intervals.
 
     Args:
-        seen: What the runs measured.
-        reversal: The test.
         prefix: For identifiers, unique in the page.
 
     Returns:

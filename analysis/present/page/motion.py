@@ -90,9 +90,6 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
     Args:
         body: With one or more observed points.
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure.
     """
     points = body.observed
     colors = joint_hex(len(points))

@@ -25,9 +25,7 @@ class ChainView:
     """What the page shows of one chain of oscillators.
 
     Attributes:
-        chain: The numbers.
         sentence: The answer, or None where it has none.
-        method: How it was made.
         matrix: The couplings as a picture; None where there are none.
         decimals: Digits after the point of K, of the rates and of the feedback.
         lags: Of the links [deg].
@@ -47,9 +45,6 @@ class ChainView:
 
 def chain_views(chains: Iterable[ChainCoupling]) -> tuple[ChainView, ...]:
     """The chains of a session.
-
-    Args:
-        chains: One a plane.
 
     Returns:
         The same, ready for the page.
@@ -102,14 +97,7 @@ def _couplings(chain: ChainCoupling) -> Entries:
 
 
 def body_facts(body: BodyOscillators) -> list[Fact]:
-    """Key figures of oscillators that feel their servos.
-
-    Args:
-        body: The numbers.
-
-    Returns:
-        Four facts.
-    """
+    """Key figures of oscillators that feel their servos."""
     patterns = len(body.modes)
     bound = f"{body.strong_above:g} eps"
     explicit = body.explicit_coupling
@@ -139,9 +127,6 @@ def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
     Args:
         body: With at least one mode.
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure.
     """
     count = len(body.modes)
     tooltips: dict[str, str] = {}
@@ -203,9 +188,6 @@ def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
 
 def entrainment_entries(body: BodyOscillators) -> Entries | None:
     """The other reading of P, as entrainment.
-
-    Args:
-        body: The numbers.
 
     Returns:
         P^-1 - I; None where P is singular.

@@ -61,13 +61,8 @@ class AnalysisView:
     """All that the template shows of one session.
 
     Attributes:
-        analysis: The numbers.
         answer: The answer in one sentence.
         notices: The first few warnings, cut to a line or two.
-        facts: Key figures.
-        marks: One a joint.
-        trials: Tests with their verdicts.
-        segments: Gain, lag and energy.
         signals: Command against response, or None.
         maps: Joints against cycles, or none.
         body: Head, middle, tail, or None.
@@ -101,12 +96,8 @@ def session_view(
     """Prepare what the template shows of one session.
 
     Args:
-        analysis: The numbers.
         session: Open, or None.
         cycles: Its cycles, or None.
-
-    Returns:
-        The view.
     """
     joints = analysis.joints
     colors = joint_hex(len(joints)) if joints else ()
@@ -160,7 +151,6 @@ def render(
     of one session the signals and maps, of an experiment the numbers of every run.
 
     Args:
-        result: The numbers.
         session: The open session of an ``Analysis``, for what is drawn from its samples; None
             where it is not at hand.
         cycles: Of an ``Analysis``, from :func:`.analysis.session.cycles.cycle_maps`; None: no maps.

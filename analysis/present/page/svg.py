@@ -300,7 +300,6 @@ def legend(figure: Figure, handles: Sequence[Handle]) -> None:
 
     Args:
         figure: Laid out by the constrained engine.
-        handles: What is explained.
     """
     figure.legend(
         handles=handles,
@@ -318,7 +317,6 @@ def joint_ticks(axes: Axes, names: Sequence[str]) -> None:
 
     Args:
         axes: Joints stand at 1, 2, ... from head to tail.
-        names: Of all joints.
     """
     shown = [short(name, 14) for name in names]
     room = 95  # characters of 8 points that stand beside one another over the width

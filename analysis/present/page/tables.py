@@ -24,9 +24,6 @@ STILL_RAD = 1e-6
 def is_driven(joint: JointResult) -> bool:
     """Whether a joint was given a command that moves.
 
-    Args:
-        joint: Its result.
-
     Returns:
         True if it has a gain, or a command with an amplitude (and then its response is missing).
     """
@@ -38,13 +35,9 @@ def element(name: str, *children: object, **attributes: object) -> Markup:
     """One element.
 
     Args:
-        name: Of the element.
         children: Elements, or text, which is escaped.
         attributes: By name; ``class_`` is ``class``, other underscores are hyphens; what is None
             is left out, numbers keep two decimals.
-
-    Returns:
-        The element as text.
     """
     told = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{escape(_value(value))}"'
@@ -59,9 +52,6 @@ def joined(children: Iterable[object]) -> Markup:
 
     Args:
         children: Elements, or text, which is escaped.
-
-    Returns:
-        The text.
     """
     return Markup("").join(
         child if isinstance(child, Markup) else escape(plain(str(child))) for child in children
@@ -99,22 +89,12 @@ def sentence(text: str) -> str:
 
     Args:
         text: With or without a capital and a full stop.
-
-    Returns:
-        With both, typeset.
     """
     return typeset(formats.sentence(text))
 
 
 def softer(text: str) -> Markup:
-    """Set the intervals of a sentence smaller, so that the sentence is read first.
-
-    Args:
-        text: Intervals in square brackets.
-
-    Returns:
-        Markup, escaped.
-    """
+    """Set the intervals of a sentence smaller, so that the sentence is read first."""
     escaped = str(escape(typeset(text)))
     parts: list[str] = []
     rest = escaped
@@ -128,7 +108,6 @@ def cut(text: str, most: int = 130) -> str:
     """The beginning of a long sentence.
 
     Args:
-        text: Any.
         most: Characters kept at most.
 
     Returns:
@@ -141,9 +120,6 @@ def cut(text: str, most: int = 130) -> str:
 
 def digits(value: float) -> str:
     """A number of any size with two digits.
-
-    Args:
-        value: Any unit.
 
     Returns:
         For example ``0.026`` or ``3.4e−9``.
@@ -162,8 +138,6 @@ class Fact:
     """One key figure.
 
     Attributes:
-        name: What it is.
-        value: With unit.
         note: Where or when, in small print; may be empty.
     """
 
@@ -179,7 +153,6 @@ def grid(table: Table[Any], marks: Sequence[Markup] = ()) -> Markup:
     """Head and body of a table.
 
     Args:
-        table: The table.
         marks: What stands before the name of each row, if anything does.
 
     Returns:
@@ -214,12 +187,7 @@ def joint_mark(color: str, plane: str | None, *, driven: bool = True) -> Markup:
     """The mark of a joint, which stands before its name.
 
     Args:
-        color: Of the joint.
-        plane: Of the joint.
         driven: Whether it was given a command that moves.
-
-    Returns:
-        An empty element.
     """
     kind = plane if plane in ("horizontal", "vertical") else "unknown"
     return Markup('<span class="mark {}{}" style="--c: {}"></span>').format(
@@ -243,7 +211,6 @@ def number(value: float | None, decimals: int) -> Markup:
     """A number that keeps its full precision in the page.
 
     Args:
-        value: The number.
         decimals: Digits after the point.
 
     Returns:
@@ -260,7 +227,6 @@ def estimate(quantity: Estimate, decimals: int, unit: str = "") -> Markup:
     Args:
         quantity: In ``unit``.
         decimals: Digits after the point.
-        unit: With its own space.
 
     Returns:
         The number, or a dash; its interval in smaller type.
@@ -291,18 +257,12 @@ def known(value: object) -> Markup:
 
     Args:
         value: Anything that prints; None: not known.
-
-    Returns:
-        Its text, escaped.
     """
     return _NOT_COMPUTED if value is None else escape(plain(str(value)))
 
 
 def key_figures(analysis: Analysis) -> list[Fact]:
     """The figures that stand at the top of the page; what is unknown is an en dash.
-
-    Args:
-        analysis: The numbers.
 
     Returns:
         Eight facts, seven where there are no joints.

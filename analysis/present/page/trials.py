@@ -28,10 +28,8 @@ class Trial:
     """One question put to the data.
 
     Attributes:
-        question: In words.
         statistic: What was computed, with unit and interval.
         p: Of the null hypothesis; None where the answer rests on an interval or a bound.
-        verdict: In words.
     """
 
     question: str
@@ -42,9 +40,6 @@ class Trial:
 
 def session_trials(indices: Mapping[str, Index]) -> tuple[Trial, ...]:
     """The tests of one session.
-
-    Args:
-        indices: Its heterogeneity indices.
 
     Returns:
         Trials, plane by plane; empty where nothing was tested.
@@ -65,9 +60,6 @@ def session_trials(indices: Mapping[str, Index]) -> tuple[Trial, ...]:
 
 def experiment_trials(experiment: Experiment) -> tuple[Trial, ...]:
     """The tests of several sessions together.
-
-    Args:
-        experiment: Its numbers.
 
     Returns:
         Trials; empty where nothing was tested.

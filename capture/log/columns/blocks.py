@@ -45,7 +45,6 @@ class Piece(Generic[_T]):
         """Offer it to the helpers.
 
         Args:
-            work: The work.
             helpers: Threads; None where there are none.
         """
         self._work = work
@@ -117,7 +116,6 @@ class Placed:
     """A block's payload in a buffer.
 
     Attributes:
-        block: The block.
         base: What its message offsets count from.
         stop: One past its last byte.
     """
@@ -141,9 +139,7 @@ def filled_arenas(
     """Buffers full of payloads, in file order; one that can't share a buffer comes alone.
 
     Args:
-        log_file: The file.
         channel_ids: Blocks whose index has none of these channels are passed over.
-        blocks: Where to look.
         warn: Takes one sentence for each block that couldn't be read.
         threads: How many decompress, the caller's among them; others do so ahead of what is used.
 
@@ -263,7 +259,6 @@ def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
     """The blocks that may hold messages of a window.
 
     Args:
-        log_file: The file.
         window_ns: Half-open window of log times [Unix ns]; None for open ends.
 
     Returns:
@@ -289,9 +284,7 @@ def record_batches(
     """The message records of some topics, many blocks at a time.
 
     Args:
-        log_file: The file.
         wanted: Channel ids, one sequence a topic.
-        blocks: Where to look.
         warn: Takes one sentence for each block that couldn't be read.
         threads: How many decompress the blocks.
 
@@ -333,11 +326,7 @@ def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequ
 def _records(
     log_file: LogFile, data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[Records]:
-    """The checked records of each topic.
-
-    Raises:
-        LogError: If an index is damaged or points to something that is no message.
-    """
+    """The checked records of each topic."""
     tiled = _tiled(data, placed, wanted)
     if tiled is not None:
         return tiled
@@ -356,11 +345,7 @@ def _records(
 def _tiled(
     data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[Records] | None:
-    """The records of a topic that has the blocks for itself, found without the index.
-
-    Returns:
-        None unless whole messages of one length and channel fill the blocks to the last byte.
-    """
+    """The records of a topic that has the blocks for itself, found without the index."""
     only = {key for one in placed for key in one.block.index_at}
     base, stop = placed[0].base, placed[-1].stop
     filled = sum(one.stop - one.base for one in placed)
@@ -444,11 +429,7 @@ class _Starts:
 def _indexed(
     log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[_Starts]:
-    """Where the records of each topic start, by the blocks' indexes.
-
-    Raises:
-        LogError: If an index is damaged or points outside its block.
-    """
+    """Where the records of each topic start, by the blocks' indexes."""
     ids = list(itertools.chain.from_iterable(wanted))
     indexes = [log_file.indexed(one.block, ids) for one in placed]
     pieces: list[IntArray] = []

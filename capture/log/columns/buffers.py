@@ -37,7 +37,6 @@ class ColumnStore:
 
         Args:
             dtype: numpy type string of a number.
-            width: Numbers a row.
             capacity: Rows to expect; more may come, at the price of a copy.
             pages: Where a large column lies; None for memory.
         """
@@ -130,7 +129,6 @@ class EchoColumn:
 
         Args:
             dtype: numpy type string of a number.
-            capacity: Rows to expect.
             others: What it may repeat, if they have the same rows before it gets them.
         """
         self._dtype = dtype
@@ -168,7 +166,6 @@ class EchoColumn:
 
         Args:
             rows: Shape (n,).
-            start: Where they would start.
 
         Returns:
             False where it has fewer rows, too.
@@ -213,9 +210,6 @@ class Times:
         Args:
             log_ns: Log times [Unix ns], shape (n,).
             stamp_ns: Stamps [ns], shape (n,).
-
-        Returns:
-            The times.
         """
         behind = log_ns - stamp_ns
         short = not len(behind) or (behind.min() >= -_SHORT_NS and behind.max() < _SHORT_NS)
@@ -233,7 +227,6 @@ class TimeStore:
         """Start empty.
 
         Args:
-            capacity: Messages to expect.
             stamped: Whether the messages have stamps; without, the log times stand for them.
             others: Times of other topics, which may be the same.
         """
@@ -253,11 +246,7 @@ class TimeStore:
         return self._behind
 
     def append(self, times: Times) -> None:
-        """Add messages.
-
-        Args:
-            times: Of the messages.
-        """
+        """Add messages."""
         if not self.is_stamped or times.stamp_ns is None or times.behind_ns is None:
             self._stamps.append(times.log_ns)
             return

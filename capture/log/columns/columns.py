@@ -35,13 +35,7 @@ _EXPANSION = 64
 
 @dataclass
 class Unread:
-    """A message that has no layout here (big-endian, ``wstring``, damaged).
-
-    Attributes:
-        log_ns: Its log time.
-        data: Its bytes.
-        why: What was wrong.
-    """
+    """A message that has no layout here (big-endian, ``wstring``, damaged)."""
 
     log_ns: int
     data: bytes
@@ -53,9 +47,7 @@ class Request:
     """What to read of one topic.
 
     Attributes:
-        topic: Its name.
         channel_ids: The topic's channels.
-        message_type: Their type.
         paths: Leaf paths to keep; None for all.
         layouts: One of each length that was seen before, by length; new ones are noted.
     """
@@ -105,7 +97,6 @@ def read_messages(
     """Read several topics in one pass over the file: each chunk is decompressed once.
 
     Args:
-        log_file: The file.
         requests: What to read, one a topic.
         window_ns: Half-open window of log times [Unix ns]; None for open ends.
         warn: Takes one sentence for each block that couldn't be read.
@@ -159,7 +150,6 @@ def message_blocks(
     """The payloads that hold messages of one topic, with the offsets of their records.
 
     Args:
-        log_file: The file.
         channel_ids: The topic's channels.
         window_ns: Blocks wholly outside this window of log times are passed over.
         warn: Takes one sentence for each block that couldn't be read.
@@ -175,10 +165,6 @@ def message_blocks(
 
 def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
     """One message record's log time and message.
-
-    Args:
-        data: The payload.
-        offset: Where the record starts.
 
     Returns:
         Log time [Unix ns] and the message's bytes.

@@ -167,7 +167,6 @@ def stamps_of(layout: Layout, matrix: Matrix) -> IntArray | None:
     """Return the stamps of messages [ns].
 
     Args:
-        layout: Their layout.
         matrix: The messages, shape (n, length).
 
     Returns:
@@ -238,10 +237,8 @@ class Group:
     """All messages of a topic that share one layout.
 
     Attributes:
-        layout: The layout.
         is_stamped: Whether they have a stamp.
         strings: The strings that are wanted, by path.
-        kept_times: Stamps and log times.
     """
 
     def __init__(
@@ -257,9 +254,7 @@ class Group:
         """Start empty.
 
         Args:
-            layout: The layout.
             paths: Leaf paths to keep; None for all. A stamp is kept as a time, not as a leaf.
-            capacity: Messages to expect.
             others: Times of other topics, which may be the same.
             stamping: What works out the times, of other topics too; None for one of its own.
             pages: Where large columns lie; None for memory.
@@ -323,9 +318,6 @@ class Group:
 
     def holds(self, places: Places) -> bool:
         """Whether messages have this layout: the quick check, for messages of its length.
-
-        Args:
-            places: Where they start.
 
         Returns:
             True if all do; False if some don't, or differ in padding.

@@ -31,7 +31,6 @@ class Channel:
     Attributes:
         topic: E.g. ``/joint_states``.
         type_name: E.g. ``sensor_msgs/msg/JointState``.
-        count: Number of messages.
         metadata: Of the channel, e.g. ``unit``.
         encoding: Of its messages, e.g. ``cdr``; ``json``, ``protobuf`` or ``ros1`` in other makes.
         schema_encoding: E.g. ``ros2msg``; empty without a schema.
@@ -57,7 +56,6 @@ class Topics:
         """Sort the file's channels by topic.
 
         Args:
-            log_file: The open file.
             warn: Takes one sentence for each irregularity.
             threads: How many decompress what is read.
         """
@@ -81,9 +79,6 @@ class Topics:
         Args:
             wanted: Topic to leaf paths; None for all.
             window_ns: Half-open window of log times [Unix ns]; None for open ends.
-
-        Returns:
-            Topic to messages.
 
         Raises:
             MissingChannelError: If the log has no such topic.
@@ -116,12 +111,6 @@ class Topics:
     def message_type(self, topic: str) -> MessageType:
         """The type of a topic's messages.
 
-        Args:
-            topic: Its name.
-
-        Returns:
-            The parsed schema.
-
         Raises:
             MissingChannelError: If the log has no such topic.
             DataError: If the schema can't be read.
@@ -141,9 +130,6 @@ class Topics:
     def first(self, topic: str) -> tuple[int, bytes, MessageType] | None:
         """The first message of a topic.
 
-        Args:
-            topic: Its name.
-
         Returns:
             Log time [Unix ns], bytes and type; None where there is none.
 
@@ -160,7 +146,6 @@ class Topics:
         """The messages of a topic as bytes, in the order of the file.
 
         Args:
-            topic: Its name.
             window_ns: Half-open window of log times [Unix ns]; None for open ends.
 
         Yields:
@@ -182,9 +167,6 @@ class Topics:
 
     def decoder(self, topic: str) -> Callable[[bytes], Any]:
         """The general decoder of a topic, for messages of any shape.
-
-        Args:
-            topic: Its name.
 
         Returns:
             A function from bytes to a message with fields as attributes; it raises DataError for a

@@ -53,18 +53,11 @@ def cut_log(
     """Write a part of a log to a new file.
 
     Args:
-        path: The log.
-        output: The new log.
         start_s: First log time wanted, from the log's first message [s].
         stop_s: One past the last log time wanted, from the log's first message [s]; None for all
             of the rest.
         topics: Topics to keep, ``*`` and ``?`` as in a shell; all if none are given.
         carry_state: Copy the last earlier message of each latched topic to the start.
-        force: Replace an existing file.
-        stop: Request to stop.
-
-    Returns:
-        What was done.
 
     Raises:
         UsageError: If the window is empty, or the output can't be that.

@@ -51,7 +51,6 @@ class Fault:
         weight: As a finding has it.
         topic: Where; the topic, or a label that begins with it.
         name: The joint; empty for all that the topic carries.
-        text: What, how much.
         gaps: How many gaps it is about; 0 if it is about something else.
         lost_ns: Begin and end of the longest of these gaps [Unix ns].
         part: Share of the samples that are missing in them.
@@ -131,10 +130,6 @@ def _where(group: Sequence[Fault]) -> str:
 def listed(names: Sequence[str], most: int = _MOST_LISTED) -> str:
     """Return a list as text.
 
-    Args:
-        names: What is listed.
-        most: How many are named.
-
     Returns:
         E.g. ``a, b and c`` or ``a, b and 7 more``.
     """
@@ -156,7 +151,6 @@ class EditReport:
 
     Attributes:
         verb: ``cut`` or ``merge``.
-        output: The new log.
         sources: Of each source: ``path``, ``session_id``, ``sha256``.
         start_ns: First log time in it [Unix ns].
         end_ns: Last log time in it [Unix ns].
@@ -196,12 +190,7 @@ class EditedLog:
     """A log being written: channels, messages and records exactly as the sources have them."""
 
     def __init__(self, stream: BinaryIO, profile: str) -> None:
-        """Begin the file.
-
-        Args:
-            stream: Where to write.
-            profile: MCAP profile.
-        """
+        """Begin the file."""
         self._writer = Writer(stream)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int, str], int] = {}
@@ -252,7 +241,6 @@ class EditedLog:
         """Copy one message.
 
         Args:
-            channel_id: In the new file.
             message: As the source has it.
             log_time_ns: Another log time [Unix ns]; its own if None.
         """
@@ -281,12 +269,7 @@ class EditedLog:
         )
 
     def note(self, name: str, facts: Mapping[str, str]) -> None:
-        """Write a metadata record.
-
-        Args:
-            name: Its name.
-            facts: Its entries.
-        """
+        """Write a metadata record."""
         self._writer.add_metadata(name, dict(facts))
 
     def finish(self) -> None:
@@ -302,8 +285,6 @@ def edited_log(
 
     Args:
         sources: What it is made from; none of them may be the output.
-        output: The new file.
-        force: Replace an existing file.
         stop: Request to stop; nothing is left behind then.
 
     Yields:
@@ -330,7 +311,6 @@ def refuse_output(output: Path, sources: Sequence[Path], *, force: bool) -> None
     """Check the output of an edit before any work is done.
 
     Args:
-        output: The new file.
         sources: What it is made from.
         force: Whether an existing file may be replaced.
 
@@ -349,9 +329,6 @@ def refuse_output(output: Path, sources: Sequence[Path], *, force: bool) -> None
 def refuse_stopped(stop: StopRequest) -> None:
     """End the work if that was asked for.
 
-    Args:
-        stop: The request.
-
     Raises:
         UndulogError: If a stop was requested.
     """
@@ -363,8 +340,6 @@ def free_name(name: str, taken: Collection[str], pattern: str) -> str:
     """A name that isn't taken.
 
     Args:
-        name: The wanted name.
-        taken: Names in use.
         pattern: How a number is put to it, of ``{name}``, ``{stem}``, ``{suffix}`` and ``{n}``.
 
     Returns:
@@ -382,9 +357,6 @@ def free_name(name: str, taken: Collection[str], pattern: str) -> str:
 def earlier_edit_name(taken: Collection[str]) -> str:
     """Where the record of an earlier edit goes: ``undulog.edit.1`` and so on.
 
-    Args:
-        taken: Names in use.
-
     Returns:
         The name with the first free number.
     """
@@ -397,9 +369,6 @@ def portable(warnings: Sequence[str], sources: Sequence[RawLog]) -> str:
     Args:
         warnings: One sentence each.
         sources: The logs that they name.
-
-    Returns:
-        The JSON text.
     """
     told = list(warnings)
     for source in sources:

@@ -62,8 +62,6 @@ def copy_records(
     """Copy metadata and attachments.
 
     Args:
-        sources: The logs.
-        log: The new log.
         robot: The robot that the merged session is of; empty where no log says one.
         warnings: Takes one sentence for each thing that had to be renamed.
 
@@ -189,14 +187,8 @@ def merge_logs(
 
     Args:
         paths: The logs, two or more.
-        output: The new log.
         robot: The robot that the merged session is of, where the logs are of different ones.
         apart: Merge logs with more than :data:`FAR_APART_S` between them.
-        force: Replace an existing file.
-        stop: Request to stop.
-
-    Returns:
-        What was done.
 
     Raises:
         UsageError: If there are fewer than two logs, one is given twice, they are of different
@@ -300,8 +292,6 @@ class _Kind:
 
     Attributes:
         names: Types, with their encoding where it is not that of ROS 2.
-        definitions: What tells types apart.
-        units: Those that are stated.
     """
 
     names: set[str] = field(default_factory=set[str])

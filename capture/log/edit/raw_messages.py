@@ -34,9 +34,7 @@ class RawMessage(NamedTuple):
     Attributes:
         log_time_ns: Log time [Unix ns].
         channel_id: Channel in its own file.
-        sequence: As stored.
         publish_time_ns: As stored [Unix ns].
-        data: Its bytes.
     """
 
     log_time_ns: int
@@ -117,12 +115,8 @@ class RawLog:
         """Messages of some channels in a window, in the order of the file.
 
         Args:
-            channel_ids: The channels.
             start_ns: First log time [Unix ns].
             stop_ns: One past the last log time [Unix ns].
-
-        Yields:
-            The messages.
         """
         for block in self.file.blocks:
             outside = block.start_ns >= stop_ns or block.end_ns < start_ns
@@ -135,7 +129,6 @@ class RawLog:
         It looks backward, and no further than it must.
 
         Args:
-            channel_ids: The channels.
             before_ns: One past the last log time [Unix ns].
 
         Returns:

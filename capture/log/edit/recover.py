@@ -74,12 +74,6 @@ def recover_log(
     Args:
         path: The damaged or unfinished log; of a split one any part, or the folder. Nothing of
             it is changed.
-        output: The new file.
-        force: Replace an existing file.
-        stop: Request to stop.
-
-    Returns:
-        What was found.
 
     Raises:
         UsageError: If the output can't be that.

@@ -128,7 +128,6 @@ class Recovered:
     """What was put together of a session that was not finalised.
 
     Attributes:
-        folder: Its write-ahead log.
         live: Whether its recorder is still writing.
         in_files: Messages that the files have.
         from_wal: Messages that only the write-ahead log has.
@@ -397,12 +396,6 @@ class LogFile:
         A channel's messages are in the files in the order they came, while those of others may be
         in a later chunk though they came before. A chunk that can't be read is left out: the
         write-ahead log may have its messages.
-
-        Args:
-            least: Channel id to how many of its messages are wanted, if there are as many.
-
-        Returns:
-            The keys, and whether all of the files was read to count their messages.
         """
         keys: set[MessageKey] = set()
         left = dict(least)
@@ -432,11 +425,7 @@ class LogFile:
         return keys, not unread
 
     def _heads(self, block: Block) -> NDArray[np.void]:
-        """The heads of all messages of a block.
-
-        Raises:
-            LogError: If it can't be read.
-        """
+        """The heads of all messages of a block."""
         ids = block.offsets if block.offsets is not None else block.index_at
         offsets = [self.offsets(block, channel_id) for channel_id in ids]
         data, base = self.payload(block)

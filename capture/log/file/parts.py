@@ -135,9 +135,6 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
         bare: Whether a write-ahead log can explain files that don't explain themselves, and
             stand in for one that is missing.
 
-    Returns:
-        The files.
-
     Raises:
         NotALogError: If the only file is no log.
         LogError: If the only file can't be opened.

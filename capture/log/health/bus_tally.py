@@ -30,7 +30,6 @@ def undecoded(
     Args:
         robot: Name of the robot whose bus map was used.
         decoded: Data frames that carry what the map names.
-        frames: All data frames.
         others: Identifier to number of the other data frames.
         all_joints: Whether every joint has samples.
 
@@ -50,10 +49,6 @@ def undecoded(
 
 def counts_text(counts: Mapping[str, int], most: int = _MOST_LISTED) -> str:
     """Return counted things as text, most frequent first.
-
-    Args:
-        counts: Name to number.
-        most: How many are named.
 
     Returns:
         E.g. ``101 (20), 102 (10) and 3 more``.

@@ -59,12 +59,9 @@ class Series:
 
     Attributes:
         names: Joints or values; empty for other types.
-        timing: Of the stamps.
         first_log_ns: First log time [Unix ns].
         last_log_ns: Last log time [Unix ns].
-        numbers: Numbers looked at.
         nan_of: NaN among them, and how many there were, by field.
-        rows: Samples with values.
         joint_nan: Samples that are NaN in some field, shape (k,).
         at_limit: Angles at the joint's limits, shape (k,).
         ranges: Angles by the second.
@@ -122,7 +119,6 @@ class ChannelScan:
         ``ends`` are the first and the last message of a topic of diagnostics, None elsewhere.
 
         Args:
-            topic: Its topic.
             kind: Its message type; None where it can't be read: log times are looked at then.
             joints: Whether its messages are JointStates.
             limits: Joint name to limits [rad]; None where its positions are not angles.

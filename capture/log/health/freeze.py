@@ -139,12 +139,7 @@ class FreezeTally:
     """The longest time that joints of one series stood while a series of commands moved."""
 
     def __init__(self, names: tuple[str, ...], commanded: tuple[str, ...]) -> None:
-        """Start with nothing seen.
-
-        Args:
-            names: Joints that are measured.
-            commanded: Joints that are commanded.
-        """
+        """Start with nothing seen."""
         place = {name: k for k, name in reversed([*enumerate(commanded)])}
         self.columns = tuple(k for k, name in enumerate(names) if name in place)
         """Places in ``names`` of the joints of both, m of them."""

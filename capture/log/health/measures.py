@@ -13,7 +13,6 @@ class SeriesHealth:
 
     Attributes:
         topic: The channel's topic.
-        type_name: Its type.
         names: Joints or values; empty for other types.
         timing: Its rhythm, by header.stamp where there is one, else by log time.
         first_log_ns: First log time [Unix ns].
@@ -42,9 +41,6 @@ class ChannelHealth:
     """One channel.
 
     Attributes:
-        topic: Its topic.
-        type_name: Its type.
-        count: Messages read.
         unread: Messages that can't be decoded.
         sequence: What its sequence numbers prove.
     """
@@ -61,10 +57,6 @@ class JointHealth:
     """One joint of one JointState topic.
 
     Attributes:
-        topic: The topic.
-        name: The joint.
-        samples: Angles seen.
-        nan: Angles that are NaN.
         at_limit: Part of the angles at or beyond the robot's limits; None without limits.
         frozen_s: Longest time that it stood while its command moved [s]; None without command.
         frozen_at_ns: When that began [Unix ns].
@@ -107,7 +99,6 @@ class BusHealth:
 
     Attributes:
         topic: E.g. ``/can/can0``.
-        frames: Frames, error frames included.
         rate_hz: Mean rate [Hz].
         error_frames: Frames that report an error.
         longest_s: Longest time without a frame [s].

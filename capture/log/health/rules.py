@@ -60,14 +60,7 @@ that was not read again repeats its last stamp. It has no rhythm that could be d
 
 
 def judge_file(health: FileHealth) -> list[Finding]:
-    """Findings on the container.
-
-    Args:
-        health: Its measures.
-
-    Returns:
-        The findings.
-    """
+    """Findings on the container."""
     found = [Finding(2, sentence) for sentence in health.damage]
     if health.unfinished:
         found.append(Finding(0 if health.running else 1, health.unfinished))
@@ -88,14 +81,7 @@ def judge_file(health: FileHealth) -> list[Finding]:
 
 
 def judge_channel(health: ChannelHealth) -> list[Fault]:
-    """Return what is wrong with one channel.
-
-    Args:
-        health: Its measures.
-
-    Returns:
-        The faults.
-    """
+    """Return what is wrong with one channel."""
     found: list[Fault] = []
 
     def add(weight: int, text: str) -> None:
@@ -118,11 +104,7 @@ def judge_channel(health: ChannelHealth) -> list[Fault]:
 
 
 def has_rhythm(topic: str) -> bool:
-    """Whether a topic is one whose rhythm is judged.
-
-    Args:
-        topic: Its name.
-    """
+    """Whether a topic is one whose rhythm is judged."""
     return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
 
 
@@ -130,7 +112,6 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault
     """Return what is wrong with the rhythm of one series.
 
     Args:
-        health: Its measures.
         start_ns: Log time of the session's first message [Unix ns].
         end_ns: Log time of its last message [Unix ns].
 
@@ -207,9 +188,6 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
     Args:
         joints: Measures of all joints of all topics.
         start_ns: Start of the session [Unix ns].
-
-    Returns:
-        The faults.
     """
     found: list[Fault] = []
     for joint in joints:
@@ -233,9 +211,6 @@ def judge_body(joints: Sequence[JointHealth]) -> list[Finding]:
 
     Args:
         joints: Measures of all joints of all topics.
-
-    Returns:
-        The findings.
     """
     measured = [joint for joint in joints if joint.topic == "/joint_states"]
     names = {joint.name for joint in measured}
@@ -269,14 +244,7 @@ def judge_following(fault: JointFault) -> Finding:
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:
-    """Findings on a bus.
-
-    Args:
-        health: Its measures.
-
-    Returns:
-        The findings.
-    """
+    """Findings on a bus."""
     found: list[Finding] = []
     if health.error_frames:
         part = health.error_frames / health.frames
@@ -297,9 +265,6 @@ def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
     Args:
         buses: Measures of all topics of frames.
         start_ns: Start of the session [Unix ns].
-
-    Returns:
-        The findings.
     """
     silences: dict[str, tuple[str, int, int]] = {}
     for bus in buses:
@@ -356,9 +321,6 @@ def judge_topics(
 
 def verdict_of(findings: Iterable[Finding]) -> str:
     """The verdict: that of the heaviest finding, ``good`` without any.
-
-    Args:
-        findings: All findings.
 
     Returns:
         One of :data:`VERDICTS`.

@@ -35,11 +35,9 @@ class SessionHealth(SessionMeasures):
     """The health of a session in a file.
 
     Attributes:
-        path: The file.
         session_id: Its id, or the file's name.
         stored: The verdict stored by whoever recorded it, or None.
         stored_reasons: The reasons stored with it.
-        file: The container.
         following: Joints that do not follow their command: only the whole file shows them, so a
             recorder's verdict is without.
     """
@@ -70,9 +68,6 @@ def check_session(
     Args:
         path: An MCAP file, of any make; of a split session any part, or the folder.
         on_part: Told how much has been read, 0 to 1.
-
-    Returns:
-        Its health.
 
     Raises:
         NotALogError: If it is not an MCAP file or nothing in it can be read.

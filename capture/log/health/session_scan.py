@@ -52,10 +52,7 @@ class SessionMeasures:
         start_ns: Log time of the first message [Unix ns]; 0 without messages.
         end_ns: Log time of the last.
         findings: All that was found, heaviest first.
-        channels: By topic.
-        series: By topic and names.
         joints: By topic, in the order of the messages.
-        buses: By topic.
         sources: As the recorder counted them, by name.
     """
 
@@ -95,7 +92,6 @@ class ChannelMeasures:
     """What one channel's messages say.
 
     Attributes:
-        channel: Counts and sequence numbers.
         series: One for each set of names.
     """
 
@@ -127,11 +123,7 @@ class SessionScan:
         return tuple(self._scans)
 
     def has(self, key: int) -> bool:
-        """Whether a channel is defined.
-
-        Args:
-            key: The channel.
-        """
+        """Whether a channel is defined."""
         return key in self._scans
 
     def define(
@@ -146,7 +138,6 @@ class SessionScan:
 
         Args:
             key: The channel's id.
-            topic: Its topic.
             type_name: Its type, by name.
             kind: Its type; None where it can't be read: only times are looked at then.
             metadata: Of the channel, e.g. ``unit``.
@@ -165,7 +156,6 @@ class SessionScan:
         """Take messages of one channel.
 
         Args:
-            key: The channel.
             data: Bytes that hold their records.
             offsets: Where the records start, in the order of the session, shape (n,).
             heads: The records' heads, of :data:`.capture.log.mcap.records.HEAD`, shape (n,).
@@ -173,28 +163,16 @@ class SessionScan:
         self._scans[key].add(data, offsets, heads)
 
     def count(self, key: int) -> int:
-        """Messages of a channel so far.
-
-        Args:
-            key: The channel.
-        """
+        """Messages of a channel so far."""
         self._scans[key].flush()
         return self._scans[key].count
 
     def topic(self, key: int) -> str:
-        """Topic of a channel.
-
-        Args:
-            key: The channel.
-        """
+        """Topic of a channel."""
         return self._scans[key].topic
 
     def measure(self, key: int) -> ChannelMeasures:
-        """What a channel's messages say so far.
-
-        Args:
-            key: The channel.
-        """
+        """What a channel's messages say so far."""
         scan, type_name = self._scans[key], self._types[key]
         scan.flush()
         return ChannelMeasures(

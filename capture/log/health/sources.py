@@ -37,7 +37,6 @@ class SourceHealth:
 
     Attributes:
         name: E.g. ``can0``.
-        frames: Frames taken.
         dropped: Frames that the source's own counters prove lost before the recorder; None where
             it has none.
         malformed: Packets or lines that could not be read.
@@ -60,7 +59,6 @@ def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, 
 
     Args:
         kind: The message's type.
-        message: Its bytes.
 
     Returns:
         The statuses in the message's order.
@@ -86,7 +84,6 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
     """The sources of a recording between its first and its last diagnostics.
 
     Args:
-        kind: The messages' type.
         first: The first message of ``/diagnostics`` in the file.
         last: The last one.
 
@@ -127,14 +124,7 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
 
 
 def judge_source(source: SourceHealth) -> list[Finding]:
-    """Findings on one source.
-
-    Args:
-        source: What the recorder counted.
-
-    Returns:
-        The findings.
-    """
+    """Findings on one source."""
     found: list[Finding] = []
     label = f"source {source.name}"
     if not source.frames:

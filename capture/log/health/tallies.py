@@ -47,7 +47,6 @@ class Timing:
     """The rhythm of one series.
 
     Attributes:
-        count: Samples.
         first_ns: Earliest time [Unix ns]; 0 without samples.
         last_ns: Latest time [Unix ns]; 0 without samples.
         median_s: Median interval [s], None where there is no interval forward.

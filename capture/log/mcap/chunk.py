@@ -108,7 +108,6 @@ def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
 
     Args:
         compression: ``zstd`` or ``lz4``.
-        raw: The compressed bytes.
         size: Declared size of the whole payload [byte].
         whole: False where the end of the file cuts ``raw`` short.
 
@@ -170,8 +169,6 @@ def read_at(descriptor: int, start: int, stop: int) -> memoryview:
     Through a mapping its pages would stay in this process's memory, and each costs a fault.
 
     Args:
-        descriptor: The file.
-        start: First byte.
         stop: One past the last byte.
 
     Returns:
@@ -192,9 +189,6 @@ def read_at(descriptor: int, start: int, stop: int) -> memoryview:
 def checks_itself(raw: memoryview) -> bool:
     """Whether a zstd frame has a checksum of its content: decompression verifies it.
 
-    Args:
-        raw: The frame.
-
     Returns:
         Whether it has; False for what is no zstd frame.
     """
@@ -208,7 +202,6 @@ def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int
     """Walk records back to back.
 
     Args:
-        data: The bytes.
         start: Offset of the first record's opcode.
         stop: One past the last byte to look at.
 
@@ -232,7 +225,6 @@ def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
     """Search for a whole compressed chunk where the chain of records is broken.
 
     Args:
-        data: The bytes.
         start: First place to look at.
         stop: One past the last byte.
 

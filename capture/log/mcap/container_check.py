@@ -101,10 +101,6 @@ def check_container(path: Path) -> Container:
 def check_chunk(path: Path, place: ChunkPlace) -> str | None:
     """Check one chunk's payload against its CRC.
 
-    Args:
-        path: The file.
-        place: The chunk.
-
     Returns:
         What is wrong, or None.
     """

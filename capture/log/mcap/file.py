@@ -49,12 +49,7 @@ class McapContents:
     """What is known of an MCAP file; grows while its records are walked.
 
     Attributes:
-        path: The file.
         profile: As its header has it, and so is ``library``.
-        library: Who wrote it.
-        schemas: By id.
-        channels: By id.
-        blocks: Where its messages are.
         counts: Channel id to number of messages.
         metadata: By name; records of one name are put together.
         attachments: By name, of several the last.
@@ -82,7 +77,6 @@ class McapContents:
         Args:
             opcode: Its kind; others than those below are passed over.
             data: The bytes that it is in.
-            start: Where its body begins.
             stop: One past its body's last byte.
 
         Raises:
@@ -114,11 +108,7 @@ class McapContents:
         Args:
             read: The reader of its kind.
             data: The bytes that it is in.
-            start: Where its body begins.
             stop: One past its body's last byte.
-
-        Returns:
-            The record.
 
         Raises:
             LogError: If it claims more bytes than there is memory for.
@@ -132,7 +122,6 @@ class McapContents:
         """Walk a block without index; its schemas and channels are noted.
 
         Args:
-            block: The block.
             data: The bytes that its payload is in.
             base: Where in them the payload begins.
 
@@ -182,7 +171,6 @@ def read_contents(file: McapPayloads, *, bare: bool) -> McapContents:
     """Find what a file holds.
 
     Args:
-        file: The file.
         bare: Take it without any channel too: a write-ahead log or another part has them.
 
     Returns:
@@ -223,11 +211,7 @@ class _Summary:
         self._held = held
 
     def read(self) -> None:
-        """Fill in everything.
-
-        Raises:
-            _NoSummaryError: If the file has no whole summary; says why.
-        """
+        """Fill in everything."""
         buffer, held = self._buffer, self._held
         summary_start, footer = self._range()
         indexes: list[tuple[int, int]] = []  # opcode of the indexed record, its offset
@@ -422,7 +406,6 @@ class McapFile(McapPayloads):
         """Open a file and find what it holds.
 
         Args:
-            path: The MCAP file.
             bare: Take it without any channel too: a write-ahead log or another part has them.
 
         Raises:

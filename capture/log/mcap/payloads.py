@@ -24,7 +24,6 @@ class _Cache:
     """Payloads that were decompressed last, of all open files together.
 
     Attributes:
-        owners: Numbers of files.
         abandoned: Those that nothing uses any more. The garbage collector adds to it in the middle
             of anything, also of what holds the lock, which it therefore must not take.
     """
@@ -72,9 +71,6 @@ class McapPayloads:
 
     def __init__(self, path: Path) -> None:
         """Map a file.
-
-        Args:
-            path: The MCAP file.
 
         Raises:
             NotALogError: If it is empty.

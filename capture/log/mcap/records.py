@@ -23,9 +23,6 @@ class BlockSource(Protocol):
     def payload(self, block: Block) -> tuple[Buffer, int]:
         """The uncompressed bytes of a block, and where in them the message offsets count from.
 
-        Args:
-            block: One of its blocks.
-
         Returns:
             A buffer and the base offset (0 unless the block is unchunked).
 
@@ -36,9 +33,6 @@ class BlockSource(Protocol):
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
         """The uncompressed bytes of a block, checked, and not kept in memory for later.
-
-        Args:
-            block: One of its blocks.
 
         Returns:
             A buffer, and the first and one past the last byte of the payload in it.
@@ -52,7 +46,6 @@ class BlockSource(Protocol):
         """Whether :meth:`inflate_into` can be used: a whole zstd chunk of no more than ``limit``.
 
         Args:
-            block: One of its blocks.
             limit: Largest size wanted [byte].
 
         Returns:
@@ -77,10 +70,6 @@ class BlockSource(Protocol):
     def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
         """Where the message records of some channels start in a block's payload, unchecked.
 
-        Args:
-            block: One of its blocks.
-            channel_ids: The channels.
-
         Returns:
             For each channel the offsets of its records' opcode bytes, shape (n,), in the order of
             the index; they may be views of the file, to be let go of before it is closed.
@@ -92,10 +81,6 @@ class BlockSource(Protocol):
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
         """Where a channel's message records start in a block's payload.
-
-        Args:
-            block: One of its blocks.
-            channel_id: The channel.
 
         Returns:
             Offsets of the records' opcode bytes, shape (n,), in the order of the index.
@@ -149,9 +134,7 @@ def gather(
     """Records of one type at any offsets: an overlapping view with a stride of one byte.
 
     Args:
-        data: The bytes.
         at: Where to count from, shape (n,).
-        kind: Their type.
         shift: Where the records start, from there; all are whole.
 
     Returns:
@@ -167,7 +150,6 @@ class Places:
     """Where messages start in a buffer.
 
     Attributes:
-        data: The buffer.
         at: Offsets, shape (n,).
         step: From each to the next, if they are evenly spaced and whole; otherwise None.
     """
@@ -198,7 +180,6 @@ class Places:
         """What lies at the same place in each.
 
         Args:
-            kind: Its type.
             shift: Offset from the message's start, not negative.
 
         Returns:
@@ -213,8 +194,6 @@ class Places:
         """Runs of numbers that lie at the same place in each.
 
         Args:
-            kind: Type of a number.
-            count: Numbers in a run.
             shift: Offset from the message's start.
 
         Returns:

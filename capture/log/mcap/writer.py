@@ -93,7 +93,6 @@ class McapWriter:
         """Write to a stream; :meth:`start` begins.
 
         Args:
-            stream: Where to.
             chunk_size: A chunk is written when it has more bytes than this.
             group_of: Topic and name of the type to the group of a channel: those of one group
                 share chunks. None for one group, named "".
@@ -130,7 +129,6 @@ class McapWriter:
 
         Args:
             profile: E.g. ``ros2``.
-            library: Who writes it.
 
         Raises:
             OSError: If the stream can't take it.
@@ -142,9 +140,7 @@ class McapWriter:
         """Register a type.
 
         Args:
-            name: Its name.
             encoding: E.g. ``ros2msg``.
-            data: Its text.
 
         Returns:
             Its id: 1, 2 and so on.
@@ -168,10 +164,7 @@ class McapWriter:
         """Register a channel.
 
         Args:
-            topic: Its topic.
             message_encoding: E.g. ``cdr``.
-            schema_id: Its type.
-            metadata: Further facts.
 
         Returns:
             Its id: 1, 2 and so on.
@@ -199,7 +192,6 @@ class McapWriter:
         Args:
             channel_id: Its channel, which is registered.
             log_time: When it was recorded [Unix ns].
-            data: Its bytes.
             publish_time: When it was sampled [Unix ns].
             sequence: The channel's own counter.
 
@@ -236,9 +228,6 @@ class McapWriter:
         Args:
             create_time: When it was made [Unix ns], 0 if unknown.
             log_time: When it was recorded [Unix ns].
-            name: Its name.
-            media_type: Its media type.
-            data: Its bytes.
 
         Raises:
             OSError: If the stream can't take it.
@@ -262,7 +251,6 @@ class McapWriter:
 
         Args:
             name: The record's name.
-            data: The pairs.
 
         Raises:
             OSError: If the stream can't take it.

@@ -58,7 +58,6 @@ class Layout:
         length: Message length [byte].
         leaves: All numbers, by path.
         strings: All strings of the example, by path.
-        example: The example message.
         hull: Byte ranges outside the leaves, as (start, stop), half-open; padding included.
         static: Indices of the bytes that every message of the layout has in common: strings and
             sequence lengths, without padding (which a foreign writer may leave undefined).
@@ -74,9 +73,6 @@ class Layout:
     def fits(self, message: bytes) -> bool:
         """Whether a message surely has this layout.
 
-        Args:
-            message: Its bytes.
-
         Returns:
             False also where it differs in padding alone.
         """
@@ -89,7 +85,6 @@ def layout_of(message_type: MessageType, message: bytes) -> Layout:
     """Find the layout of a message.
 
     Args:
-        message_type: Its type.
         message: One CDR message, encapsulation header included.
 
     Returns:
@@ -195,7 +190,6 @@ def encode(message_type: MessageType, values: Mapping[str, Any]) -> bytes:
     """Encode one message, field by field (for templates and rare messages).
 
     Args:
-        message_type: Its type.
         values: Field name to value: numbers, strings, mappings for nested messages, sequences for
             arrays. A field left out is zero, empty, or (fixed array) zeros.
 

@@ -70,7 +70,6 @@ class Field:
     """One field of a message.
 
     Attributes:
-        name: Field name.
         base: A key of :data:`PRIMITIVES`, ``string``, ``wstring``, or None for a nested message.
         nested: The nested message type, or None.
         length: 1 for a plain field, n for a fixed array, None for a sequence.
@@ -106,7 +105,6 @@ def parse_message_type(name: str, text: str) -> MessageType:
 
     Args:
         name: Full name of the main type, e.g. ``sensor_msgs/msg/JointState``.
-        text: The schema text.
 
     Returns:
         The type with all dependencies resolved.
@@ -279,9 +277,6 @@ def message_type(name: str) -> MessageType:
     Args:
         name: Full name, e.g. ``sensor_msgs/msg/JointState``.
 
-    Returns:
-        The type.
-
     Raises:
         DataError: If the log contract doesn't use that type.
     """
@@ -315,7 +310,6 @@ class DiagnosticStatus:
     Attributes:
         level: :data:`OK`, :data:`WARN`, :data:`ERROR` or :data:`STALE`.
         name: The component, e.g. ``source can0``.
-        message: One sentence.
         hardware_id: The device, e.g. ``can:socketcan:can0``; empty where there is none.
         values: Further facts; numbers as text.
     """
@@ -351,13 +345,6 @@ def is_latched(type_name: str, channel: Channel) -> bool:
 
     A String, static transforms, or what a ROS 2 recorder noted as durability transient local
     (``offered_qos_profiles``, https://github.com/ros2/rosbag2).
-
-    Args:
-        type_name: The messages' type.
-        channel: The channel.
-
-    Returns:
-        True for those.
     """
     if type_name == "std_msgs/msg/String":
         return True
@@ -367,9 +354,6 @@ def is_latched(type_name: str, channel: Channel) -> bool:
 
 def adds_up(channel: Channel) -> bool:
     """Whether every different message stays in force, not only the last.
-
-    Args:
-        channel: The channel.
 
     Returns:
         True for static transforms: each message holds some of them.

@@ -108,9 +108,6 @@ def bus_of(topic: str) -> str:
 def empty_frames(count: int) -> FrameArray:
     """An array of zeroed frame records.
 
-    Args:
-        count: Number of records.
-
     Returns:
         Shape (count,), every byte zero, padding included.
     """
@@ -119,9 +116,6 @@ def empty_frames(count: int) -> FrameArray:
 
 def empty_fd_frames(count: int) -> FrameArray:
     """An array of zeroed records of CAN FD frames.
-
-    Args:
-        count: Number of records.
 
     Returns:
         Records of :data:`FD_FRAME_DTYPE`, shape (count,), every byte zero, padding included.
@@ -207,7 +201,6 @@ def join_batches(
     Args:
         batches: For messages of one size: their log times [Unix ns], shape (n,), their places in
             the file, shape (n,), and their frames, shape (n, frames a message).
-        dtype: Layout of the frames.
 
     Returns:
         The frames of all messages, by log time and then place, shape (total,).
@@ -236,9 +229,6 @@ def join_batches(
 
 def identifier_text(id_flags: int) -> str:
     """Return an identifier as candump writes it: three hexadecimal digits, or eight if extended.
-
-    Args:
-        id_flags: Identifier with flags.
 
     Returns:
         E.g. ``14B`` or ``18FEF100``.
@@ -291,10 +281,6 @@ def frame_message(
     Args:
         frames: Records of ``dtype``, shape (n,).
         label: What the message says of a record's layout.
-        dtype: The layout.
-
-    Returns:
-        The CDR message.
     """
     head, size = _head(label, dtype.itemsize), len(frames) * dtype.itemsize
     pair, count = _PAIR.pack(len(frames), size), _COUNT.pack(size)
@@ -309,7 +295,6 @@ def records_at(
     Args:
         message: A CDR message, or its beginning and all that follows of it.
         label: What it has to say of a record's layout.
-        dtype: The layout.
 
     Returns:
         Offset of the first record and number of records; None for any other message, also where

@@ -51,9 +51,6 @@ def rows_of(group: Group, field: str) -> JointRows:
     Args:
         group: JointState messages of one layout.
         field: ``position``, ``velocity`` or ``effort``.
-
-    Returns:
-        Names, times and values.
     """
     log_ns = group.times()
     stamp_ns = group.stamps() if group.is_stamped else np.zeros_like(log_ns)
@@ -71,8 +68,6 @@ def merge_rows(
 
     Args:
         rows: The messages, by layout.
-        topic: For the warnings.
-        field: For the warnings.
         warn: Takes one sentence for each irregularity.
 
     Returns:
@@ -175,7 +170,6 @@ def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
     """Whether what was read goes beyond a window at both ends, in order, so nothing is missing.
 
     Args:
-        found: Topic to messages.
         window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
 
     Returns:
@@ -235,9 +229,6 @@ class JointReader:
         """Keep what reading needs.
 
         Args:
-            path: The file, for messages.
-            topics: Its topics.
-            clock: Of its header stamps.
             warn: Takes one sentence for each irregularity.
         """
         self._path = path
@@ -302,7 +293,6 @@ class JointReader:
         """Make signals of what was read.
 
         Args:
-            wanted: Topic to fields.
             found: What was read for :meth:`requests`.
             window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
             chain: Joint names head to tail; joints not in it come after it.

@@ -31,8 +31,6 @@ class OpenLog:
 
     Attributes:
         path: The file, or the folder of a split session.
-        file: The open file.
-        topics: Its topics.
         warnings: What is missing or doubtful, one sentence each; grows while columns are read.
     """
 

@@ -199,7 +199,6 @@ class Series:
     """Samples of some joints.
 
     Attributes:
-        names: The joints.
         t_ns: Message stamps [Unix ns], not decreasing, one array a joint; joints that were
             sampled together share one array.
         values: One array of shape (n_j,) a joint.
@@ -214,7 +213,6 @@ def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]
     """Sampling times of several series whose joints have the same offsets.
 
     Args:
-        stamped: The series.
         offsets: Sample time minus stamp [s]. Its memory may be used for the times: don't look at
             it afterwards.
 

@@ -52,7 +52,6 @@ class SessionView:
         """Keep what is seen of a log; :meth:`.Session.open` and :meth:`view` call this.
 
         Args:
-            log: The open log.
             window_ns: Half-open window of what is read [Unix ns]; None for open ends.
             names: Name of a topic to the name that it was logged by, where these differ.
             on_read: Called before each read.

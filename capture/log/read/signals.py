@@ -18,8 +18,6 @@ class Signal:
     """Samples of one quantity of one joint.
 
     Attributes:
-        name: Joint name.
-        unit: Unit of the values.
         t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
         values: Shape (n,).
     """
@@ -37,8 +35,6 @@ class JointSignals:
     Attributes:
         topic: Where it was read from.
         field: ``position``, ``velocity`` or ``effort`` of the JointState.
-        unit: Unit of the values.
-        names: Joint names.
         t_ns: Sampling times [Unix ns], one array of shape (n_j,) a joint. Joints that were sampled
             together share one array.
         values: One array of shape (n_j,) a joint; NaN samples are kept.
@@ -59,12 +55,6 @@ class JointSignals:
     def signal(self, name: str) -> Signal:
         """The samples of one joint.
 
-        Args:
-            name: Joint name.
-
-        Returns:
-            Its samples.
-
         Raises:
             DataError: If there is no such joint.
         """
@@ -78,9 +68,6 @@ class JointSignals:
 
         Args:
             names: Joint names, in the order wanted.
-
-        Returns:
-            Their samples.
 
         Raises:
             DataError: If there is no such joint.

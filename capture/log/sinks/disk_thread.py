@@ -29,7 +29,6 @@ class PartStream:
     """A file whose writing is put off: the MCAP writer never waits for the disk.
 
     Attributes:
-        path: The file.
         number: The part, from 1.
         size: Bytes of the part so far, written or not.
     """
@@ -38,7 +37,6 @@ class PartStream:
         """Create the file.
 
         Args:
-            path: The file to create.
             number: The part, from 1.
             force: Put it in the place of an existing one, which whoever reads it goes on reading.
 
@@ -65,14 +63,7 @@ class PartStream:
     # -- for the MCAP writer ---------------------------------------------------------------
 
     def write(self, data: bytes) -> int:
-        """Queue bytes.
-
-        Args:
-            data: The bytes.
-
-        Returns:
-            How many.
-        """
+        """Queue bytes."""
         if data:
             self._pieces.append(data)
             self.size += len(data)
@@ -94,12 +85,6 @@ class PartStream:
 
     def put(self, data: memoryview) -> int:
         """Write bytes to the file.
-
-        Args:
-            data: The bytes.
-
-        Returns:
-            How many were written.
 
         Raises:
             OSError: If none were.
@@ -215,7 +200,6 @@ class DiskThread:
         """Hand over what a part has queued.
 
         Args:
-            part: The part.
             covered: Position of the last message that is in it then.
         """
         pieces = part.take()
@@ -228,7 +212,6 @@ class DiskThread:
         """Hand over a part to be finalised.
 
         Args:
-            part: The part.
             writer: Its writer; not to be used any more.
             last: Metadata that belong at its end.
             covered: Position of its last message.

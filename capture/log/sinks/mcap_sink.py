@@ -28,7 +28,6 @@ def chunk_group(topic: str, type_name: str) -> str:
     """The group of a channel; those of one group share chunks.
 
     Args:
-        topic: Its topic.
         type_name: Its message type, e.g. ``sensor_msgs/msg/Imu``.
 
     Returns:
@@ -67,11 +66,9 @@ class MessageSink(Protocol):
         """Take one message.
 
         Args:
-            channel_id: Its channel.
             log_time_ns: When it was recorded [Unix ns].
             publish_time_ns: When it was sampled [Unix ns].
             sequence: The channel's own counter.
-            payload: Its bytes.
 
         Raises:
             LogWriteError: If it can't be kept; it is not in the log then.
@@ -99,10 +96,6 @@ class McapSink:
 
     def __init__(self, path: Path | str, *, force: bool = False) -> None:
         """Create the file.
-
-        Args:
-            path: The file to create.
-            force: Replace an existing file.
 
         Raises:
             OutputExistsError: If the file is there and ``force`` is not given.
@@ -170,7 +163,6 @@ def write_description(writer: McapWriter, record: Description) -> None:
     """Write a record that explains messages.
 
     Args:
-        writer: Where to.
         record: A schema, channel, attachment or metadata record.
 
     Raises:
@@ -200,7 +192,6 @@ def write_error(path: Path, error: OSError) -> LogWriteError:
 
     Args:
         path: The file that can't be written.
-        error: What was raised.
 
     Returns:
         The error to raise; the same one where it is ours already.
@@ -212,13 +203,6 @@ def write_error(path: Path, error: OSError) -> LogWriteError:
 
 def create_file(path: Path, *, force: bool) -> BinaryIO:
     """Create a file to write.
-
-    Args:
-        path: The file.
-        force: Replace an existing one.
-
-    Returns:
-        The open file.
 
     Raises:
         OutputExistsError: If it is there and ``force`` is not given.

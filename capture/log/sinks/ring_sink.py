@@ -46,8 +46,6 @@ class Mark:
     """One mark, written or not.
 
     Attributes:
-        path: Its file.
-        messages: Messages in the file.
         start_ns: Log time of the first one [Unix ns]; None without any.
         stop_ns: Log time of the last one [Unix ns]; None without any.
         error: Why the file is not whole; None when it is.
@@ -65,8 +63,6 @@ class Snapshot:
     """What a mark holds.
 
     Attributes:
-        path: The file to write.
-        definitions: What explains the messages.
         facts: Entries of :data:`MARK_RECORD`.
         carried: What was in force before the first message.
         messages: The ring's messages.
@@ -106,11 +102,7 @@ class MarkWriter:
         return tuple(self._done)
 
     def add(self, snapshot: Snapshot) -> None:
-        """Have a mark written.
-
-        Args:
-            snapshot: What it holds.
-        """
+        """Have a mark written."""
         with self._lock:
             self._asked += 1
             self._waiting.append(snapshot)

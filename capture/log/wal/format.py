@@ -46,9 +46,6 @@ class WalLock:
     def __init__(self, folder: Path) -> None:
         """Take the lock.
 
-        Args:
-            folder: The log.
-
         Raises:
             LogWriteError: If another recorder holds it, or the folder can't be written.
         """
@@ -74,9 +71,6 @@ class WalLock:
 
 def is_live(folder: Path) -> bool:
     """Whether a recorder is writing a log at the moment.
-
-    Args:
-        folder: The log.
 
     Returns:
         True while the recorder lives; on a file system without locks, False.
@@ -139,9 +133,7 @@ class RecordHead(NamedTuple):
     """What stands before a payload.
 
     Attributes:
-        length: Bytes of payload.
         position: Running number in its stream, from 1.
-        kind: MCAP opcode.
         mark: :data:`MARK`.
         channel_id: MCAP channel; 0 for a definition.
         sequence: The message's own counter.
@@ -217,9 +209,6 @@ def segment_name(stream: int, number: int) -> str:
 def segment_files(folder: Path) -> list[tuple[int, int, Path]]:
     """The segments in a folder.
 
-    Args:
-        folder: The log.
-
     Returns:
         Stream, number and path of each, sorted by stream and number.
 
@@ -252,11 +241,7 @@ def unpack_definition(kind: int, payload: bytes) -> Definition:
     """Read a definition.
 
     Args:
-        kind: Its MCAP opcode.
         payload: The body of the MCAP record.
-
-    Returns:
-        The record.
 
     Raises:
         McapError: If the body ends too early.

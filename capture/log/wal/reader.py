@@ -48,11 +48,8 @@ class WalMessage(NamedTuple):
 
     Attributes:
         position: Its place among all messages of the session, from 1.
-        channel_id: Its MCAP channel.
-        sequence: Its own counter.
         log_time_ns: When it was recorded [Unix ns].
         publish_time_ns: When it was sampled [Unix ns].
-        payload: Its bytes.
     """
 
     position: int
@@ -86,9 +83,6 @@ class Recovery(Iterator[WalMessage]):
 
     def __init__(self, folder: Path) -> None:
         """Open a log; :func:`recover` does.
-
-        Args:
-            folder: The log.
 
         Raises:
             NotALogError: If there is no segment, or no header of one can be read.
@@ -311,12 +305,7 @@ class _SegmentReader:
         return head if crc == RECORD_CRC.unpack_from(raw)[0] else None
 
     def _search(self, at: int) -> tuple[tuple[int, RecordHead] | None, int]:
-        """The next whole record behind a place where none is.
-
-        Returns:
-            Its place and head, or None; and where the damage ends: there, or one past the last
-            byte that isn't zero (``at`` itself where nothing but zeros follow).
-        """
+        """The next whole record behind a place where none is."""
         damage_stop = at
         start, size = at, _FIRST_LOOK
         while start < self._end:

@@ -79,8 +79,6 @@ class _Mapping:
     """One mapped file.
 
     Attributes:
-        address: Where it begins.
-        size: Its bytes.
         cut: Called when a store found it cut short; must not store to the mapping.
     """
 
@@ -149,8 +147,6 @@ def watch_mapping(address: int, size: int, cut: Callable[[], None]) -> Callable[
     """Keep a mapped file's process alive when the file is cut short.
 
     Args:
-        address: Where the mapping begins.
-        size: Its bytes.
         cut: Called, in the thread that stored, when a store found the file too short; must not
             store to the mapping. What is stored there from then on is only in memory.
 
@@ -218,7 +214,6 @@ class Segment:
         A sparse mapping would do until the disk is full, and then end the process with SIGBUS.
 
         Args:
-            path: The file to create.
             header: What it says of itself; ``size`` is a multiple of 8.
 
         Raises:
@@ -259,7 +254,6 @@ class Segment:
 
         Args:
             fields: What stands before the payload, from the running number on.
-            payload: Its bytes.
 
         Returns:
             Whether there was room; where there wasn't, nothing is written.
@@ -343,11 +337,7 @@ class Segment:
         return start + ahead - stop
 
     def close(self, *, remove: bool) -> None:
-        """Release the mapping.
-
-        Args:
-            remove: Delete the file too.
-        """
+        """Release the mapping."""
         self._end = 0
         self._unwatch()
         self._view.close()
@@ -376,18 +366,12 @@ def new_header(stream: int, number: int, size: int, log_id: bytes) -> SegmentHea
         number: Its place in the stream, from 1.
         size: Bytes wanted; rounded up to a multiple of 8.
         log_id: The log's 16 bytes.
-
-    Returns:
-        The header.
     """
     return SegmentHeader(stream, secrets.randbits(32), number, (size + 7) & -8, log_id)
 
 
 def sync_folder(folder: Path) -> None:
     """Bring a folder's entries to the disk, so that a new file's name survives power loss.
-
-    Args:
-        folder: The folder.
 
     Raises:
         OSError: If the disk fails.
@@ -451,11 +435,7 @@ class Ballast:
             ) from error
 
     def free(self) -> bool:
-        """Give the space back.
-
-        Returns:
-            Whether there was any.
-        """
+        """Give the space back."""
         there, self._there = self._there, False
         if there:
             with suppress(OSError):  # someone else may have tidied up

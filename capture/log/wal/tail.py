@@ -29,7 +29,6 @@ class WalContents:
     """All that a write-ahead log holds.
 
     Attributes:
-        folder: The log.
         definitions: Headers, schemas, channels, metadata, attachments, in the order given.
         messages: In the order they were accepted.
         live: Whether a recorder is writing it.
@@ -153,7 +152,6 @@ def beyond(messages: Iterable[WalMessage], known: Collection[MessageKey]) -> lis
     """The messages that a file lacks.
 
     Args:
-        messages: Of the write-ahead log.
         known: Of the file: at least its last ones, as many as the log has.
 
     Returns:

@@ -67,9 +67,6 @@ _HELD = 2 << 20  # bytes ahead of the writing: a second of two saturated buses
 def wal_folder(path: Path | str) -> Path:
     """Where the write-ahead log of a session file is.
 
-    Args:
-        path: The MCAP file.
-
     Returns:
         The folder beside it, e.g. ``run.mcap.wal``.
     """
@@ -195,7 +192,6 @@ class WriteAheadLog:
             log_time_ns: When it was recorded [Unix ns].
             publish_time_ns: When it was sampled [Unix ns].
             sequence: The message's own counter, 32 bits.
-            payload: Its bytes.
 
         Returns:
             Its position, for :meth:`release`.

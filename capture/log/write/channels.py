@@ -42,9 +42,7 @@ class Template:
     """A message of fixed layout, filled again for every sample.
 
     Attributes:
-        message: Its bytes.
         leaves: Where its numbers are, by path.
-        send: Writes a message.
     """
 
     message: bytearray
@@ -305,7 +303,6 @@ class StringChannel:
 
         Args:
             t_ns: Time [Unix ns].
-            text: The text.
             log_time_ns: Time of recording [Unix ns]; the time itself if None.
 
         Raises:
@@ -331,7 +328,6 @@ class LogChannel:
             t_ns: When it happened [Unix ns].
             level: ``debug``, ``info``, ``warn``, ``error`` or ``fatal``.
             name: Who says it, e.g. ``twin``.
-            text: One sentence.
             log_time_ns: Time of recording [Unix ns]; when it happened if None.
 
         Raises:
@@ -416,7 +412,6 @@ class DiagnosticsChannel:
 
         Args:
             t_ns: When [Unix ns].
-            statuses: One a component.
 
         Raises:
             LogWriteError: If the file can't be written.

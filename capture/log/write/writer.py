@@ -71,9 +71,6 @@ class ChannelOpeners(ABC):
             velocity: Whether samples carry velocities [rad/s].
             effort: Whether samples carry efforts [N m].
 
-        Returns:
-            The channel.
-
         Raises:
             DataError: If the topic is open already.
         """
@@ -95,9 +92,6 @@ class ChannelOpeners(ABC):
             frame: Frame of the pose, e.g. ``world``.
             child: The moving link; the velocity is given in its frame.
 
-        Returns:
-            The channel.
-
         Raises:
             DataError: If the topic is open already.
         """
@@ -109,11 +103,7 @@ class ChannelOpeners(ABC):
 
         Args:
             topic: E.g. ``/tf``.
-            parent: Frame of the poses.
             children: Names of the moving frames, k of them.
-
-        Returns:
-            The channel.
 
         Raises:
             DataError: If the topic is open already.
@@ -142,10 +132,6 @@ class ChannelOpeners(ABC):
             min_range: Shortest distance it can tell [m].
             max_range: Longest distance it can tell [m].
             field_of_view: Full cone angle [rad].
-            infrared: False for ultrasound.
-
-        Returns:
-            The channel.
 
         Raises:
             DataError: If the topic is open already.
@@ -168,9 +154,6 @@ class ChannelOpeners(ABC):
             topic: E.g. ``/imu``.
             frame: The sensor's frame.
 
-        Returns:
-            The channel.
-
         Raises:
             DataError: If the topic is open already.
         """
@@ -185,9 +168,6 @@ class ChannelOpeners(ABC):
             topic: E.g. ``/compass``.
             frame: The sensor's frame.
 
-        Returns:
-            The channel.
-
         Raises:
             DataError: If the topic is open already.
         """
@@ -200,9 +180,6 @@ class ChannelOpeners(ABC):
 
         Args:
             topic: E.g. ``/gait/mode``.
-
-        Returns:
-            The channel.
 
         Raises:
             DataError: If the topic is open already.
@@ -231,9 +208,6 @@ class ChannelOpeners(ABC):
         Args:
             topic: E.g. ``/can/can0``.
 
-        Returns:
-            The channel.
-
         Raises:
             DataError: If the topic is open already.
         """
@@ -244,9 +218,6 @@ class ChannelOpeners(ABC):
 
         Args:
             topic: E.g. ``/can_fd/can0``.
-
-        Returns:
-            The channel.
 
         Raises:
             DataError: If the topic is open already.
@@ -260,9 +231,6 @@ class ChannelOpeners(ABC):
             topic: E.g. ``/clock/can0``.
             source: Whose clock ``time_ref`` is on, e.g. ``can0``.
 
-        Returns:
-            The channel.
-
         Raises:
             DataError: If the topic is open already.
         """
@@ -274,9 +242,6 @@ class ChannelOpeners(ABC):
 
         Args:
             topic: E.g. ``/diagnostics``.
-
-        Returns:
-            The channel.
 
         Raises:
             DataError: If the topic is open already.
@@ -304,13 +269,6 @@ SensorWrite: TypeAlias = Callable[[FloatArray, int, int], None]
 
 def open_sensor(writer: ChannelOpeners, sensor: Sensor) -> SensorWrite:
     """Open a sensor's channel on the topic of its description; its frame has its name.
-
-    Args:
-        writer: The session.
-        sensor: The sensor.
-
-    Returns:
-        What writes one sample.
 
     Raises:
         DataError: If the topic is open already.
@@ -354,13 +312,11 @@ class SessionWriter(ChannelOpeners):
         """Open the session and write what explains it.
 
         Args:
-            path: The file to create.
             session_id: Names the session; the same for all its parts.
             epoch_ns: Unix time of the session's start [ns].
             robot: Its description travels as attachments ``robot.toml`` and its DBC files.
             clock: Source name to clock domain.
             metadata: Further facts, e.g. ``operator``; all values are strings.
-            force: Replace an existing file.
             sink: Where the records go, and who opens the file then: ``path`` only names the
                 session in errors and ``force`` has no meaning. The session closes it.
 
@@ -414,7 +370,6 @@ class SessionWriter(ChannelOpeners):
         Args:
             name: File name, e.g. ``scenario.toml``.
             media_type: Its media type, e.g. ``application/toml``.
-            data: Its bytes.
 
         Raises:
             LogWriteError: If the session can't be written.
@@ -426,7 +381,6 @@ class SessionWriter(ChannelOpeners):
 
         Args:
             name: Its name, e.g. ``undulog``.
-            facts: Its entries.
 
         Raises:
             LogWriteError: If the session can't be written.
@@ -453,7 +407,6 @@ class SessionWriter(ChannelOpeners):
 
         Args:
             name: Its name, e.g. ``undulog.clock``; another one of that name is replaced.
-            facts: Its entries.
         """
         self._last[name] = Metadata(name, dict(facts))
 

@@ -90,7 +90,6 @@ class MeanCycles:
     """Mean cycles of k channels.
 
     Attributes:
-        names: Of the channels.
         value: In the channels' unit, shape (k, p); the last phase is the first again.
         half: Half widths of the 95 % intervals, each phase by itself, NaN where one cycle is all
             there is, shape (k, p).
@@ -105,9 +104,6 @@ class MeanCycles:
     def of(self, name: str) -> tuple[FloatArray, FloatArray]:
         """One channel.
 
-        Args:
-            name: Its name.
-
         Returns:
             Value and half width, each of shape (p,).
 
@@ -119,9 +115,6 @@ class MeanCycles:
 
     def ordered(self, names: Sequence[str]) -> FloatArray:
         """Values as columns in another order.
-
-        Args:
-            names: Channel names.
 
         Returns:
             Shape (p, number of names); NaN columns where there is no such channel.
@@ -199,7 +192,6 @@ def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
 
     Args:
         tracks: The channels, each on its own times.
-        pace: The phase.
 
     Returns:
         Those of them that have a whole cycle; None where none has.

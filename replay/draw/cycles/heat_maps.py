@@ -55,7 +55,6 @@ def heat_maps(
 
     Args:
         analysis: The session's analysis, for its windows.
-        tables: The cycles.
         names: All joints, head to tail.
 
     Returns:
@@ -105,9 +104,6 @@ def log_maps(
     """Write the maps.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        maps: What to draw.
         named: Joints whose numbers below the maps carry a mark.
     """
     for shown in maps:

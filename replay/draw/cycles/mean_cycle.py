@@ -96,7 +96,6 @@ def read_channels(
     """Read what is averaged.
 
     Args:
-        session: The session.
         wanted: JointState topic to the fields that come.
         part_ns: Start and end of the part that is averaged [Unix ns].
 
@@ -127,10 +126,7 @@ def log_mean_cycle(
     """Average the cycles and write what comes out.
 
     Args:
-        rec: The recording.
         clock: The session's timelines; their rhythm is the phase, where one was logged.
-        channels: What is averaged.
-        look: How it is drawn.
         analysis: The session's analysis, for its window and what is wrong with samples, or None.
         warnings: Grows by a sentence where joints are left out.
 

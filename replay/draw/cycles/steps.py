@@ -120,9 +120,6 @@ def log_cycles(
     """Write the steps.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        tables: The cycles.
         palette: Colour by joint name.
 
     Returns:
@@ -158,7 +155,6 @@ def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray
     """When the cycles start and end.
 
     Args:
-        table: The cycles.
         start_ns: Unix time of the session's start [ns].
 
     Returns:
@@ -274,8 +270,6 @@ def log_charts(
     """Write the bars, valid for the whole session.
 
     Args:
-        rec: The recording.
-        found: The charts.
         palette: Colour by joint name.
         named: Joints whose bars carry a mark, a thin line on their left.
     """
@@ -306,14 +300,7 @@ def log_current(
     found: Sequence[Chart],
     tables: Sequence[CycleTable],
 ) -> None:
-    """Write the bars of the cycle at the time cursor.
-
-    Args:
-        rec: The recording.
-        clock: Its timelines.
-        found: The charts.
-        tables: The cycles.
-    """
+    """Write the bars of the cycle at the time cursor."""
     for chart in found:
         parts = [table for table in tables if table.quantity.key == chart.key]
         if parts:

@@ -55,9 +55,6 @@ def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:
 def changes(states: Sequence[str]) -> list[int]:
     """Indices at which the state differs from the one before.
 
-    Args:
-        states: One state a message.
-
     Returns:
         Indices, the first message's included.
     """
@@ -70,9 +67,6 @@ def log_mode(
     """Write the gait mode as a state that lasts until the next one.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        session: The session.
         warnings: Grows by a sentence where messages can't be read.
 
     Returns:
@@ -89,8 +83,6 @@ def log_states(rec: rr.RecordingStream, clock: Clock, states: Sequence[tuple[int
     """Write states, each lasting until the next one.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         states: When each began [ns], and its name.
     """
     t_ns = np.array([time for time, _ in states], dtype=np.int64)
@@ -105,13 +97,7 @@ def log_events(
     """Write events and faults from ``/rosout``.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        session: The session.
         warnings: Grows by a sentence where messages can't be read.
-
-    Returns:
-        Whether there was any.
     """
     events = _read(session, "/rosout", {"name": str, "msg": str, "level": int}, warnings)
     log_lines(rec, clock, events)
@@ -122,8 +108,6 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
     """Write events as lines of text.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         events: When each happened [ns], and its ``rcl_interfaces/msg/Log``.
     """
     t_ns = np.array([time for time, _ in events], dtype=np.int64)

@@ -87,8 +87,6 @@ def log_angles(
     """Write one kind of angle of all joints.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         entity: E.g. ``/joints/measured``.
         tracks: The angles [rad].
         palette: Colour by joint name; None for the grey of everything commanded.
@@ -112,14 +110,7 @@ def log_scalars(
     """Write a quantity of all joints that needs no other unit.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        entity: Where to.
-        tracks: The values.
         palette: Colour by joint name; None for grey.
-
-    Returns:
-        What was written.
     """
     return tuple(
         log_table(rec, clock, path, table, palette, degrees=False)
@@ -131,7 +122,6 @@ def places_titles(places: Places, kind: str) -> dict[str, str]:
     """Names of the lines of head, middle and tail.
 
     Args:
-        places: The joints.
         kind: ``measured`` or ``commanded``.
 
     Returns:
@@ -176,15 +166,8 @@ def log_table(
     """Write joints that were sampled together.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        entity: Where to.
-        table: Their values.
         palette: Colour by joint name; None for grey.
         degrees: Whether the values are angles [rad], to be plotted in degrees.
-
-    Returns:
-        What was written.
     """
     component = DEGREES if degrees else SCALARS
     log_look(rec, entity, table.names, palette)
@@ -205,8 +188,6 @@ def log_look(
     """Say how the lines of an entity are drawn.
 
     Args:
-        rec: The recording.
-        entity: Which.
         names: Joints, a line each.
         palette: Colour by joint name; None for grey.
         titles: Lines' names by joint name; None for the joints' own.
@@ -234,9 +215,6 @@ def log_rows(
     """Write rows of lines.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        entity: Where to.
         t_ns: Their times [ns], shape (n,).
         values: Shape (n, k); NaN ends a line.
         degrees: Whether they are angles [rad], to be plotted in degrees.
@@ -262,7 +240,6 @@ def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
     """Say how the line of one kind of the body's power is drawn.
 
     Args:
-        rec: The recording.
         kind: ``mechanical`` or ``electrical``.
     """
     look = rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5)
@@ -273,8 +250,6 @@ def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> N
     """Write one kind of the body's power.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         kind: ``mechanical`` or ``electrical``.
         whole: The body's power [W].
     """

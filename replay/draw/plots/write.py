@@ -65,9 +65,6 @@ _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 def is_foreign(session: SessionView) -> bool:
     """Whether undulog has neither recorded nor imported a session.
 
-    Args:
-        session: The session.
-
     Returns:
         True where it doesn't carry undulog's metadata.
     """
@@ -80,9 +77,6 @@ def log_others(
     """Plot the numbers of every other topic of a foreign bag.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        session: The session.
         warnings: Grows by a sentence that names the topics left out.
 
     Returns:
@@ -113,16 +107,7 @@ def log_others(
 
 
 def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
-    """Write what String topics of a foreign bag say, each time that it changes, as events.
-
-    Args:
-        rec: The recording.
-        clock: Its timelines.
-        session: The session.
-
-    Returns:
-        Whether there was any.
-    """
+    """Write what String topics of a foreign bag say, each time that it changes, as events."""
     said: list[tuple[int, str]] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS and channel.is_ros2:
@@ -225,7 +210,6 @@ class Plot:
             samples: Some samples of each line, by which it is rounded.
             parts: Names of the lines, those in one part that are drawn at common times.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
-            component: What is written.
         """
         paths = [entity if len(parts) == 1 else part_entity(entity, part[0]) for part in parts]
         self.series = tuple(
@@ -244,8 +228,6 @@ class Plot:
         """Write the samples of a stretch.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
             tracks: The samples, with those just before and after it.
             span: What of them is drawn.
         """
@@ -287,9 +269,6 @@ class Plots:
         """Say how the lines look.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
-            found: What the session holds.
             places: Joints that stand for the body, or None.
             palette: Colour by joint name.
         """
@@ -337,11 +316,7 @@ class Plots:
         }
 
     def write(self, stretch: Stretch) -> None:
-        """Write a stretch.
-
-        Args:
-            stretch: Its samples.
-        """
+        """Write a stretch."""
         tracks = quantities(stretch.columns)
         for entity, plot in self._plots.items():
             if entity in tracks:

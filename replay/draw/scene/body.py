@@ -39,9 +39,6 @@ _NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 def meshed(robot: Robot) -> NDArray[np.bool_]:
     """Which links are drawn as their meshes.
 
-    Args:
-        robot: The robot.
-
     Returns:
         Whether a link's mesh is at hand, shape (number of links,).
     """
@@ -50,12 +47,7 @@ def meshed(robot: Robot) -> NDArray[np.bool_]:
 
 
 def log_shapes(rec: rr.RecordingStream, robot: Robot) -> None:
-    """Write the meshes, once.
-
-    Args:
-        rec: The recording.
-        robot: The robot.
-    """
+    """Write the meshes, once."""
     files = dict(robot.meshes)
     for link in robot.links:
         if link.mesh in files:
@@ -73,7 +65,6 @@ def log_poses(
     """Write where the meshed links were and what colour they had.
 
     Args:
-        rec: The recording.
         robot: The robot, m joints.
         times: Timelines of n rows.
         poses: Link centres [m], shape (n, m + 1, 3), and orientations, shape (n, m + 1, 3, 3).
@@ -141,9 +132,6 @@ def capsule_shape(robot: Robot) -> tuple[NDArray[np.float32], NDArray[np.float32
 
     A cylinder is one radius shorter than its link, so that neighbouring balls overlap without
     lying in each other and the segments stay countable.
-
-    Args:
-        robot: The robot.
 
     Returns:
         Lengths of the cylinders and radii [m], each of shape (number of links,).
@@ -222,9 +210,6 @@ def log_body(
     """Draw the measured body, coloured by power per segment.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        motion: What moved.
         limit_w: Power at which a segment's colour is full [W]; None takes it from the motion.
 
     Returns:
@@ -253,8 +238,6 @@ def log_ghost(rec: rr.RecordingStream, clock: Clock, motion: Motion, chosen: Int
     """Draw the commanded shape on the measured head, as a grey wireframe.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         motion: What moved; without commands nothing is drawn.
         chosen: Which of its drawing times, shape (n,).
     """
@@ -276,7 +259,6 @@ def rounded_to(values: FloatArray, step: float) -> NDArray[np.float32]:
 
     Args:
         values: Any shape.
-        step: The power of two.
 
     Returns:
         The same shape, in 32 bits; at most half a step from the values.
@@ -285,14 +267,7 @@ def rounded_to(values: FloatArray, step: float) -> NDArray[np.float32]:
 
 
 def body_title(content: Content) -> str:
-    """Name of the body's view, which is also the legend of its colours.
-
-    Args:
-        content: What the recording holds.
-
-    Returns:
-        A short title.
-    """
+    """Name of the body's view, which is also the legend of its colours."""
     if content.power_limit_w is None:
         return "Body, blue head to amber tail"
     if content.live:  # the scale may still grow
@@ -342,10 +317,6 @@ def log_markers(
     """Mark the joints that stand for the body.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        motion: What moved.
-        places: The joints.
         palette: Colour by joint name.
         named: At which of the motion's times the names are moved, shape (n,).
     """
@@ -398,9 +369,6 @@ def log_marks(
     """Mark joints with a point and their name.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        motion: What moved.
         names: The joints; those that the robot doesn't have are left out.
         chosen: Which of its drawing times, shape (n,).
     """

@@ -109,9 +109,6 @@ class Frames:
     def between(self, rows: slice) -> Frames:
         """Some of them.
 
-        Args:
-            rows: Which.
-
         Returns:
             These only.
         """
@@ -126,9 +123,6 @@ def frames_of(head: HeadPath, end_ns: int) -> Frames:
     Args:
         head: The head's path.
         end_ns: The session's end [ns].
-
-    Returns:
-        The frames.
     """
     chosen = decimate(head.t_ns, BODY_RATE_HZ)
     pose = np.concatenate([head.position, head.quaternion], axis=1)[chosen]
@@ -146,8 +140,6 @@ def read_head(
     """The head's pose from ``/odom``, or held at the origin.
 
     Args:
-        session: The session.
-        robot: The robot.
         positions: Measured joint angles, whose times serve where there is no odometry.
         warnings: Grows by a sentence where something had to be assumed.
 
@@ -171,9 +163,6 @@ def still_head(t_ns: IntArray) -> HeadPath:
 
     Args:
         t_ns: Times [ns], shape (n,).
-
-    Returns:
-        The path.
     """
     still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (t_ns.size, 1))
     return HeadPath(t_ns, still[:, :3], still[:, 3:], tracked=False)

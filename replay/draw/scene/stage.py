@@ -86,8 +86,6 @@ def read_ranges(session: SessionView, robot: Robot, at_ns: IntArray) -> Readings
     """Read all distance sensors.
 
     Args:
-        session: The session.
-        robot: The robot.
         at_ns: When they are drawn [ns], shape (n,).
 
     Returns:
@@ -109,9 +107,6 @@ def read_ranges(session: SessionView, robot: Robot, at_ns: IntArray) -> Readings
 def range_sensors(robot: Robot) -> tuple[Sensor, ...]:
     """The robot's distance sensors.
 
-    Args:
-        robot: The robot.
-
     Returns:
         Infrared and ultrasound, in the robot's order.
     """
@@ -131,9 +126,6 @@ def log_rays(
     """Draw what distance sensors see.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
-        motion: What moved.
         chosen: Which of its drawing times, shape (n,).
         sensors: The sensors, k of them.
         reading: Distances at those times [m], shape (n, k); NaN where there is none.
@@ -179,8 +171,6 @@ def log_trail(rec: rr.RecordingStream, clock: Clock, head: HeadPath, span: Span 
     """Draw the head's path; the view shows its last 20 s.
 
     Args:
-        rec: The recording.
-        clock: Its timelines.
         head: The head's path.
         span: The part that is drawn.
     """
@@ -207,7 +197,6 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
     """The world that the session's scenario describes.
 
     Args:
-        session: The session, open.
         warnings: Extended by what can't be read.
 
     Returns:
@@ -231,12 +220,7 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
 
 
 def log_surroundings(rec: rr.RecordingStream, world: World) -> None:
-    """Draw what does not move.
-
-    Args:
-        rec: The recording.
-        world: The world.
-    """
+    """Draw what does not move."""
     cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
     boxes = [_box(one) for one in world.obstacles if not isinstance(one, Cylinder)]
     if cylinders:
@@ -296,10 +280,6 @@ class Scene:
         """Write what doesn't move, and the head's trail.
 
         Args:
-            rec: The recording.
-            clock: Its timelines.
-            session: The session.
-            robot: The robot.
             head: Where its head was.
             places: Joints that stand for the body, or None.
             palette: Colour by joint name.
@@ -323,11 +303,7 @@ class Scene:
             log_trail(rec, clock, head, span)
 
     def write(self, stretch: Stretch) -> None:
-        """Draw a stretch.
-
-        Args:
-            stretch: Its samples.
-        """
+        """Draw a stretch."""
         rows = stretch.span.rows(self._frames.head.t_ns)
         if rows.stop <= rows.start:
             return
