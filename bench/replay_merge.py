@@ -28,7 +28,7 @@ from rerun.chunk import Chunk, LazyChunkStream
 from undulog.capture import Session
 from undulog.replay.overlay.alignment import Align, align
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.write import Converted, chunks_of, send, write_beside
+from undulog.replay.overlay.write import Converted, chunks_of, send, write_overlay
 from undulog.replay.viewer.viewer import viewer_binary
 
 BAR_S = 3.0
@@ -109,7 +109,7 @@ def main(minutes: float) -> None:
         whole = [
             timed(
                 "merge with views, differences and comparison",
-                lambda: write_beside(converted, target, Align.PHASE),
+                lambda: write_overlay(converted, target, Align.PHASE),
                 target,
             )
             for _ in range(3)

@@ -14,7 +14,7 @@ import sys
 
 import numpy as np
 
-from undulog.analysis.experiment.kicks.local import Answers, local_matrices, nonlinearity
+from undulog.analysis.experiment.kicks.local import ResponseMatrices, local_matrices, nonlinearity
 from undulog.analysis.experiment.kicks.runs import Kick, Kind
 
 NOISE = np.radians(0.01)
@@ -81,7 +81,9 @@ def experiments(random, count, kicks, H, c, *, scatter, how="each"):
             moved = np.sqrt(12) * order[:, None] * (1 + 1j) * np.ones(m)
         log = clean + scatter * moved + NOISE * _complex(random, shape)
         said = NOISE**2 * random.chisquare(FIT_DOF, (2, *shape)) / FIT_DOF
-        yield Answers(log - log[base].mean(axis=0), said[0], said[1], np.full(shape, FIT_DOF))
+        yield ResponseMatrices(
+            log - log[base].mean(axis=0), said[0], said[1], np.full(shape, FIT_DOF)
+        )
 
 
 def row(random, count, m, scatter_deg, *, coupled=True, base_runs=6, how="each", index=True):

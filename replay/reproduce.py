@@ -19,13 +19,13 @@ from undulog.analysis.compare.compare import compare_sessions
 from undulog.analysis.results.comparison import Comparison
 from undulog.analysis.signals.columns import RESPONSE_TOPIC
 from undulog.capture import Session, SessionView, load_robot
-from undulog.capture.common.console import emit_json, say
+from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.edit.raw_messages import RawLog, RawMessage
 from undulog.sim.commands.drive_bus import drive_armed, drive_on_bus
 from undulog.sim.drive.in_process import drive_twin
-from undulog.sim.drive.motion import Driven, find_driven
+from undulog.sim.drive.motion import MotionSource, find_motion
 from undulog.sim.drive.over_bus import bus_address
 from undulog.sim.scenario.scenario import Scenario
 from undulog.sim.scenario.scenario_file import load_scenario
@@ -39,7 +39,7 @@ _ALWAYS = 1 << 64
 
 
 @dataclass(frozen=True)
-class Sameness:
+class LogDifference:
     """What two sessions have alike.
 
     Attributes:
@@ -61,7 +61,7 @@ class Sameness:
         return not (self.differs_s or self.one_sided)
 
 
-def sameness(one: Path, other: Path) -> Sameness:
+def compare_logs(one: Path, other: Path) -> LogDifference:
     """Hold two sessions against each other, topic by topic.
 
     Args:
@@ -90,7 +90,7 @@ def sameness(one: Path, other: Path) -> Sameness:
             else:
                 same.append(topic)
         one_sided = tuple(sorted(({*ids[0]} ^ {*ids[1]}) - {EVENTS}))
-    return Sameness(tuple(same), differs_s, one_sided, messages)
+    return LogDifference(tuple(same), differs_s, one_sided, messages)
 
 
 def _told(log: RawLog, channel_id: int) -> Iterator[tuple[int, int, bytes]]:
@@ -110,12 +110,12 @@ class Repetition:
     """
 
     original: Path
-    driven: Driven
+    driven: MotionSource
     scenario: Scenario
 
 
 @dataclass(frozen=True)
-class Again:
+class ReproducedRun:
     """An experiment that was run again.
 
     Attributes:
@@ -129,7 +129,7 @@ class Again:
     original: Path
     scenario: Scenario
     recording: Recording
-    same: Sameness | None
+    same: LogDifference | None
     comparison: Comparison | None
     not_compared: str | None
 
@@ -157,7 +157,7 @@ def find_repetition(
         LogError: If the session can't be read, or has no commands.
     """
     there = None if world is None else load_scenario(world, changes)
-    driven = find_driven(str(original), there, changes)
+    driven = find_motion(str(original), there, changes)
     return Repetition(original, driven, driven.scenario(there, duration_s))
 
 
@@ -168,7 +168,7 @@ def replay_in_twin(
     force: bool = False,
     stop: StopRequest | None = None,
     on_sample: Callable[[Sample], None] | None = None,
-) -> Again:
+) -> ReproducedRun:
     """Give a session's commands to the twin again, record it, and compare.
 
     Args:
@@ -188,8 +188,8 @@ def replay_in_twin(
     with Session.open(repetition.original) as first, Session.open(output) as second:
         of_twin = "physics_rate_hz" in first.metadata.get("undulog", {})
         comparison, why = compared(first, second)
-    same = sameness(repetition.original, output) if of_twin else None
-    return Again(repetition.original, repetition.scenario, recording, same, comparison, why)
+    same = compare_logs(repetition.original, output) if of_twin else None
+    return ReproducedRun(repetition.original, repetition.scenario, recording, same, comparison, why)
 
 
 def compared(first: SessionView, second: SessionView) -> tuple[Comparison | None, str | None]:
@@ -255,7 +255,7 @@ def replay_on_bus(
     """
     bus_address(on)
     described = load_robot(robot) if robot is not None else None
-    driven = find_driven(str(file), robot=described)
+    driven = find_motion(str(file), robot=described)
     if driven.kind != "commands":
         raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
     if not arm:
@@ -287,10 +287,10 @@ def replay_on_bus(
         told = None if comparison is None else comparison.to_dict()
         emit_json({"original": str(file), **run.facts(), "comparison": told, "not_compared": why})
     else:
-        say(*run.lines())
+        echo(*run.lines())
         if comparison is not None:
             show(comparison)
         elif run.complete:
-            say(f"Not compared: {why}")
-        say(*what_next(file, run.plan.output, comparable=comparison is not None))
+            echo(f"Not compared: {why}")
+        echo(*what_next(file, run.plan.output, comparable=comparison is not None))
     return run.complain()

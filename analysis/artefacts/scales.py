@@ -83,7 +83,7 @@ EITHER_WAY = 0.75
 of a multisine near a resonance every cycle has another phase."""
 
 FULL_SIZE = (0.5, 2.0)
-TOGETHER = 0.98
+MIN_CORRELATION = 0.98
 """Correlation of a position with the integral of its velocity that lets scales be compared."""
 
 SAME_SCALE = 1.05
@@ -193,7 +193,7 @@ def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
     """
     degrees = _near(one.ratio, DEGREE) & (np.abs(one.correlation) > -OPPOSITE)
     # A joint that hardly moves may be stuck: only one that follows closely is in another unit.
-    radians = _near(one.ratio, 1 / DEGREE) & (one.correlation > TOGETHER)
+    radians = _near(one.ratio, 1 / DEGREE) & (one.correlation > MIN_CORRELATION)
     full = (one.ratio > FULL_SIZE[0]) & (one.ratio < FULL_SIZE[1])
     opposite = (one.correlation < OPPOSITE) & (full | degrees)
     # A sign changes no more than the sign: near a resonance the phase is anything, cycle by cycle.
@@ -213,7 +213,7 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     Returns:
         ``wrong_sign``, ``wrong_unit`` and ``scale_mismatch`` to stretches, those that were found.
     """
-    told = np.abs(one.correlation) > TOGETHER
+    told = np.abs(one.correlation) > MIN_CORRELATION
     ratio = np.where(told, one.ratio, np.nan)
     known = np.flatnonzero(told)
     if known.size:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from undulog.capture.common.console import UNLIMITED, Progress, say
+from undulog.capture.common.console import UNLIMITED, Progress, echo
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
@@ -82,4 +82,4 @@ def show(render: Callable[[int, bool], str], output: Path | None) -> None:
     width = shutil.get_terminal_size().columns if terminal else UNLIMITED
     sys.stdout.write(render(width, terminal))  # its names are escaped; the rest are styles
     if output is not None:
-        say(f"Result: {output}")
+        echo(f"Result: {output}")

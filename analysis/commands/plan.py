@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, say
+from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def reversal(
 
     _plan("reversal", like, output, design, (runs, settle, measure), as_json=json)
     if not json:
-        say(
+        echo(
             "Before each file whose name ends in -180, put the robot down turned by 180 degrees; "
             "before the others, as in the first"
         )
@@ -154,11 +154,11 @@ def announce(
     if as_json:
         emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
         return
-    say(
+    echo(
         f"{folder}: {plan}, {len(files)} runs of {settle_s + measure_s:g} s, "
         f"{len(files) * (settle_s + measure_s) / 60:.1f} min in all"
     )
-    say(
+    echo(
         "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
         f"--start {settle_s:g} of all recordings"
     )
@@ -301,12 +301,12 @@ def _plan_tones(
     if as_json:
         return
     if facts:
-        say(
+        echo(
             f"The slowest body mode without contact has {facts['mode_hz']} Hz and dies away with "
             f"{facts['mode_tau_s']} s"
         )
     if settle_s < needed_s:
-        say(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
+        echo(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
 
 
 def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str]]:

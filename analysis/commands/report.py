@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, say
+from undulog.capture.common.console import echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
 
@@ -59,9 +59,9 @@ def report(
     if json:
         emit_json({"page": str(output), "bytes": size, **told})
         return
-    say(told["answer"])
+    echo(told["answer"])
     said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
-    say(f"{output}: {size / 1e3:.0f} kB{said}")
+    echo(f"{output}: {size / 1e3:.0f} kB{said}")
 
 
 def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:

@@ -23,10 +23,12 @@ from ..segments.examine import OFFSET_RAD
 from ..signals.stretch import Options
 from .alignment import Alignment, align, changes
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .side import Quantities, Seen, independent, phases_rad, see, turned
+from .side import ComparedSession, Quantities, independent, phases_rad, see, turned
 
 
-def broken_joints(a: Sequence[Seen], b: Sequence[Seen]) -> tuple[BrokenJoint, ...]:
+def broken_joints(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession]
+) -> tuple[BrokenJoint, ...]:
     """Find the joints that do not follow, or stand off their command, on one side only.
 
     Returns:
@@ -52,7 +54,7 @@ def _off(answer: Answer) -> list[StandOut]:
     return [each for each in answer.stand_out if each.quantity == "offset"]
 
 
-def _moved(joint: str, own: Sequence[Seen], other: Sequence[Seen]) -> bool:
+def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:
     """Whether a joint's mean differs between the sides, too: both may share a zero."""
     here, there = (
         [one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)
@@ -108,7 +110,7 @@ def compare_sessions(
     choices = choices or Choices()
     warnings: dict[str, list[str]] = {}
 
-    def seen(session: SessionView) -> Seen:
+    def seen(session: SessionView) -> ComparedSession:
         def warn(sentence: str) -> None:
             warnings.setdefault(sentence, []).append(session.path.name)
 
@@ -123,11 +125,14 @@ def compare_sessions(
         f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
         for sentence, names in warnings.items()
     ]
-    return compare_seen(sides[0], sides[1], choices, said)
+    return compare_fitted(sides[0], sides[1], choices, said)
 
 
-def compare_seen(
-    a: Sequence[Seen], b: Sequence[Seen], choices: Choices, warnings: Sequence[str] = ()
+def compare_fitted(
+    a: Sequence[ComparedSession],
+    b: Sequence[ComparedSession],
+    choices: Choices,
+    warnings: Sequence[str] = (),
 ) -> Comparison:
     """Compare what was taken from the sessions.
 
@@ -176,7 +181,7 @@ def compare_seen(
     )
 
 
-def _design(a: Sequence[Seen], b: Sequence[Seen], choices: Choices) -> str:
+def _design(a: Sequence[ComparedSession], b: Sequence[ComparedSession], choices: Choices) -> str:
     if choices.paired:
         return "pairs"
     return "sessions" if len(a) == len(b) == 1 else "groups"
@@ -192,7 +197,9 @@ def _partial(aligned: Alignment) -> str | None:
     return "; ".join(parts) or None
 
 
-def _warn(a: Sequence[Seen], b: Sequence[Seen], design: str, warn: Warn) -> None:
+def _warn(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession], design: str, warn: Warn
+) -> None:
     if design == "sessions":
         warn(
             "one session a side: the intervals know the noise within each session, not how one "
@@ -211,7 +218,7 @@ def _warn(a: Sequence[Seen], b: Sequence[Seen], design: str, warn: Warn) -> None
 
 
 def _waveforms(
-    a: Sequence[Seen], b: Sequence[Seen], names: Sequence[str], design: str
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession], names: Sequence[str], design: str
 ) -> tuple[Waveform, ...]:
     found: list[Waveform] = []
     for name in names:
@@ -244,7 +251,7 @@ def _waveforms(
     return tuple(found)
 
 
-def _by_first(one: Seen, name: str, names: Sequence[str]) -> Quantities:
+def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantities:
     """A mean cycle by the phase of the first joint in common that has the same frequency."""
     run = one.run
     group = run.group[run.names.index(name)]
@@ -254,7 +261,9 @@ def _by_first(one: Seen, name: str, names: Sequence[str]) -> Quantities:
     return turned(one.cycles[name], float(np.angle(commands[0] / commands[1])))
 
 
-def _provenance(a: Sequence[Seen], b: Sequence[Seen], choices: Choices) -> Provenance:
+def _provenance(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession], choices: Choices
+) -> Provenance:
     paths = [[one.analysis.session.path for one in side] for side in (a, b)]
     single = len(a) == len(b) == 1 and not choices.paired
     files = [*paths[0], *paths[1]] if single else ["--a", *paths[0], "--b", *paths[1]]

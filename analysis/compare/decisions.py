@@ -16,7 +16,16 @@ from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, 
 from ..results import formats
 from ..results.comparison import BODY, BrokenJoint, Difference, Equivalence, NamedJoint
 from ..results.estimate import Estimate, leaves_out_zero
-from .side import Differences, Key, Quantities, Seen, from_runs, holm, independent, paired
+from .side import (
+    ComparedSession,
+    Differences,
+    Key,
+    Quantities,
+    from_runs,
+    holm,
+    independent,
+    paired,
+)
 
 SIGNIFICANT_DIFFERENCE = 0.05
 """Family-wise level of the decisions, and level of each equivalence."""
@@ -54,7 +63,9 @@ class Decided:
     equivalence: tuple[Equivalence, ...]
 
 
-def family(a: Sequence[Seen], b: Sequence[Seen], joints: Sequence[str]) -> list[Key]:
+def family(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession], joints: Sequence[str]
+) -> list[Key]:
     """What every session of both sides knows.
 
     Args:
@@ -89,7 +100,9 @@ def differ(
     return first, second, paired(a, b) if paired_runs else independent(first, second)
 
 
-def estimates_of(side: Sequence[Seen], keys: Sequence[Key], lags_about: FloatArray) -> FloatArray:
+def estimates_of(
+    side: Sequence[ComparedSession], keys: Sequence[Key], lags_about: FloatArray
+) -> FloatArray:
     """Estimates of a side as arrays.
 
     Args:
@@ -315,7 +328,7 @@ def _largest(decided: Decided) -> str:
         more = f"; and {others} more" if others else ""
         where = f"{plain(first.place)}:" if first.size >= 1 else "one joint's"
         where = "the body's" if first.place == BODY else where
-        return f"{where} {told(first)} ({formats.told_p(first.p_holm)}){more}"
+        return f"{where} {told(first)} ({formats.p_value_text(first.p_holm)}){more}"
     own = [one for one in beyond_doubt if one.place == named[0] and one.quantity != "energy_abs"]
     parts = ", ".join(told(one) for one in sorted(own, key=lambda one: one.quantity))
     smallest = min(one.p_holm for one in own)
@@ -323,7 +336,7 @@ def _largest(decided: Decided) -> str:
     listed = ", ".join(others[:MOST])
     listed += f" and {len(others) - MOST} more" if len(others) > MOST else ""
     more = f"; {listed} by less" if others else ""
-    return f"{plain(named[0])} most, {parts} ({formats.told_p(smallest)}){more}"
+    return f"{plain(named[0])} most, {parts} ({formats.p_value_text(smallest)}){more}"
 
 
 def _not_shown(decided: Decided) -> str:

@@ -34,7 +34,7 @@ from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 from ..estimators.series import GAP_FACTOR, Series
 from ..results.analysis import Analysis
 from ..results.comparison import BODY
-from ..session.analyse import Measured, measure_session
+from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from .alignment import facts_of
@@ -224,7 +224,7 @@ Known = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Seen:
+class ComparedSession:
     """One session.
 
     Attributes:
@@ -243,7 +243,7 @@ class Seen:
     offsets: Mapping[str, float]
 
 
-def see(session: SessionView, options: Options, warn: Warn) -> Seen:
+def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
     """Take from a session what a comparison needs.
 
     Args:
@@ -273,7 +273,9 @@ def see(session: SessionView, options: Options, warn: Warn) -> Seen:
             else:
                 estimates[quantity, BODY] = known
     offsets = {name: float(np.median(each)) for name, each in measured.offsets.items() if each.size}
-    return Seen(analysis, run, facts_of(session), estimates, _cycles(measured, run), offsets)
+    return ComparedSession(
+        analysis, run, facts_of(session), estimates, _cycles(measured, run), offsets
+    )
 
 
 def turned(cycle: Quantities, by_rad: float) -> Quantities:
@@ -296,7 +298,7 @@ def turned(cycle: Quantities, by_rad: float) -> Quantities:
     return Quantities(value.astype(np.float64), variance, cycle.dof)
 
 
-def _responses(measured: Measured, run: GaitRun) -> dict[Key, Known]:
+def _responses(measured: SessionMeasurement, run: GaitRun) -> dict[Key, Known]:
     gait = measured.gait
     found: dict[Key, Known] = {}
     if gait is None:
@@ -315,7 +317,7 @@ def _responses(measured: Measured, run: GaitRun) -> dict[Key, Known]:
     return found
 
 
-def _energies(measured: Measured) -> dict[Key, Known]:
+def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
     found: dict[Key, Known] = {}
     for name, energies in measured.energies.items():
         known = None if energies.mechanical is None else mean_of_cycles(energies.mechanical.abs_j)
@@ -324,14 +326,14 @@ def _energies(measured: Measured) -> dict[Key, Known]:
     return found
 
 
-def _total_energy(measured: Measured) -> FloatArray | None:
+def _total_energy(measured: SessionMeasurement) -> FloatArray | None:
     """E_abs of all joints together in each cycle [J]; None where one is not known."""
     powers = [energies.mechanical for energies in measured.energies.values()]
     known = [power.abs_j for power in powers if power is not None]
     return np.sum(known, axis=0) if known and len(known) == len(powers) else None
 
 
-def _cycles(measured: Measured, run: GaitRun) -> dict[str, Quantities]:
+def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]:
     gait, span = measured.gait, measured.span
     found: dict[str, Quantities] = {}
     if gait is None or not run.names:

@@ -23,16 +23,16 @@ from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
-from ..session.analyse import Examined, examine_session
+from ..session.analyse import FittedSession, examine_session
 from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
     GaitRun,
     Posture,
     Role,
+    coupling_of_one_gait,
     gait_run,
     mirror_fault,
-    one_gait_coupling,
     posture,
     responses,
     sort_runs,
@@ -70,7 +70,7 @@ def analyse_experiment(
         UsageError: If there is no session, or the options leave nothing of one.
     """
     options = options or Options()
-    examined: list[Examined] = []
+    examined: list[FittedSession] = []
     robots: list[Robot | None] = []
     commanded: list[CommandTones | None] = []
     postures: list[Posture] = []
@@ -107,7 +107,11 @@ def analyse_experiment(
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
-    pooled = pool_runs(chosen[0].names, [run.response for run in chosen]) if one_way(ways) else None
+    pooled = (
+        pool_runs(chosen[0].names, [run.response for run in chosen])
+        if one_direction(ways)
+        else None
+    )
     robot = robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:
@@ -120,7 +124,7 @@ def analyse_experiment(
         _warn_floor(reversal, warnings.append)
         _warn_headings(reversal, warnings.append)
     coupling = (
-        one_gait_coupling(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
+        coupling_of_one_gait(len(names)) if kicks is None else kick_coupling(kicks, warnings.append)
     )
     answer = (
         kick_answer(coupling) if only_kicks else experiment_answer(reversal, roles, pooled, joints)
@@ -146,7 +150,7 @@ def analyse_experiment(
 def _of_sweep(
     sweep: Sweep,
     commanded: Sequence[CommandTones | None],
-    examined: Sequence[Examined],
+    examined: Sequence[FittedSession],
     runs: Sequence[GaitRun],
     options: Options,
 ) -> Experiment:
@@ -175,7 +179,7 @@ def _of_sweep(
     )
 
 
-def one_way(ways: Sequence[Role]) -> bool:
+def one_direction(ways: Sequence[Role]) -> bool:
     """Whether all runs are of one direction."""
     return len(set(ways)) == 1
 

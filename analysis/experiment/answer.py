@@ -335,7 +335,7 @@ def _one_direction(pooled: PooledResponse | None, joints: Answer | None) -> str:
 
 
 def _different(reversal: Reversal) -> str:
-    reported = formats.told_p(reversal.p)
+    reported = formats.p_value_text(reversal.p)
     if not reversal.pairs:
         cause = "check that ground and body are alike fore and aft"
         if not reversal.tilt.excluded:
@@ -349,9 +349,8 @@ def _different(reversal: Reversal) -> str:
     others = len(reversal.pairs) - 1
     also = f"; {others} more pair{'s differ' if others > 1 else ' differs'}, by less"
     lead = "the modules differ: " if reversal.tilt.excluded else ""
-    return (
-        f"{lead}{pair_order(first)} ({formats.told_p(first.p)}): {either}{also if others else ''}"
-    )
+    doubt = formats.p_value_text(first.p)
+    return f"{lead}{pair_order(first)} ({doubt}): {either}{also if others else ''}"
 
 
 def _bounded(reversal: Reversal) -> str:

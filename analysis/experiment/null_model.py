@@ -49,7 +49,7 @@ from ..results.null_model import (
     SharedEstimate,
     null_answer,
 )
-from ..session.analyse import Measured, measure_session
+from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..signals.stretch import Options
 from .reversal.mirror import parts
@@ -313,7 +313,7 @@ def analyse_with_null(
 
 
 def _answered(
-    measured: Measured, model: NullModel, file: Path
+    measured: SessionMeasurement, model: NullModel, file: Path
 ) -> tuple[Response, np.ndarray[tuple[int], np.dtype[np.int64]]]:
     """The response of the joints that answer, and their places in the model."""
     path, gait = measured.analysis.session.path, measured.gait

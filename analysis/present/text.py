@@ -15,7 +15,7 @@ from undulog.capture.common.console import UNLIMITED, plain
 from ..results import formats
 from ..results.analysis import Analysis, EnergyResult
 from ..results.estimate import Estimate
-from ..results.null_model import ModelledAnalysis, told_null
+from ..results.null_model import ModelledAnalysis, null_model_text
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, Link, LoopMode
 from . import tables
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
@@ -264,7 +264,7 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         for line in chain_detail(chain):
             sheet.print(line)
     if isinstance(analysis, ModelledAnalysis):
-        for line in told_null(analysis.null_model):
+        for line in null_model_text(analysis.null_model):
             sheet.print(line)
     for warning in analysis.warnings:
         sheet.print(f"Warning: {warning}")

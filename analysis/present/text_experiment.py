@@ -77,7 +77,7 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
     return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
 
 
-def margin_told(one: Equivalence, value: float | None = None) -> str:
+def margin_text(one: Equivalence, value: float | None = None) -> str:
     """A margin, or a difference that is held to it, in the unit people read.
 
     Args:
@@ -99,7 +99,7 @@ def _equivalence(comparison: Comparison) -> str:
     for one in comparison.equivalence:
         shown = "yes" if one.p < SIGNIFICANT_DIFFERENCE else "not shown"
         parts.append(
-            f"{WORDS[one.quantity]} within {margin_told(one)} {shown} (p {formats.p_value(one.p)})"
+            f"{WORDS[one.quantity]} within {margin_text(one)} {shown} (p {formats.p_value(one.p)})"
         )
     return f"The same within margins: {'; '.join(parts)}."
 
@@ -175,7 +175,7 @@ def reversal_detail(reversal: Reversal) -> Iterable[str]:
         yield (
             f"{pair.name} against its mirror {pair.mirror}, over both directions: "
             f"{_gain(pair.log_gain_contrast)} in gain, {_lag(pair.lag_contrast_rad)} in lag "
-            f"({formats.told_p(pair.p)}, ordered by {pair.by})."
+            f"({formats.p_value_text(pair.p)}, ordered by {pair.by})."
         )
     if reversal.pairs:
         first = reversal.pairs[0]

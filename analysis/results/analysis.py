@@ -16,7 +16,7 @@ from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
 from .coupling import Coupling
 from .estimate import Estimate, Interval, Provenance
-from .shown import Shown
+from .shown import PresentedResult
 
 if TYPE_CHECKING:
     from .oscillators import ChainCoupling
@@ -327,7 +327,7 @@ class Index:
 
 
 @dataclass(frozen=True, repr=False)
-class Analysis(Shown):
+class Analysis(PresentedResult):
     """All numbers of one session.
 
     Attributes:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from .analysis import SessionFacts
 from .estimate import Estimate, Provenance
-from .shown import Shown
+from .shown import PresentedResult
 
 BODY = "body"
 """Where a difference is that belongs to no joint."""
@@ -131,7 +131,7 @@ class Waveform:
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison(Shown):
+class Comparison(PresentedResult):
     """Two sessions, or two groups of them, side by side.
 
     Attributes:

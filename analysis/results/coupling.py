@@ -8,11 +8,11 @@ from enum import StrEnum
 from undulog.capture.common.arrays import FloatArray
 
 from .estimate import Estimate
-from .shown import Shown
+from .shown import PresentedResult
 
 
 @dataclass(frozen=True, repr=False)
-class Coupling(Shown):
+class Coupling(PresentedResult):
     """Whether the coupling can be told from this session.
 
     Attributes:

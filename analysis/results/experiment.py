@@ -16,7 +16,7 @@ from .analysis import Analysis, Index
 from .coupling import Coupling
 from .estimate import Estimate, Provenance
 from .oscillators import BodyOscillators
-from .shown import Shown
+from .shown import PresentedResult
 
 BLIND = (
     "blind to what is alike at both joints of a mirror pair and to the middle joint of an odd "
@@ -122,7 +122,7 @@ class FloorTilt:
 
 
 @dataclass(frozen=True, repr=False)
-class Reversal(Shown):
+class Reversal(PresentedResult):
     """Test of H1, that the modules are identical, by running the wave both ways.
 
     Attributes:
@@ -197,7 +197,7 @@ class PooledRuns:
 
 
 @dataclass(frozen=True, repr=False)
-class Experiment(Shown):
+class Experiment(PresentedResult):
     """All numbers of several sessions.
 
     Attributes:

@@ -236,7 +236,7 @@ def p_value(p: float | None) -> str:
     return f"{p:.{digits}f}"
 
 
-def told_p(p: float | None) -> str:
+def p_value_text(p: float | None) -> str:
     """A p-value with its name.
 
     Args:

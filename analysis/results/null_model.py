@@ -111,11 +111,11 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
         shown = (clear or first.relative).items()
         own = ", ".join(f"{_words(kind)} {formats.percent(one)}" for kind, one in shown)
         also = f"; then {', '.join(named[1:])}" if len(named) > 1 else ""
-        return f"{first.name} deviates: {own} ({formats.told_p(p)}){also}"
+        return f"{first.name} deviates: {own} ({formats.p_value_text(p)}){also}"
     if fit_p < SIGNIFICANT:
         return (
             f"neither identical modules nor a single one that deviates explain this session "
-            f"(fit {formats.told_p(fit_p)}): the model is not of this robot, ground or gait"
+            f"(fit {formats.p_value_text(fit_p)}): the model is not of this robot, ground or gait"
         )
     bounds: list[str] = []
     for kind in modules[0].relative:
@@ -123,10 +123,10 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
         if max(ends) < 1:  # more than that is no bound
             bounds.append(f"{100 * max(ends):.2g} % in {_words(kind)}")
     bound = f": none by more than {', '.join(bounds)}" if bounds else ", nor any bound on it"
-    return f"no module is shown to deviate ({formats.told_p(p)}){bound}"
+    return f"no module is shown to deviate ({formats.p_value_text(p)}){bound}"
 
 
-def told_null(result: NullModelResult) -> list[str]:
+def null_model_text(result: NullModelResult) -> list[str]:
     """Lines for a terminal.
 
     Returns:
@@ -138,7 +138,7 @@ def told_null(result: NullModelResult) -> list[str]:
     )
     return [
         f"Modules, {result.condition}: {result.answer}.",
-        f"Shared by all modules: {shared}; fit {formats.told_p(result.fit_p)}.",
+        f"Shared by all modules: {shared}; fit {formats.p_value_text(result.fit_p)}.",
     ]
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class ShownPicture(Protocol):
+class PictureProtocol(Protocol):
     """A figure, as :class:`.analysis.Picture`."""
 
     @property
@@ -33,33 +33,33 @@ class ShownPicture(Protocol):
 
 
 class Presentation(Protocol):
-    """The implementation of the methods of :class:`Shown`, which is above all results."""
+    """The implementation of the methods of :class:`PresentedResult`, which is above all results."""
 
-    def text(self, result: Shown) -> str:
+    def text(self, result: PresentedResult) -> str:
         """Return the text of a result."""
         ...
 
-    def headline(self, result: Shown) -> str:
+    def headline(self, result: PresentedResult) -> str:
         """Return the answer in one line."""
         ...
 
-    def html(self, result: Shown) -> str:
+    def html(self, result: PresentedResult) -> str:
         """Return what a notebook shows."""
         ...
 
-    def frames(self, result: Shown) -> dict[str, pd.DataFrame]:
+    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]:
         """Return the tables."""
         ...
 
-    def picture(self, result: Shown, what: str | None) -> ShownPicture:
+    def picture(self, result: PresentedResult, what: str | None) -> PictureProtocol:
         """Draw a picture."""
         ...
 
-    def save(self, result: Shown, path: Path, *, force: bool) -> Path:
+    def save(self, result: PresentedResult, path: Path, *, force: bool) -> Path:
         """Write the JSON file."""
         ...
 
-    def save_tables(self, result: Shown, folder: Path, *, force: bool) -> list[Path]:
+    def save_tables(self, result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:
         """Write the Parquet files."""
         ...
 
@@ -80,7 +80,7 @@ def _presentation() -> Presentation:
     return _make[0]()
 
 
-class Shown:
+class PresentedResult:
     """A result that prints, plots, becomes tables, and goes to files and back.
 
     The first line printed is the answer. ``frames`` gives the numbers as pandas tables whose
@@ -111,7 +111,7 @@ class Shown:
         """
         return _presentation().frames(self)
 
-    def plot(self, what: str | None = None) -> ShownPicture:
+    def plot(self, what: str | None = None) -> PictureProtocol:
         """The result as a picture, as the report draws it; needs the extra ``report``.
 
         Args:

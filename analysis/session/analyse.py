@@ -45,7 +45,7 @@ from ..signals.windows import Span, Stretch, whole_cycles
 from .heterogeneity import heterogeneity_indices
 from .joints import group_facts, joint_energies, joint_results
 from .over_time import response_over_time
-from .runs import one_gait_coupling
+from .runs import coupling_of_one_gait
 
 _NS = 1e9
 
@@ -109,7 +109,7 @@ _FEW = 1e-3
 
 
 @dataclass(frozen=True)
-class Examined:
+class FittedSession:
     """One session's numbers, and the fit that an experiment of several sessions builds on.
 
     Attributes:
@@ -121,7 +121,7 @@ class Examined:
 
 
 @dataclass(frozen=True)
-class Measured(Examined):
+class SessionMeasurement(FittedSession):
     """One session's numbers with what they were computed from; heavy, so not to be kept.
 
     Attributes:
@@ -155,7 +155,7 @@ def analyse_session(session: SessionView, options: Options | None = None) -> Ana
 
 def examine_session(
     session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
-) -> Examined:
+) -> FittedSession:
     """Compute what one session tells, and keep the fit.
 
     Args:
@@ -171,12 +171,12 @@ def examine_session(
         UsageError: If the options leave nothing of the session.
     """
     measured = measure_session(session, options, with_dead_bands=with_dead_bands)
-    return Examined(measured.analysis, measured.gait)
+    return FittedSession(measured.analysis, measured.gait)
 
 
 def measure_session(
     session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
-) -> Measured:
+) -> SessionMeasurement:
     """Compute what one session tells, and keep what it was computed from.
 
     Args:
@@ -271,7 +271,7 @@ def measure_session(
         joints=joints,
         body=body,
         heterogeneity=heterogeneity,
-        coupling=one_gait_coupling(0 if gait is None else len(gait.all_answered)),
+        coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
@@ -285,7 +285,7 @@ def measure_session(
     )
     answer = compose(facts)
     analysis = dataclasses.replace(analysis, answer=answer)
-    return Measured(analysis, gait, sound, energies, span, follows.offsets)
+    return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)
 
 
 def _series(

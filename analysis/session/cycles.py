@@ -20,7 +20,7 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, I
 from ..estimators.cycle_sums import cycle_sums, weigh
 from ..estimators.harmonic import cos_sin
 from ..estimators.series import Series
-from .analyse import Measured
+from .analyse import SessionMeasurement
 
 LEAST_COVERED = 0.9
 """A cycle with samples over less of its length is missing."""
@@ -51,7 +51,7 @@ class CycleMaps:
     power_w: FloatArray
 
 
-def cycle_maps(measured: Measured) -> CycleMaps | None:
+def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
     """Follow a steady gait cycle by cycle.
 
     Args:

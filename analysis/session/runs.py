@@ -29,7 +29,7 @@ from ..results.coupling import Coupling
 from ..signals.columns import by_plane
 
 
-def one_gait_coupling(joints: int) -> Coupling:
+def coupling_of_one_gait(joints: int) -> Coupling:
     """What one steady gait says about the coupling: nothing, and what would.
 
     Args:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import emit_json, say
+from ..common.console import echo, emit_json
 from ..common.errors import ImportFormatError, UsageError
 from ..common.files import is_file
 
@@ -138,9 +138,9 @@ def export_log(
         facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
         emit_json(facts)
         return
-    say(f"{output}: {what}")
+    echo(f"{output}: {what}")
     for warning in warnings:
-        say(f"  warning: {warning}")
+        echo(f"  warning: {warning}")
 
 
 def _column_map(
@@ -172,16 +172,16 @@ def _require_mcap(output: Path) -> None:
 
 def _print_import(report: ImportReport) -> None:
     frames = f"{report.frames} CAN frames, " if report.frames is not None else ""
-    say(
+    echo(
         f"{report.output}: {report.duration_s:.1f} s of {report.robot}, {frames}"
         f"verdict {report.verdict}"
     )
     if not report.complete:
-        say("stopped on request; the file is complete up to there")
+        echo("stopped on request; the file is complete up to there")
     width = max(map(len, report.samples), default=0)
     for topic, count in sorted(report.samples.items()):
-        say(f"  {topic:<{width}}  {count} messages")
+        echo(f"  {topic:<{width}}  {count} messages")
     for problem in report.problems:
-        say(f"  problem: {problem}")
+        echo(f"  problem: {problem}")
     for note in report.notes:
-        say(f"  note: {note}")
+        echo(f"  note: {note}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-from ..common.console import emit_json, say
+from ..common.console import echo, emit_json
 
 _BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
 _EXTRAS: dict[str, tuple[str, ...]] = {
@@ -61,10 +61,10 @@ def info(*, json: bool = False) -> None:
         emit_json({"platform": platform.platform(), "packages": base_versions(), "extras": extras})
         return
     packages = base_versions()
-    say(f"undulog {packages['undulog']} on Python {packages['python']}, {platform.platform()}")
-    say("packages  " + ", ".join(f"{k} {v}" for k, v in packages.items() if k != "undulog"))
+    echo(f"undulog {packages['undulog']} on Python {packages['python']}, {platform.platform()}")
+    echo("packages  " + ", ".join(f"{k} {v}" for k, v in packages.items() if k != "undulog"))
     for extra, found in extras.items():
         missing = [name for name, number in found.items() if number is None]
         listed = ", ".join(f"{name} {number}" for name, number in found.items() if number)
         state = listed if not missing else f"not installed: pip install 'undulog[{extra}]'"
-        say(f"{extra:<9} {state}")
+        echo(f"{extra:<9} {state}")

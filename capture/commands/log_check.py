@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.console import emit_json, progress, say
+from ..common.console import echo, emit_json, progress
 from ..log.messages.frames import FD_TOPIC_PREFIX
 
 if TYPE_CHECKING:
@@ -83,25 +83,25 @@ def _print(health: SessionHealth) -> None:
     robot = f"{health.robot}, " if health.robot else ""
     count = len(health.reasons)
     why = f", for {count} reason{'s' if count != 1 else ''}" if count else ""
-    say(f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}")
+    echo(f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}")
     for sentence in health.reasons:
-        say(f"  {sentence}")
+        echo(f"  {sentence}")
     for sentence in health.notes:
-        say(f"  note: {sentence}")
+        echo(f"  note: {sentence}")
     _print_stored(health)
     _print_series(health)
     for bus in health.buses:
-        say("", _bus_line(bus))
+        echo("", _bus_line(bus))
     for source in health.sources:
-        say("", _source_line(source))
+        echo("", _source_line(source))
     _print_sequences(health)
     file = health.file
-    say(
+    echo(
         "",
         f"{file.checked} of {file.chunks} chunks have the CRC that they should have, "
         f"{file.without_crc} carry none",
     )
-    say(
+    echo(
         "Intervals are between stamps (log times where there are none); a gap is longer than 1.5 "
         "medians."
     )
@@ -109,23 +109,23 @@ def _print(health: SessionHealth) -> None:
 
 def _print_stored(health: SessionHealth) -> None:
     if health.stored is None:
-        say("stored verdict: none")
+        echo("stored verdict: none")
     elif health.stored == health.verdict:
-        say(f"stored verdict: {health.stored}, the same")
+        echo(f"stored verdict: {health.stored}, the same")
     else:
         said = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
-        say(f"stored verdict: {health.stored}{said}; the data say {health.verdict}")
+        echo(f"stored verdict: {health.stored}{said}; the data say {health.verdict}")
 
 
 def _print_series(health: SessionHealth) -> None:
     width = max([len(each.label) for each in health.series] + [6])
-    say(
+    echo(
         "",
         f"{'series':<{width}}  {'samples':>8}  {'rate/Hz':>8}  {'gaps':>5}  {'missing':>7}  "
         f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}",
     )
     for each in health.series:
-        say(_series_line(each, width))
+        echo(_series_line(each, width))
 
 
 def _series_line(each: SeriesHealth, width: int) -> str:
@@ -148,13 +148,13 @@ def _print_sequences(health: SessionHealth) -> None:
         kinds.setdefault(channel.sequence.kind, []).append(channel.topic)
     counted = [each for each in health.channels if each.sequence.kind == "counted"]
     dropped = math.fsum(each.sequence.dropped or 0 for each in counted)
-    say("")
+    echo("")
     if counted:
-        say(f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels")
+        echo(f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels")
     if "none" in kinds:
-        say(f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}")
+        echo(f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}")
     if "not a count" in kinds:
-        say(f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}")
+        echo(f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}")
 
 
 def _source_line(source: SourceHealth) -> str:

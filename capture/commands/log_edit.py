@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import emit_json, say
+from ..common.console import echo, emit_json
 from ..common.process import interruptible
 
 if TYPE_CHECKING:
@@ -54,14 +54,14 @@ def _tell_recovered(report: RecoverReport) -> None:
     messages = sum(report.messages.values())
     missing = {None: "how many are missing can't be told", 0: "none is missing"}
     lost = missing.get(report.missing, f"{report.missing} are missing")
-    say(
+    echo(
         f"{report.output}: {messages} messages over {report.duration_s:.2f} s, "
         f"{report.from_wal} of them from the write-ahead log; {lost}"
     )
     for warning in report.warnings:
-        say(f"warning: {warning}")
+        echo(f"warning: {warning}")
     for note in report.notes:
-        say(f"note: {note}")
+        echo(f"note: {note}")
 
 
 def log_cut(
@@ -156,14 +156,14 @@ def _tell(report: EditReport, *, as_json: bool) -> None:
         return
     messages = sum(report.messages.values())
     origin = ", ".join(dict.fromkeys(source["session_id"] for source in report.sources))
-    say(
+    echo(
         f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, "
         f"{report.output.stat().st_size / 1e6:.1f} MB"
     )
     for warning in report.warnings:
-        say(f"warning: {warning}")
+        echo(f"warning: {warning}")
     for note in report.notes:
-        say(f"note: {note}")
+        echo(f"note: {note}")
     width = max(map(len, report.messages), default=0)
     for topic, count in report.messages.items():
-        say(f"  {topic:<{width}}  {count} messages")
+        echo(f"  {topic:<{width}}  {count} messages")

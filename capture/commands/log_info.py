@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ..common.console import emit_json, say
+from ..common.console import echo, emit_json
 from ..common.errors import DataError
 from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
@@ -110,31 +110,31 @@ def _print_facts(facts: dict[str, Any]) -> None:
         if session["start_utc"]
         else "no messages"
     )
-    say(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
+    echo(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
     for warning in facts["warnings"]:
-        say(f"warning: {warning}")
+        echo(f"warning: {warning}")
     foreign = Counter(topic["encoding"] or "no encoding" for topic in _foreign(facts))
     if foreign:
         order = sorted(foreign.items(), key=lambda item: (-item[1], item[0]))
         listed = ", ".join(f"{encoding} {count}" for encoding, count in order)
         topics = "1 topic is" if foreign.total() == 1 else f"{foreign.total()} topics are"
-        say(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
+        echo(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
     names = [_type(topic) for topic in facts["topics"]]
     width = max([len(topic["topic"]) for topic in facts["topics"]] + [5])
     kinds = max([len(name) for name in names] + [4])
-    say("", f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
+    echo("", f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
     for topic, name in zip(facts["topics"], names, strict=True):
         rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
         held = f"{topic['frames']} frames" if topic["frames"] is not None else topic["unit"] or ""
-        say(
+        echo(
             f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}  "
             f"{rate}  {held}".rstrip()
         )
     if facts["attachments"]:
         listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())
-        say("", f"attached: {', '.join(listed)}")
+        echo("", f"attached: {', '.join(listed)}")
     writer = session["library"] or "an unnamed program"
-    say(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
+    echo(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
 
 
 def _foreign(facts: dict[str, Any]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import complain, emit_json, say
+from ..common.console import complain, echo, emit_json
 from ..common.errors import UndulogError
 
 if TYPE_CHECKING:
@@ -175,11 +175,11 @@ def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
 def _print_report(report: RecordReport) -> None:
     names = ", ".join(str(file) for file in report.files[:3])
     names += f" and {len(report.files) - 3} more" if len(report.files) > 3 else ""
-    say(
+    echo(
         f"{names or 'nothing written'}: {report.duration_s:.1f} s of {report.robot or 'raw data'}, "
         f"{report.messages} messages, {report.size / 1e6:.1f} MB, verdict {report.verdict}"
     )
-    say(f"  ended: {report.ending.reason}")
+    echo(f"  ended: {report.ending.reason}")
     for name, counts in report.sources.items():
         parts = [f"{counts['frames']} frames"]
         dropped = counts["dropped"]
@@ -191,6 +191,6 @@ def _print_report(report: RecordReport) -> None:
         ):
             if counts[key]:
                 parts.append(f"{counts[key]} {what}")
-        say(f"  {name}: {', '.join(parts)}")
+        echo(f"  {name}: {', '.join(parts)}")
     for reason in report.reasons:
-        say(f"  reason: {reason}")
+        echo(f"  reason: {reason}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from ..common.console import complain, emit_json, say
+from ..common.console import complain, echo, emit_json
 from ..common.errors import ControlError, UsageError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def status(*, socket: Path | None = None, json: bool = False) -> int:
     if json:
         emit_json({"recordings": found, "silent": silent})
     for recording in [] if json else found:
-        say(*_summary(recording))
+        echo(*_summary(recording))
     for error in silent:
         complain(f"error: {error}")
     return int(bool(silent))
@@ -119,9 +119,9 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
         _tell("stopping", reply, as_json=json)
     else:
         files = ", ".join(str(file) for file in reply.get("files", []))
-        say(f"{files or 'nothing written'}: {_facts(reply)}")
+        echo(f"{files or 'nothing written'}: {_facts(reply)}")
         for reason in reply.get("reasons", []):
-            say(f"  reason: {reason}")
+            echo(f"  reason: {reason}")
     return int(bool(reply.get("failed", False)))
 
 
@@ -135,7 +135,7 @@ def unit() -> None:
     from ..recorder.systemd import hidden_folder, installed_program, unit_text
 
     program = installed_program()
-    say(*unit_text(program).splitlines())
+    echo(*unit_text(program).splitlines())
     if (folder := hidden_folder(program)) is not None:
         complain(
             f"warning: {program} lies below {folder}, which this unit hides from the service; "
@@ -220,7 +220,7 @@ def _tell(done: str, reply: Mapping[str, Any], *, as_json: bool) -> None:
     if as_json:
         emit_json(dict(reply))
     else:
-        say(": ".join([done, *([_plain(reply)] if reply else [])]))
+        echo(": ".join([done, *([_plain(reply)] if reply else [])]))
 
 
 def _plain(reply: Mapping[str, Any]) -> str:

@@ -43,7 +43,7 @@ def plain(text: str) -> str:
     )
 
 
-def say(*lines: str) -> None:
+def echo(*lines: str) -> None:
     """Print lines on stdout.
 
     Args:

@@ -29,7 +29,7 @@ from .motion import (
 POWERLESS = 0.2
 """Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction."""
 
-ASTRAY = 2.5
+PUSHING_ERROR_RATIO = 2.5
 """Control error, in those of the neighbours, from which a motor with power would push."""
 
 ENDS = 2
@@ -139,7 +139,7 @@ def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
     if each.motion.effort is None or min(k, len(judged) - 1 - k) < ENDS:
         return []
     usual = _known_median([_usual(one, _control_error(one.response)) for one in near])
-    far = _control_error(r) > np.fmax(ASTRAY * usual, r.asked / 2)
+    far = _control_error(r) > np.fmax(PUSHING_ERROR_RATIO * usual, r.asked / 2)
     off = r.valid & ~each.still & far
     if not off.any():
         return []

@@ -48,7 +48,7 @@ STEPPED = 0.35
 SETTLING = 1.5
 """Cycles from the start in which a departure is a transient."""
 
-AGAIN = 3
+MIN_DEPARTURES = 3
 """Short departures that make a fault."""
 
 GROWN = 0.8
@@ -253,7 +253,7 @@ def _grows(response: Response, at_s: float) -> bool:
 def _lasting(spans: Sequence[Span], period_s: float, length_s: float) -> bool:
     """Whether departures come again and again, or one of them lasts a cycle."""
     together = sum(stop - start for start, stop in spans)
-    again = len(spans) >= AGAIN and together > AT_TIMES * length_s
+    again = len(spans) >= MIN_DEPARTURES and together > AT_TIMES * length_s
     return again or any(stop - start > period_s for start, stop in spans)
 
 

@@ -37,7 +37,7 @@ OF_SENSOR = 0.5
 MOSTLY = 0.5
 """Share of exact repeats above which a sensor may be frozen."""
 
-AGAIN = 3
+MIN_RETURNS = 3
 """Times that a joint stands at one place, which is no chance."""
 
 LIMIT_SHARE = 0.02
@@ -292,7 +292,7 @@ def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
 
 def _at_one_end(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
     """Whether the joint stands again and again at the same end of its motion."""
-    if len(spans) < AGAIN:
+    if len(spans) < MIN_RETURNS:
         return False
     values = motion.position.values
     levels = [

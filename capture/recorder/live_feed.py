@@ -35,7 +35,7 @@ from .live_wire import (
     RECORD_SIZE,
     DatagramHead,
     Kind,
-    LiveWords,
+    LiveDefinitions,
     Queued,
     pack_datagram,
     pack_message,
@@ -198,7 +198,7 @@ class LiveFeed:
         self.path = Path(path)
         self.counts = LiveCounts()
         self._max_messages, self._max_bytes = max_messages, max_bytes
-        self._words = LiveWords(period_ns=round(1e9 / max_rate_hz), raw_frames=raw_frames)
+        self._words = LiveDefinitions(period_ns=round(1e9 / max_rate_hz), raw_frames=raw_frames)
         self._feed_id = int.from_bytes(os.urandom(8), "little")
         self._socket: socket.socket | None = None
         self._periods = self._words.periods

@@ -204,7 +204,7 @@ Queued = tuple[int, int, int, int, int, bytes]
 """The fields of a :class:`.capture.recorder.live_wire.LiveMessage`."""
 
 
-class LiveWords:
+class LiveDefinitions:
     """Definitions, and the last messages of topics that speak only on change."""
 
     def __init__(self, *, period_ns: int, raw_frames: bool) -> None:

@@ -45,7 +45,7 @@ from ..log.messages.frames import (
 from ..robot.model import ClockDomain
 from .address import flag, number, only
 from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress
-from .events import ODD_TIME, Tally
+from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
 from .slcan import SlcanSettings, slcan_source
 from .socketcan import socketcan_source
@@ -110,7 +110,7 @@ class PythonCanLink:
         held = [self._held.popleft() for _ in range(count)]
         if self._device_time:
             odd = sum(not 0.0 <= message.timestamp < _TIMES_END_S for _, message in held)
-            self._tally.malformed(ODD_TIME, odd)
+            self._tally.malformed(IMPLAUSIBLE_TIME, odd)
         classic = [pair for pair in held if not _is_fd(pair[1])]
         fd = [pair for pair in held if _is_fd(pair[1])] if len(classic) < count else []
         return (

@@ -17,7 +17,7 @@ import numpy as np
 from ..log.messages.frames import ERROR_FLAG, ID_MASK, FrameArray
 from .contract import DEVICE_TIMES_END_NS, SourceCounts, SourceEvent
 
-ODD_TIME = "device time out of range, another is estimated"
+IMPLAUSIBLE_TIME = "device time out of range, another is estimated"
 """The event of a frame whose device time is impossible."""
 
 _PAUSE_NS = 1_000_000_000
@@ -178,7 +178,7 @@ class BusWatch:
         t_ns = frames["t_device_ns"]
         if t_ns.max(initial=0) >= DEVICE_TIMES_END_NS:
             odd = int((t_ns >= np.uint64(DEVICE_TIMES_END_NS)).sum())
-            tally.malformed(ODD_TIME, odd)
+            tally.malformed(IMPLAUSIBLE_TIME, odd)
         ids = frames["id_flags"]
         if not np.bitwise_or.reduce(ids) & ERROR_FLAG:
             if self._off and len(ids):

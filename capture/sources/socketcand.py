@@ -28,7 +28,7 @@ from ..log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLA
 from ..robot.model import ClockDomain
 from .address import number, only
 from .contract import SourceAddress, pack_record, records
-from .events import ODD_TIME, Tally
+from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
 from .reader_thread import ReceiveThread
 from .receive_many import ArrivalClock
@@ -171,7 +171,7 @@ def _time_ns(stamp: str, t_host_ns: int, tally: Tally) -> int:
     """A frame's time; that of its arrival where the server's is negative, infinite or too long."""
     found = _TIME.fullmatch(stamp)
     if found is None:
-        tally.malformed(ODD_TIME, 1)
+        tally.malformed(IMPLAUSIBLE_TIME, 1)
         return t_host_ns
     seconds, fraction = found.groups(default="")
     return int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0"))

@@ -24,7 +24,14 @@ from undulog.capture.common.errors import DataError, UndulogError
 from undulog.sim.scenario.scenario import Kernels, Scenario
 
 from ..reproduce import find_repetition
-from .identifiability import Alternative, Ridge, alternatives, half_widths, ridges, what_would_tell
+from .identifiability import (
+    Alternative,
+    CorrelatedParameters,
+    alternatives,
+    half_widths,
+    ridges,
+    suggested_recordings,
+)
 from .lack_of_fit import LackOfFit, Misfit, halves, lack_of_fit, misfit
 from .parameters import (
     DELAY,
@@ -168,7 +175,7 @@ class Calibration:
     world: str
     scenario: Scenario
     parameters: tuple[Fitted, ...]
-    ridges: tuple[Ridge, ...]
+    ridges: tuple[CorrelatedParameters, ...]
     would_tell: tuple[str, ...]
     before: dict[str, Misfit]
     after: dict[str, Misfit]
@@ -286,7 +293,7 @@ def _calibration(
         scenario=with_values(answers.scenario, solution.unknowns, solution.x),
         parameters=tuple(parameters),
         ridges=ridges(solution.unknowns, solution.covariance),
-        would_tell=what_would_tell(
+        would_tell=suggested_recordings(
             solution.unknowns,
             [i for i, one in enumerate(parameters) if not (one.determined or lack.found)],
         ),

@@ -60,7 +60,7 @@ _TELLS = {
 
 
 @dataclass(frozen=True)
-class Ridge:
+class CorrelatedParameters:
     """A direction that a session doesn't tell.
 
     Attributes:
@@ -78,7 +78,7 @@ def half_widths(covariance: FloatArray) -> FloatArray:
     return Z95 * np.sqrt(np.diag(covariance))
 
 
-def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Ridge, ...]:
+def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[CorrelatedParameters, ...]:
     """The directions that are left open.
 
     Args:
@@ -90,7 +90,7 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Ridge, 
     """
     spread = np.array([one.spread for one in unknowns])
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
-    found: list[Ridge] = []
+    found: list[CorrelatedParameters] = []
     for k in np.argsort(values)[::-1].tolist():
         left = float(np.sqrt(max(values[k], 0.0)))
         if left <= _RIDGE:
@@ -103,11 +103,11 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Ridge, 
             unknowns[i].label: unknowns[i].value(float(way[i])) / (unknowns[i].start or 1.0)
             for i in moved
         }
-        found.append(Ridge(left, factors))
+        found.append(CorrelatedParameters(left, factors))
     return tuple(found)
 
 
-def what_would_tell(unknowns: Sequence[Unknown], open_ones: Sequence[int]) -> tuple[str, ...]:
+def suggested_recordings(unknowns: Sequence[Unknown], open_ones: Sequence[int]) -> tuple[str, ...]:
     """What else to record.
 
     Args:

@@ -25,7 +25,7 @@ from undulog.capture.robot.model import Robot
 from undulog.sim.scenario.scenario import Modules
 
 from .fit import Calibration, Fitted
-from .identifiability import Z95, Alternative, Ridge
+from .identifiability import Z95, Alternative, CorrelatedParameters
 from .lack_of_fit import LEVEL, LackOfFit, Misfit
 from .parameters import DELAY
 
@@ -315,7 +315,7 @@ def _undetermined(calibration: Calibration) -> Iterator[str]:
         yield f"  what would tell {line}"
 
 
-def _ridge(ridge: Ridge) -> str:
+def _ridge(ridge: CorrelatedParameters) -> str:
     return ", ".join(
         f"{label} + {1e3 * factor:.2g} ms" if label == DELAY else f"{label} x {factor:.2f}"
         for label, factor in ridge.factors.items()

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import interruptible
@@ -90,12 +90,12 @@ def fit(
         paths = {"robot": str(output), "scenario": None if scenario is None else str(scenario)}
         emit_json({**reported(calibration), "written": paths})
         return 0
-    say(*told(calibration))
-    say(f"{output}: the robot with the fitted servo")
+    echo(*told(calibration))
+    echo(f"{output}: the robot with the fitted servo")
     if scenario is not None:
-        say(f"{scenario}: the scenario with the fitted ground, on that robot")
+        echo(f"{scenario}: the scenario with the fitted ground, on that robot")
     elif calibration.scenario.world.ground is not None:
-        say("The ground's friction belongs to a scenario: --scenario FILE writes one.")
+        echo("The ground's friction belongs to a scenario: --scenario FILE writes one.")
     return 0
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
     from undulog.analysis.results.comparison import Comparison
 
-    from ..reproduce import Again, Sameness
+    from ..reproduce import LogDifference, ReproducedRun
 
 
 _TWIN = "twin"
@@ -114,12 +114,12 @@ def replay(
     if json:
         emit_json(_reported(again, changes))
     else:
-        say(*_told(again))
+        echo(*_told(again))
         comparison = again.comparison
         if comparison is not None and not (again.same and again.same.exact):
             _show(comparison)
         comparable = comparison is not None
-        say(*what_next(file, again.recording.path, comparable=comparable))
+        echo(*what_next(file, again.recording.path, comparable=comparable))
     return 0
 
 
@@ -128,11 +128,11 @@ def _show(comparison: Comparison) -> None:
     from undulog.analysis.commands.options import show
     from undulog.analysis.present.text_experiment import render_comparison
 
-    say("")
+    echo("")
     show(lambda width, color: render_comparison(comparison, width=width, color=color), None)
 
 
-def _told(again: Again) -> Iterator[str]:
+def _told(again: ReproducedRun) -> Iterator[str]:
     recording, scenario = again.recording, again.scenario
     yield (
         f"{recording.path}: {again.original.name} again on the twin of {scenario.robot.name} in "
@@ -146,7 +146,7 @@ def _told(again: Again) -> Iterator[str]:
         yield f"Not compared: {again.not_compared}"
 
 
-def _same(same: Sameness) -> Iterator[str]:
+def _same(same: LogDifference) -> Iterator[str]:
     if same.exact:
         yield (
             f"The same to the last bit: all {same.messages} messages on {len(same.same)} topics."
@@ -161,7 +161,7 @@ def _same(same: Sameness) -> Iterator[str]:
         yield f"Only one of the two has {', '.join(same.one_sided)}."
 
 
-def _reported(again: Again, changes: dict[str, Any]) -> dict[str, Any]:
+def _reported(again: ReproducedRun, changes: dict[str, Any]) -> dict[str, Any]:
     recording, same = again.recording, again.same
     return {
         "original": str(again.original),

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 
 from .view_film import ClipOptions, view_clip
-from .view_overlay import BesideOptions
+from .view_overlay import OverlayOptions
 from .view_single import SingleOptions
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def view(
     single: Annotated[SingleOptions | None, Parameter(name="*")] = None,
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
-    beside: Annotated[BesideOptions | None, Parameter(name="*")] = None,
+    beside: Annotated[OverlayOptions | None, Parameter(name="*")] = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -88,9 +88,9 @@ def view(
     elif len(files) == 1:
         _view_file(files[0], single or SingleOptions(), save=save, web=web, json=json)
     else:
-        from .view_overlay import view_beside
+        from .view_overlay import view_overlay
 
-        view_beside(files, beside or BesideOptions(), save=save, web=web, json=json)
+        view_overlay(files, beside or OverlayOptions(), save=save, web=web, json=json)
 
 
 def _check_usage(
@@ -172,12 +172,12 @@ def _report(recording: Recording, duration_s: float, *, json: bool) -> None:
     if json:
         emit_json(_facts(recording, duration_s, size))
         return
-    say(
+    echo(
         f"{recording.path}: {duration_s:.1f} s, {size / 1e6:.1f} MB; open it with: rerun "
         f"{recording.path}"
     )
     for warning in recording.warnings:
-        say(f"note: {warning}")
+        echo(f"note: {warning}")
 
 
 def _facts(recording: Recording, duration_s: float, size: int) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
 
@@ -132,9 +132,9 @@ def _report(clip: Path, shot: Shot, frames: int, recording: Recording, *, json: 
     if json:
         emit_json(facts)
         return
-    say(
+    echo(
         f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {shot.size[0]}x{shot.size[1]}, "
         f"{facts['bytes'] / 1e6:.2f} MB"
     )
     for warning in recording.warnings:
-        say(f"note: {warning}")
+        echo(f"note: {warning}")

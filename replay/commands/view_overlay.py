@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, say
+from undulog.capture.common.console import echo, emit_json, progress
 from undulog.capture.common.process import interruptible
 
 from ..viewer import viewer
 
 if TYPE_CHECKING:
     from ..overlay.alignment import Align
-    from ..overlay.write import Beside, Place
+    from ..overlay.write import Overlay, Place
 
 
 @dataclass(frozen=True, kw_only=True)
-class BesideOptions:
+class OverlayOptions:
     """What the command line says of sessions side by side; None is what it doesn't say.
 
     Attributes:
@@ -46,9 +46,9 @@ class BesideOptions:
         return [f"--{name}" for name, value in named.items() if value is not None]
 
 
-def view_beside(
+def view_overlay(
     files: Sequence[Path],
-    options: BesideOptions,
+    options: OverlayOptions,
     *,
     save: Path | None,
     web: bool,
@@ -67,7 +67,7 @@ def view_beside(
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
     from ..overlay.alignment import Align
-    from ..overlay.combine import bring_together, steps
+    from ..overlay.combine import combine_sessions, steps
     from ..overlay.side import names_of
     from ..overlay.write import Place
 
@@ -78,7 +78,7 @@ def view_beside(
     with ExitStack() as stack:
         path = save or _in_passing(stack)
         with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
-            beside = bring_together(
+            beside = combine_sessions(
                 files,
                 path,
                 names=names,
@@ -89,7 +89,7 @@ def view_beside(
             )
         _report(beside, how, place, saved=save is not None, json=json)
         if web:
-            viewer.serve(path, say)
+            viewer.serve(path, echo)
         elif save is None:
             viewer.show(path)
 
@@ -100,7 +100,7 @@ def _in_passing(stack: ExitStack) -> Path:
     return Path(folder) / "beside.rrd"
 
 
-def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool) -> None:
+def _report(beside: Overlay, how: Align, place: Place, *, saved: bool, json: bool) -> None:
     size = beside.path.stat().st_size
     if json:
         emit_json(_facts(beside, how, place, size))
@@ -109,14 +109,14 @@ def _report(beside: Beside, how: Align, place: Place, *, saved: bool, json: bool
 
     first, *others = [one.side for one in beside.shown]
     for other in others:
-        say(f"{words.answer(first, other, beside.found[other.name])}.")
+        echo(f"{words.answer(first, other, beside.found[other.name])}.")
     if saved:
-        say(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
+        echo(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
     for warning in beside.warnings:
-        say(f"note: {warning}")
+        echo(f"note: {warning}")
 
 
-def _facts(beside: Beside, how: Align, place: Place, size: int) -> dict[str, Any]:
+def _facts(beside: Overlay, how: Align, place: Place, size: int) -> dict[str, Any]:
     return {
         "path": str(beside.path),
         "bytes": size,
@@ -128,7 +128,7 @@ def _facts(beside: Beside, how: Align, place: Place, size: int) -> dict[str, Any
     }
 
 
-def _session(beside: Beside, place: int) -> dict[str, Any]:
+def _session(beside: Overlay, place: int) -> dict[str, Any]:
     from ..overlay import layout as words
 
     one, first = beside.shown[place], beside.shown[0].side

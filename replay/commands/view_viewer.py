@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from undulog.capture import Session, SessionView
-from undulog.capture.common.console import complain, emit_json, progress, say
+from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.process import interruptible
 
 from ..samples.content import Layer
@@ -47,7 +47,7 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
     elif connect is not None:
         report = relay_to_viewer(path, None, connect)
     elif web:
-        with open_server(say) as server:
+        with open_server(echo) as server:
             report = relay_to_viewer(path, server, server.address)
     else:
         with open_window() as window:
@@ -69,9 +69,9 @@ def _leave(complaint: str) -> NoReturn:
 def _tell(report: RelayReport, save: Path | None) -> None:
     where = f"{save}: " if save is not None else ""
     late = "" if report.lag_s is None else f", {report.lag_s[0] * 1e3:.0f} ms late (median)"
-    say(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")
+    echo(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")
     if report.unread:
-        say(f"note: {report.unread} messages could not be read")
+        echo(f"note: {report.unread} messages could not be read")
 
 
 def _facts(report: RelayReport, save: Path | None) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         stack.enter_context(process)
         if page:
             process.wait_until_it_listens()
-            say(page)
+            echo(page)
         # Rerun would tell a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
         from ..feed.numbers import Analysing
@@ -132,9 +132,9 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return
-        say(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
+        echo(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
         for note in notes:
-            say(f"note: {note}")
+            echo(f"note: {note}")
         process.wait(stop)
 
 
@@ -147,6 +147,6 @@ def _known(session: SessionView, single: SingleOptions) -> Layer:
     """What results say of it."""
     if not single.result:
         return Layer(None)
-    from ..feed.numbers import found_before
+    from ..feed.numbers import read_results
 
-    return found_before(session, single.result)
+    return read_results(session, single.result)

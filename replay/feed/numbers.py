@@ -25,7 +25,7 @@ from undulog.analysis.present.notebook.files import load
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.results.comparison import Comparison
 from undulog.analysis.results.experiment import Experiment
-from undulog.analysis.results.formats import told_p
+from undulog.analysis.results.formats import p_value_text
 from undulog.analysis.results.null_model import ModelledAnalysis
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
@@ -155,11 +155,11 @@ def saved(session: SessionView, paths: Sequence[Path], options: Options | None =
         DataError: If one holds no result, one that names no session, one of other sessions, or a
             second one with numbers of this session.
     """
-    known = found_before(session, paths)
+    known = read_results(session, paths)
     return known if known.analysis is not None else known.with_numbers(computed(session, options))
 
 
-def found_before(session: SessionView, paths: Sequence[Path]) -> Layer:
+def read_results(session: SessionView, paths: Sequence[Path]) -> Layer:
     """Read what was found of a session before, and compute nothing.
 
     Args:
@@ -229,14 +229,18 @@ def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
         for pair in result.reversal.pairs:
             how = "less gain" if pair.by == "gain" else "more lag"
             floor = "" if result.reversal.tilt.excluded else ", or the floor is tilted"
-            why = f"{how} than its mirror joint {pair.mirror}, {told_p(pair.p)}{floor}"
+            why = f"{how} than its mirror joint {pair.mirror}, {p_value_text(pair.p)}{floor}"
             yield Named(pair.name, why)
     elif isinstance(result, Comparison):
         for joint in result.named:
             if joint.size >= 1.0:  # in margins: what differs by less is there, but small
-                yield Named(joint.name, f"answers differently in A and B, {told_p(joint.p_holm)}")
+                yield Named(
+                    joint.name, f"answers differently in A and B, {p_value_text(joint.p_holm)}"
+                )
     elif isinstance(result, ModelledAnalysis):
         test = result.null_model
         for module in test.modules:
             if module.name in test.named:
-                yield Named(module.name, f"deviates from the others' model, {told_p(module.p)}")
+                yield Named(
+                    module.name, f"deviates from the others' model, {p_value_text(module.p)}"
+                )

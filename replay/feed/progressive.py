@@ -56,7 +56,7 @@ from .numbers import Analysing
 from .recording import open_recording, recording_id, send_properties
 
 
-def foreseen(content: Content, rhythm: Rhythm | None) -> Content:
+def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
     """Add what an analysis adds to a session like this.
 
     Args:
@@ -295,7 +295,7 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
         drawing.write_words()
     else:
         drawing.content = replace(drawing.content, modes=2, has_events=True)
-    early = foreseen(drawing.content, clock.rhythm)
+    early = predict_layout(drawing.content, clock.rhythm)
     sink.connect(rec, build_blueprint(early))
     drawing.write_facts(session, task.known, early, awaited=task.known.analysis is None)
     drawing.write(first)

@@ -235,7 +235,7 @@ def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
     return Placement(turn, float(step[0]), float(step[1]))
 
 
-def told_placed(placed: Placement, name: str, first: str) -> str:
+def placement_text(placed: Placement, name: str, first: str) -> str:
     """A placement in words.
 
     Args:

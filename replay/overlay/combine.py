@@ -14,10 +14,10 @@ from undulog.capture.common.process import StopRequest
 
 from .alignment import Align, align
 from .side import convert, names_of, read_side
-from .write import Beside, Converted, Place, write_beside
+from .write import Converted, Overlay, Place, write_overlay
 
 
-def bring_together(
+def combine_sessions(
     files: Sequence[Path],
     path: Path,
     *,
@@ -26,7 +26,7 @@ def bring_together(
     place: Place = Place.START,
     on_step: Callable[[int, str], None] = lambda _done, _note: None,
     stop: StopRequest | None = None,
-) -> Beside:
+) -> Overlay:
     """Convert sessions and bring them together.
 
     Args:
@@ -65,7 +65,7 @@ def bring_together(
             step(f"recording of {name}")
             converted.append(Converted(one, *convert(session, folder / f"{k}.rrd")))
         step("side by side")
-        return write_beside(converted, path, how, place=place, stop=stop)
+        return write_overlay(converted, path, how, place=place, stop=stop)
 
 
 def steps(count: int) -> int:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.compare.side import Known, Seen
+from undulog.analysis.compare.side import ComparedSession, Known
 from undulog.analysis.estimators.intervals import around, t_factor
 from undulog.analysis.results.comparison import BODY, Comparison
 from undulog.analysis.results.estimate import Estimate
@@ -172,7 +172,9 @@ class _Bar:
     far: float | None
 
 
-def log_bars(rec: rr.RecordingStream, sides: Sequence[tuple[Side, Seen]]) -> tuple[Quantity, ...]:
+def log_bars(
+    rec: rr.RecordingStream, sides: Sequence[tuple[Side, ComparedSession]]
+) -> tuple[Quantity, ...]:
     """Write the sessions' bars next to each other.
 
     Args:

@@ -140,7 +140,7 @@ def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
     return "\n".join(lines)
 
 
-APART = "/head_distance"
+SEPARATE = "/head_distance"
 """Distance of the heads, below a session's own path."""
 
 _HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)
@@ -302,7 +302,7 @@ def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
             plane = str(view.name).lower().replace("measured", "").strip()
             view.name = f"{one.side.name} − {first.side.name}, {plane}".replace(", [", " [")
             found.append(view)
-    apart = [f"{one.side.own}{APART}" for one in others if one.apart]
+    apart = [f"{one.side.own}{SEPARATE}" for one in others if one.apart]
     if apart:
         found.append(_plot("Heads apart [m]", apart))
     return found

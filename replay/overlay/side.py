@@ -9,7 +9,7 @@ from pathlib import Path
 import rerun as rr
 
 from undulog.analysis.compare.alignment import facts_of
-from undulog.analysis.compare.side import Seen, see
+from undulog.analysis.compare.side import ComparedSession, see
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionView
 from undulog.capture.common.errors import UndulogError, UsageError
@@ -132,7 +132,7 @@ def read_side(session: SessionView, name: str) -> Side:
     )
 
 
-def convert(session: SessionView, path: Path) -> tuple[Recording, Seen | None]:
+def convert(session: SessionView, path: Path) -> tuple[Recording, ComparedSession | None]:
     """Write the session's own recording, and take from it what a comparison needs.
 
     Returns:
@@ -144,7 +144,7 @@ def convert(session: SessionView, path: Path) -> tuple[Recording, Seen | None]:
         LogWriteError: If the file can't be written.
     """
     notes: list[str] = []
-    seen: Seen | None = None
+    seen: ComparedSession | None = None
     try:
         seen = see(session, Options(), notes.append)
     except UndulogError as error:  # a session without a gait can be seen too

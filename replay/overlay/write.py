@@ -20,8 +20,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from undulog.analysis.compare.compare import Choices, compare_seen
-from undulog.analysis.compare.side import Seen
+from undulog.analysis.compare.compare import Choices, compare_fitted
+from undulog.analysis.compare.side import ComparedSession
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.process import StopRequest
@@ -32,7 +32,7 @@ from ..feed.recording import Recording, open_recording, recording_id, require_wh
 from ..samples.content import Series
 from ..samples.sampling import decimate, interpolate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Track, brought_together
+from ..samples.tracks import Track, join_tracks
 from . import differences as bars
 from . import differences as lines
 from . import layout as words
@@ -44,9 +44,9 @@ from .alignment import (
     counterparts,
     head_distance,
     placement,
-    told_placed,
+    placement_text,
 )
-from .layout import APART, Found, Shown, build_blueprint
+from .layout import SEPARATE, Found, Shown, build_blueprint
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
@@ -157,7 +157,7 @@ def log_differences(
             rec,
             a.clock,
             entity if len(parts) == 1 else part_entity(entity, part[0].name),
-            brought_together(part),
+            join_tracks(part),
             a.side.palette,
             degrees=True,
         )
@@ -194,11 +194,11 @@ class Converted:
 
     aligned: Aligned
     recording: Recording
-    seen: Seen | None
+    seen: ComparedSession | None
 
 
 @dataclass(frozen=True)
-class Beside:
+class Overlay:
     """What was written.
 
     Attributes:
@@ -217,7 +217,7 @@ class Beside:
     warnings: tuple[str, ...]
 
 
-def write_beside(
+def write_overlay(
     sessions: Sequence[Converted],
     path: Path,
     how: Align,
@@ -225,7 +225,7 @@ def write_beside(
     place: Place = Place.START,
     stop: StopRequest | None = None,
     layout: Layout = build_blueprint,
-) -> Beside:
+) -> Overlay:
     """Bring converted sessions together.
 
     Args:
@@ -282,7 +282,7 @@ def write_beside(
             rec.disconnect()
         require_whole(draft, path)
         check_stop(path, stop)
-    return Beside(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
+    return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
 
 
 def _chunks(one: Converted) -> LazyChunkStream:
@@ -320,7 +320,7 @@ def _compare(first: Converted, other: Converted) -> Found:
     assert first.seen is not None  # noqa: S101 - just looked
     assert other.seen is not None  # noqa: S101
     try:
-        comparison = compare_seen([first.seen], [other.seen], Choices(any_gait=True))
+        comparison = compare_fitted([first.seen], [other.seen], Choices(any_gait=True))
     except UndulogError as error:
         return Found(None, f"not compared: {error}", changed)
     return Found(comparison, None, changed)
@@ -341,7 +341,7 @@ def _placements(
             )
         else:
             found[name] = placed
-            told.append(told_placed(placed, name, first))
+            told.append(placement_text(placed, name, first))
     if len(bodies) > 1 and place is Place.WORLD:
         told.append("every body is drawn where its own session says that it was")
     return found
@@ -403,7 +403,7 @@ def _log_apart(rec: rr.RecordingStream, a: Aligned, b: Aligned, how: Align, pair
     if known:
         name = f"{b.side.name}, {a.side.name}"
         colors = {name: dress.tint(pair.rank)}
-        log_scalars(rec, a.clock, f"{b.side.own}{APART}", [Track(name, t_ns, apart)], colors)
+        log_scalars(rec, a.clock, f"{b.side.own}{SEPARATE}", [Track(name, t_ns, apart)], colors)
     return known
 
 

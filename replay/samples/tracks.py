@@ -191,7 +191,7 @@ def in_turn(first: IntArray, other: IntArray) -> bool:
     return inner.size >= max(first.size - 2, 1) and bool(np.all(np.diff(inner) == 1))
 
 
-def brought_together(tracks: Sequence[Track]) -> Table:
+def join_tracks(tracks: Sequence[Track]) -> Table:
     """Joints at the times of the first of them.
 
     Args:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..drive.motion import Driven
+    from ..drive.motion import MotionSource
     from ..scenario.scenario import Scenario
     from ..twin.recording import Recording
 
@@ -58,7 +58,7 @@ def drive(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
-    from ..drive.motion import find_driven
+    from ..drive.motion import find_motion
     from ..scenario.scenario_file import load_scenario
 
     if output is not None:
@@ -79,7 +79,7 @@ def drive(
         bus_address(on)
         described = load_robot(robot) if robot is not None else None
         return drive_on_bus(
-            find_driven(what, robot=described),
+            find_motion(what, robot=described),
             on,
             arm=arm,
             robot=described,
@@ -94,12 +94,12 @@ def drive(
             "--arm, --recorder and --robot are for a bus; a run of the twin records itself"
         )
     world = load_scenario(rest) if rest else None
-    driven = find_driven(what, world)
+    driven = find_motion(what, world)
     return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
 
 
 def _on_twin(
-    driven: Driven, scenario: Scenario, output: Path | None, *, force: bool, as_json: bool
+    driven: MotionSource, scenario: Scenario, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
     from ..drive.in_process import drive_twin
 
@@ -124,12 +124,12 @@ def _on_twin(
     if as_json:
         emit_json(_reported(driven, scenario, recording, factor))
     else:
-        say(*_told(driven, scenario, recording, factor))
+        echo(*_told(driven, scenario, recording, factor))
     return 0
 
 
 def _reported(
-    driven: Driven, scenario: Scenario, recording: Recording, factor: float
+    driven: MotionSource, scenario: Scenario, recording: Recording, factor: float
 ) -> dict[str, Any]:
     return {
         "driven": driven.name,
@@ -146,7 +146,9 @@ def _reported(
     }
 
 
-def _told(driven: Driven, scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+def _told(
+    driven: MotionSource, scenario: Scenario, recording: Recording, factor: float
+) -> list[str]:
     if recording.complete:
         first = f"{recording.path}: drove {driven.name} for {recording.duration_s:g} s"
     else:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from undulog.capture.common.console import complain, emit_json, progress, say
+from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 from undulog.capture.recorder.control_client import find_sockets
@@ -19,17 +19,17 @@ from undulog.capture.robot.model import Robot
 from ..drive.dry_run import dry_run
 from ..drive.dry_run_text import reported, told
 from ..drive.loop import BusTick, ConsoleWatch
-from ..drive.motion import Driven
+from ..drive.motion import MotionSource
 from ..drive.over_bus import BusPlan, bus_plan, check_drivable, drive_bus
 from ..drive.report import BusReport, report_facts, report_lines
-from ..gate.outcome import How
+from ..gate.outcome import DriveEnding
 from ..scenario.scenario import Scenario
 
 _UNLIMITED = 10_000
 
 
 def run_dry(
-    driven: Driven,
+    driven: MotionSource,
     on: str,
     *,
     robot: Robot | None = None,
@@ -83,9 +83,9 @@ def run_dry(
         emit_json({"on": on, **reported(run)})
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _UNLIMITED
-        say(*told(run, width))
+        echo(*told(run, width))
         if run.verdict.fit:
-            say("", f"To send it to {on}, the same with --arm and -o SESSION.mcap")
+            echo("", f"To send it to {on}, the same with --arm and -o SESSION.mcap")
     return 0 if run.verdict.fit else 1
 
 
@@ -104,7 +104,7 @@ class ArmedRun:
     @property
     def complete(self) -> bool:
         """Whether it ran to its planned end."""
-        return self.report.outcome.how is How.COMPLETE
+        return self.report.outcome.how is DriveEnding.COMPLETE
 
     def facts(self) -> dict[str, Any]:
         """For JSON."""
@@ -153,7 +153,7 @@ class ArmedRun:
 
 
 def drive_armed(
-    driven: Driven,
+    driven: MotionSource,
     on: str,
     *,
     robot: Robot | None,
@@ -209,7 +209,7 @@ def drive_armed(
 
 
 def drive_on_bus(
-    driven: Driven,
+    driven: MotionSource,
     on: str,
     *,
     arm: bool,
@@ -265,7 +265,7 @@ def drive_on_bus(
     if as_json:
         emit_json(run.facts())
     else:
-        say(*run.lines())
+        echo(*run.lines())
     return run.complain()
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import emit_json, progress, refuse_existing, say
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
@@ -83,12 +83,12 @@ def null(
             }
         )
         return
-    say(
+    echo(
         f"{output}: {len(model.joints)} driven joints of {model.robot} at {model.frequency_hz:g} "
         f"Hz; off the twin by at most {model.error:.2g} in ln gain and lag within its reach"
     )
     for one in model.parameters:
-        say(
+        echo(
             f"{one.name.replace('_', ' ')} {one.value:g} {one.unit}, by a factor "
             f"exp(±{one.reach:g})"
         )
@@ -112,7 +112,7 @@ def list_scenarios(*, json: bool = False) -> None:
         emit_json([_described(scenario) for scenario in scenarios])
         return
     columns = get_terminal_size().columns if sys.stdout.isatty() else _UNWRAPPED
-    say(*_listed(scenarios, columns))
+    echo(*_listed(scenarios, columns))
 
 
 def run(
@@ -175,7 +175,7 @@ def run(
     if json:
         emit_json(_reported(chosen, recording, factor))
     else:
-        say(*_told(chosen, recording, factor))
+        echo(*_told(chosen, recording, factor))
     return 0 if recording.complete else 1
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import complain, say
+from undulog.capture.common.console import complain, echo
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ class _Report:
         self._say(facts, _told(self._plan, served, bus, sender))
 
     def _say(self, facts: dict[str, Any], lines: list[str]) -> None:
-        say(*([dumps(facts)] if self._json else lines))
+        echo(*([dumps(facts)] if self._json else lines))
 
 
 def _told(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:

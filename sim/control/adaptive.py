@@ -12,11 +12,11 @@ from ..gait.contract import WALK, Gait, GaitTick, Generator, Modulation, Reading
 from ..scenario.controllers import Controller, RandomTurns, TargetHeading
 from ..scenario.gaits import generator
 from ..scenario.sensors import layout
-from .dead_reckoning import Reckoning, turned
+from .dead_reckoning import DeadReckoning, turned
 from .filters import BodyWave
-from .heading import Course, RandomCourse, StraightOn, TargetCourse
-from .obstacle_monitor import Distances, Lookout, Moment
-from .reactions import Haste, Shrinking, Steering
+from .heading import HeadingPolicy, RandomHeadingPolicy, StraightOn, TargetHeadingPolicy
+from .obstacle_monitor import ControlInput, Distances, ObstacleMonitor
+from .reactions import AmplitudeReduction, Steering, TailSpeedUp
 
 if TYPE_CHECKING:
     from ..scenario.scenario import Scenario
@@ -37,7 +37,7 @@ class AdaptiveGait:
     """
 
     def __init__(
-        self, generator: Generator, controller: Controller, course: Course, robot: Robot
+        self, generator: Generator, controller: Controller, course: HeadingPolicy, robot: Robot
     ) -> None:
         """Wrap a generator that has not been stepped yet.
 
@@ -50,11 +50,13 @@ class AdaptiveGait:
         self._robot = robot
         self._course = course
         self._distances = Distances(roles.fold_m, controller.near_hold_s)
-        self._reckoning = Reckoning(controller.calibration, robot)
-        self._lookout = Lookout(controller.lookout, roles, robot)
+        self._reckoning = DeadReckoning(controller.calibration, robot)
+        self._lookout = ObstacleMonitor(controller.lookout, roles, robot)
         self._steering = Steering(controller.head)
-        self._shrinking = Shrinking(controller.side, roles, robot) if controller.side else None
-        self._haste = Haste(controller.tail, roles) if controller.tail else None
+        self._shrinking = (
+            AmplitudeReduction(controller.side, roles, robot) if controller.side else None
+        )
+        self._haste = TailSpeedUp(controller.tail, roles) if controller.tail else None
         parts = (self._steering, self._shrinking, self._haste, course)
         self._parts = [part for part in parts if part is not None]
         self._horizontal = robot.joint_indices(Plane.HORIZONTAL)
@@ -86,7 +88,7 @@ class AdaptiveGait:
             return self._told(tick, time_s)
         elapsed_s, phase = time_s - self._time_s, self._phase
         pose = self._reckoning.step(elapsed_s, phase, self._steering.offset, readings)
-        now = Moment(time_s, elapsed_s, phase, pose, readings)
+        now = ControlInput(time_s, elapsed_s, phase, pose, readings)
         self._distances.step(time_s, readings.ranges)
         head = self._steering.step(now, self._lookout.step(now), self._course.step(now))
         unchanged = Modulation.none(len(self._robot.joints))
@@ -144,14 +146,14 @@ def build_gait(scenario: Scenario) -> Gait:
     return AdaptiveGait(wave, controller, _course(scenario), robot)
 
 
-def _course(scenario: Scenario) -> Course:
+def _course(scenario: Scenario) -> HeadingPolicy:
     controller, target = scenario.controller, scenario.world.target
     course = controller.course if controller is not None else None
     if isinstance(course, RandomTurns):
-        return RandomCourse(course, scenario.seed)
+        return RandomHeadingPolicy(course, scenario.seed)
     if controller is not None and isinstance(course, TargetHeading) and target is not None:
         north = scenario.sensing.compass.north
         x, y = turned(np.array(target.position), -north).tolist()
         radius_m = controller.calibration.turn_radius_m
-        return TargetCourse(course, (x, y), target.radius, radius_m, scenario.robot)
+        return TargetHeadingPolicy(course, (x, y), target.radius, radius_m, scenario.robot)
     return StraightOn()

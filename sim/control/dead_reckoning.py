@@ -91,7 +91,7 @@ class Pose(NamedTuple):
     way: float
 
 
-class Reckoning:
+class DeadReckoning:
     """Adds up what the odometry says; what it gets wrong stays wrong."""
 
     def __init__(self, calibration: Calibration, robot: Robot) -> None:

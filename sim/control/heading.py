@@ -13,13 +13,13 @@ from undulog.capture.robot.model import Robot, SensorKind
 from ..scenario.controllers import RandomTurns, TargetHeading
 from .dead_reckoning import turned
 from .filters import TURN, LowPass
-from .obstacle_monitor import Moment
+from .obstacle_monitor import ControlInput
 
 RANDOM_STREAM = 300
 """Of the scenario's seed; random turns draw from it and nothing else does."""
 
 
-class Course(Protocol):
+class HeadingPolicy(Protocol):
     """Says how to bend when nothing is in the way."""
 
     @property
@@ -32,7 +32,7 @@ class Course(Protocol):
         """What it meant at the last step, in the order of the names."""
         ...
 
-    def step(self, now: Moment) -> float:
+    def step(self, now: ControlInput) -> float:
         """Advance to a tick.
 
         Returns:
@@ -47,7 +47,7 @@ class StraightOn:
     names: tuple[str, ...] = ()
     values: FloatArray = np.zeros(0)
 
-    def step(self, now: Moment) -> float:  # noqa: ARG002 - straight whatever is known
+    def step(self, now: ControlInput) -> float:  # noqa: ARG002 - straight whatever is known
         """Go straight on.
 
         Returns:
@@ -56,7 +56,7 @@ class StraightOn:
         return 0.0
 
 
-class RandomCourse:
+class RandomHeadingPolicy:
     """A random walk: bends drawn at random, each kept for a random time."""
 
     names = ("course.offset",)
@@ -73,7 +73,7 @@ class RandomCourse:
         """The offset [rad]."""
         return np.array([self._offset])
 
-    def step(self, now: Moment) -> float:
+    def step(self, now: ControlInput) -> float:
         """Go on, or draw anew.
 
         Returns:
@@ -86,7 +86,7 @@ class RandomCourse:
         return self._offset
 
 
-class TargetCourse:
+class TargetHeadingPolicy:
     """Towards a target that the robot was told of, by compass and dead reckoning.
 
     The robot knows where the target lies from its start, and reckons where it is from compass and
@@ -128,7 +128,7 @@ class TargetCourse:
         """Heading and bearing of the target from magnetic north [rad], reckoned place [m]."""
         return self._values
 
-    def step(self, now: Moment) -> float:
+    def step(self, now: ControlInput) -> float:
         """Steer to where the target must be.
 
         Returns:
@@ -153,7 +153,7 @@ class TargetCourse:
         ahead, aside = distance * math.cos(error), distance * math.sin(error)
         return math.hypot(ahead, aside - radius) < radius - self._target_radius_m
 
-    def _start_from_north(self, now: Moment) -> float:
+    def _start_from_north(self, now: ControlInput) -> float:
         """The head's heading at the start from magnetic north, to the left [rad]; NaN at first."""
         field = now.readings.magnetic_field.get(self._compass.name)
         if field is None:

@@ -23,7 +23,7 @@ from .dead_reckoning import Pose, turned
 from .filters import NearMemory
 
 
-class Moment(NamedTuple):
+class ControlInput(NamedTuple):
     """One control tick.
 
     Attributes:
@@ -95,7 +95,7 @@ class InTheWay(NamedTuple):
     right: float
 
 
-class Lookout:
+class ObstacleMonitor:
     """Keeps echoes while the robot moves on."""
 
     def __init__(self, parameters: Parameters, layout: Layout, robot: Robot) -> None:
@@ -115,7 +115,7 @@ class Lookout:
         self._last: dict[str, float] = {}
         self._seen: list[tuple[float, FloatArray]] = []
 
-    def step(self, now: Moment) -> InTheWay:
+    def step(self, now: ControlInput) -> InTheWay:
         """Look, and forget what is old.
 
         Returns:
@@ -136,7 +136,7 @@ class Lookout:
             right=float(distance[left <= 0.0].min(initial=math.inf)),
         )
 
-    def _look(self, now: Moment) -> None:
+    def _look(self, now: ControlInput) -> None:
         """Add the echoes that are new."""
         pose = now.pose
         for name, mount, angle in self._mounts:

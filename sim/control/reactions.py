@@ -18,7 +18,7 @@ from undulog.capture.robot.model import Plane, Robot
 from ..scenario.controllers import HeadSteering, SideShrinking, TailHaste
 from ..scenario.sensors import Layout
 from .filters import TURN, LowPass, PhaseHistory, SideLatch
-from .obstacle_monitor import Distances, InTheWay, Moment
+from .obstacle_monitor import ControlInput, Distances, InTheWay
 
 
 def bend(distance: float, side: float, f0: float, k: float) -> float:
@@ -84,7 +84,7 @@ class Steering:
         self.offset = 0.0
         self.values = np.array([0.0, parameters.range_m, 1.0])
 
-    def step(self, now: Moment, seen: InTheWay, course: float) -> float:
+    def step(self, now: ControlInput, seen: InTheWay, course: float) -> float:
         """Steer; :attr:`avoiding` says whether an obstacle is in the way.
 
         Args:
@@ -106,7 +106,7 @@ class Steering:
         return self.offset
 
 
-class Shrinking:
+class AmplitudeReduction:
     """The amplitude of the joints beside a wall."""
 
     def __init__(self, parameters: SideShrinking, layout: Layout, robot: Robot) -> None:
@@ -129,7 +129,7 @@ class Shrinking:
         self.shrinking = False
         self.values = np.ones(len(self._joints))
 
-    def step(self, now: Moment, distances: Distances) -> FloatArray:
+    def step(self, now: ControlInput, distances: Distances) -> FloatArray:
         """Shrink; :attr:`shrinking` says whether some joint has lost a tenth of its amplitude.
 
         The body sweeps to and fro beside a wall, so the distance that counts is the shortest of
@@ -151,7 +151,7 @@ class Shrinking:
         return factor
 
 
-class Haste:
+class TailSpeedUp:
     """The frequency while an obstacle is near the tail."""
 
     names = ("haste.factor", "haste.distance")
@@ -168,7 +168,7 @@ class Haste:
         self.hastening = False
         self.values = np.array([1.0, parameters.range_m])
 
-    def step(self, now: Moment, distances: Distances) -> float:
+    def step(self, now: ControlInput, distances: Distances) -> float:
         """Hasten; :attr:`hastening` says whether an obstacle is near the tail.
 
         Args:

@@ -26,7 +26,7 @@ from undulog.capture.robot.model import Robot, Safety
 from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.gate import POSE_S, Gate
 from ..gate.limits import GateLimits, Ramp, gate_limits, missing_limits
-from ..gate.outcome import GateFault, How, Remark
+from ..gate.outcome import DriveEnding, GateEvent, GateFault
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..scenario.scenario_file import parse_scenario
 from ..twin.recording import Driver, open_session
@@ -34,7 +34,7 @@ from ..twin.session_log import SessionLog
 from ..twin.stability import warnings
 from ..twin.twin import Sample, Twin
 from .dry_run_gait import Demand, GatedGait, JointDemand
-from .motion import Driven
+from .motion import MotionSource
 
 _NOMINAL = """
 description = "Flat ground, and servos as the description of the robot has them."
@@ -100,7 +100,7 @@ class DryRun:
     fault: GateFault | None
     started: bool
     complete: bool
-    remarks: tuple[Remark, ...]
+    remarks: tuple[GateEvent, ...]
     path: Path | None = None
 
     @property
@@ -138,7 +138,7 @@ class DryRun:
 
 
 def dry_run(
-    driven: Driven,
+    driven: MotionSource,
     *,
     robot: Robot | None = None,
     world: Scenario | None = None,
@@ -206,7 +206,7 @@ def dry_run(
                 session.fail(str(error))
             raise
         outcome, first = gate.outcome, gait.inner.first
-        complete = outcome is not None and outcome.how is How.COMPLETE
+        complete = outcome is not None and outcome.how is DriveEnding.COMPLETE
         if session is not None:
             why = "it was stopped" if outcome is None else outcome.why
             session.finish(None if complete else why)
@@ -237,7 +237,7 @@ class _Session:
         self._writer, self._twin = writer, twin
         self._log = SessionLog(writer, twin)
 
-    def write(self, sample: Sample, remarks: Iterable[Remark]) -> None:
+    def write(self, sample: Sample, remarks: Iterable[GateEvent]) -> None:
         self._log.write(sample)
         for remark in remarks:
             self._log.say(*remark)

@@ -19,7 +19,7 @@ from undulog.capture.robot.model import Robot
 from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick, Readings
 from ..gate.gate import Gate
 from ..gate.limits import GateLimits
-from ..gate.outcome import Heard, JointStatus, Phase, Remark
+from ..gate.outcome import GateEvent, GateInput, JointStatus, Phase
 from ..physics.ledger import JOINT_TERMS
 from ..sensing.contract import JointSample, SensorSample
 from ..twin.twin import Sample, Twin
@@ -285,7 +285,7 @@ class GatedGait:
         """
         self.inner = NotedGait(gait, robot)
         self.tally = DemandTally(robot, limits)
-        self.remarks: list[Remark] = []
+        self.remarks: list[GateEvent] = []
         self._told = 0
         self._command = np.clip(np.zeros(len(robot.joints)), *robot.limits())
         self._unknown = np.full(len(robot.joints), np.nan)
@@ -337,7 +337,7 @@ class GatedGait:
             np.zeros(len(self._unknown)),
         )
         before, was = self._command, self._phase
-        step = self._gate.step(self._tick, Heard(readings, status))
+        step = self._gate.step(self._tick, GateInput(readings, status))
         self._tick += 1
         self.remarks += step.remarks
         self._phase = step.phase
@@ -362,7 +362,7 @@ class GatedGait:
         if self._phase is Phase.RUN:
             self.tally.energy(sample.joint_energy)
 
-    def fresh_remarks(self) -> Iterator[Remark]:
+    def fresh_remarks(self) -> Iterator[GateEvent]:
         """What the gate said since this was asked before."""
         told, self._told = self._told, len(self.remarks)
         yield from self.remarks[told:]

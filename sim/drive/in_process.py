@@ -16,7 +16,7 @@ from ..gait.wave import smoothstep
 from ..scenario.scenario import Scenario
 from ..twin.recording import Driver, Recording, record
 from ..twin.twin import Sample
-from .motion import Driven
+from .motion import MotionSource
 
 FADE_S = 1.0
 """A gait that is to stop comes to rest within this time [s]."""
@@ -87,7 +87,7 @@ class FadingGait:
 
 
 def drive_twin(
-    driven: Driven,
+    driven: MotionSource,
     scenario: Scenario,
     path: Path,
     *,
@@ -100,7 +100,7 @@ def drive_twin(
     A stop request lets the gait come to rest first (:class:`Fading`), then the run ends.
 
     Args:
-        scenario: Where; from :meth:`.sim.drive.motion.Driven.scenario`.
+        scenario: Where; from :meth:`.sim.drive.motion.MotionSource.scenario`.
         on_sample: Told of each sample after it was written.
 
     Raises:

@@ -21,10 +21,10 @@ from undulog.capture.robot.model import Direction, Quantity, Robot
 
 from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.confirmation import Confirmation
-from ..gate.feedback import Presence
+from ..gate.feedback import BusCheck
 from ..gate.gate import Gate
 from ..gate.limits import Spacing
-from ..gate.outcome import FaultKind, GateFault, GateStep, Heard, Phase
+from ..gate.outcome import FaultKind, GateFault, GateInput, GateStep, Phase
 from .links import BusReadings, Link, VirtualRobotLink
 
 _STREAMS = (0, 1, 2)
@@ -166,7 +166,7 @@ _WORDS = {
 }
 
 
-def why_stop(stop: StopRequest, *, console_gone: bool) -> str:
+def stop_reason(stop: StopRequest, *, console_gone: bool) -> str:
     """Why it is to stop.
 
     Args:
@@ -276,7 +276,7 @@ class ControlLoop:
         self._gate, self._link, self._pace = gate, link, pace
         self._spacing = spacing
         self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
-        self._presence = Presence(robot)
+        self._presence = BusCheck(robot)
         self._polls = poll_frames(robot)
         self._confirmation = confirmation if len(self._polls) else None
         timeout_s = robot.safety.reply_timeout_s if robot.safety is not None else None
@@ -317,7 +317,7 @@ class ControlLoop:
                 heard = self._hear(tick, received)
                 gone = gone or (console is not None and console.gone())
                 step = self._gate.step(
-                    tick, heard, why_stop(stop, console_gone=gone), at_once=stop.again
+                    tick, heard, stop_reason(stop, console_gone=gone), at_once=stop.again
                 )
                 sent = self._send(step, heard)
             except SourceError as error:
@@ -338,7 +338,7 @@ class ControlLoop:
         if failed := unwritten or self._gate.gait_error:
             raise failed
 
-    def _hear(self, tick: int, received: Sequence[FrameArray]) -> Heard:
+    def _hear(self, tick: int, received: Sequence[FrameArray]) -> GateInput:
         time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._known.angles.copy()
         for frames in received:
             self._known.add(frames, time_s)
@@ -353,7 +353,7 @@ class ControlLoop:
             last_ns = max((int(frames["t_host_ns"][-1]) for frames in received), default=0)
             self._confirmation.receive(fresh, last_ns)
             bounds = self._confirmation.bounds()
-        return Heard(
+        return GateInput(
             readings=self._known.readings(time_s),
             status=self._known.status(time_s),
             trouble=trouble,
@@ -364,7 +364,7 @@ class ControlLoop:
             bounds=bounds,
         )
 
-    def _send(self, step: GateStep, heard: Heard) -> FrameArray:
+    def _send(self, step: GateStep, heard: GateInput) -> FrameArray:
         """Send the commands, then ask for the state where the robot doesn't tell it unasked.
 
         The requests follow the commands, so that a reply confirms these.

@@ -179,7 +179,7 @@ _RECORDS = ("undulog.plan",)
 
 
 @dataclass(frozen=True)
-class Driven:
+class MotionSource:
     """What is driven.
 
     Attributes:
@@ -283,12 +283,12 @@ class Driven:
         return where.changed(duration_s=self.duration_s if duration_s is None else duration_s)
 
 
-def find_driven(
+def find_motion(
     word: str,
     world: Scenario | None = None,
     changes: Mapping[str, Any] | None = None,
     robot: Robot | None = None,
-) -> Driven:
+) -> MotionSource:
     """Find what is to be driven.
 
     Args:
@@ -316,11 +316,11 @@ def find_driven(
     return _gait(load_scenario(word))
 
 
-def _gait(scenario: Scenario) -> Driven:
+def _gait(scenario: Scenario) -> MotionSource:
     def make(robot: Robot, world: Scenario | None) -> Gait:
         return build_gait(world or dataclasses.replace(scenario, robot=robot))
 
-    return Driven(
+    return MotionSource(
         kind="gait",
         name=scenario.name,
         robot=scenario.robot,
@@ -335,9 +335,9 @@ def _gait(scenario: Scenario) -> Driven:
     )
 
 
-def _plan(text: str, source: Path) -> Driven:
+def _plan(text: str, source: Path) -> MotionSource:
     plan = parse_plan(text, source)
-    return Driven(
+    return MotionSource(
         kind="plan",
         name=plan.name,
         robot=plan.scenario.robot,
@@ -352,7 +352,7 @@ def _plan(text: str, source: Path) -> Driven:
 
 def _commands(
     path: Path, world: Scenario | None, changes: Mapping[str, Any] | None, robot: Robot | None
-) -> Driven:
+) -> MotionSource:
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
@@ -380,7 +380,7 @@ def _commands(
             return None
         return parse_scenario(text.decode(), f"{path}:scenario.toml", described, changes)
 
-    return Driven(
+    return MotionSource(
         kind="commands",
         name=path.name,
         robot=robot,

@@ -21,15 +21,15 @@ from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.confirmation import Confirmation
 from ..gate.gate import Gate
 from ..gate.limits import GateLimits, Spacing, gate_limits
-from ..gate.outcome import FaultKind, GateFault, How, Outcome, jitter
+from ..gate.outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..twin.recording import quick_collections
 from .links import Link, VirtualRobotLink
 from .loop import BusTick, ConsoleWatch, ControlLoop, LockstepPace, LoopTally, WallPace
-from .motion import Driven
+from .motion import MotionSource
 from .python_can_bus import open_link
 from .report import UNASKED, BusReport, Feedback, remarks_of
-from .session import BusSession, GaitTeller, stamped
+from .session import BusSession, GaitPublisher, stamped
 
 LISTEN_S = 0.5
 """A bus is listened to for so long before anything is sent [s]: whose it is, and how often joints
@@ -48,7 +48,7 @@ class BusPlan:
         recorder: Control socket of a recorder that is told the gait, or None.
     """
 
-    driven: Driven
+    driven: MotionSource
     robot: Robot
     limits: GateLimits
     address: SourceAddress
@@ -59,7 +59,7 @@ class BusPlan:
 
 
 def bus_plan(
-    driven: Driven,
+    driven: MotionSource,
     on: str,
     *,
     robot: Robot | None = None,
@@ -93,7 +93,7 @@ def bus_plan(
     return BusPlan(driven, robot, limits, address, length, output, recorder, force)
 
 
-def check_drivable(driven: Driven, robot: Robot) -> None:
+def check_drivable(driven: MotionSource, robot: Robot) -> None:
     """See that it can be driven on a bus of the robot at all, armed or dry.
 
     Raises:
@@ -174,7 +174,7 @@ def drive_bus(
         opened.callback(session.close)
         teller = None
         if plan.recorder is not None:
-            teller = GaitTeller(plan.recorder, gait.names)
+            teller = GaitPublisher(plan.recorder, gait.names)
             opened.callback(teller.close)
         tell = _Telling(
             plan,
@@ -287,7 +287,7 @@ def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:
 
 
 def _report(gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceCounts) -> BusReport:
-    outcome = gate.outcome or Outcome(How.STOPPED, "", "")
+    outcome = gate.outcome or Outcome(DriveEnding.STOPPED, "", "")
     began = gate.run_from
     return BusReport(
         outcome=outcome,
@@ -314,7 +314,7 @@ class _Telling:
         self,
         plan: BusPlan,
         session: BusSession,
-        teller: GaitTeller | None,
+        teller: GaitPublisher | None,
         *,
         tally: Tally,
         clock: SessionClock,
@@ -372,7 +372,7 @@ class _Telling:
         if self._teller is not None:
             name, outcome = self._plan.driven.name, report.outcome
             why = f", {outcome.why}" if outcome.why else ""
-            level = "error" if outcome.how is How.FAULT else "info"
+            level = "error" if outcome.how is DriveEnding.FAULT else "info"
             self._teller.note(f"drove {name} for {report.gait_s:g} s{why}", level)
 
     def failed(self, text: str) -> None:

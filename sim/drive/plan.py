@@ -64,8 +64,8 @@ from ..gait.wave import (
     IntegratedPhase,
     PlaneGait,
     Serpentine,
-    Swing,
     WaveGenerator,
+    WaveState,
     started,
 )
 from ..scenario.gaits import read_gait
@@ -152,14 +152,14 @@ class _PlannedRhythm:
         omega = float(self._values[0, 3])
         self._phase = IntegratedPhase(gaits[0].phase, omega)
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:  # noqa: ARG002
+    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
         segment = bisect_right(self._starts, time_s) - 1
         share = started(time_s - self._starts[segment], self._transitions[segment])
         before, after = self._values[segment], self._values[segment + 1]
         amplitude, offset, lag, omega = (before + (after - before) * share).tolist()
         ramp = started(time_s, self._ramp_s)
         omega *= change.frequency_factor
-        return Swing(
+        return WaveState(
             amplitude=ramp * amplitude * change.amplitude_factor,
             offset=ramp * offset + change.offset,
             phase=self._phase.advance(time_s, omega) + self._places * lag,

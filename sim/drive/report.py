@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..gate.outcome import How, Jitter, Outcome, Remark
+from ..gate.outcome import DriveEnding, GateEvent, Jitter, Outcome
 from .loop import LoopTally
 
 UNASKED = "joints were received more often than asked: commands are not confirmed by replies"
@@ -89,33 +89,33 @@ class BusReport:
     not_told: str | None = None
 
 
-def remarks_of(report: BusReport) -> list[Remark]:
+def remarks_of(report: BusReport) -> list[GateEvent]:
     """What is worth a line of the log at the end.
 
     Returns:
         The remarks; warnings are reasons for a verdict that is not good.
     """
-    remarks: list[Remark] = []
+    remarks: list[GateEvent] = []
     if report.jitter is not None:
-        remarks.append(Remark("info", str(report.jitter)))
+        remarks.append(GateEvent("info", str(report.jitter)))
     overruns = report.tally.overruns
     if overruns:
         many = f"{overruns} control ticks were" if overruns > 1 else "1 control tick was"
         text = f"{many} left out, as the one before took too long"
-        remarks.append(Remark("warn", text))
+        remarks.append(GateEvent("warn", text))
     for count, what in ((report.malformed, "could not be read"), (report.dropped, "were dropped")):
         if count:
-            remarks.append(Remark("warn", f"messages of the bus that {what}: {count}"))
+            remarks.append(GateEvent("warn", f"messages of the bus that {what}: {count}"))
     if report.waits:
         text = (
             f"commands that followed a late one and waited: {report.waits}, up to "
             f"{report.longest_wait_s * 1e3:.2f} ms, so that no joint was told to be too fast"
         )
-        remarks.append(Remark("info", text))
+        remarks.append(GateEvent("info", text))
     changed = {why: count for why, count in report.cuts.items() if count}
     if changed:
         listed = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in changed.items())
-        remarks.append(Remark("warn", f"the gate changed commands of single joints: {listed}"))
+        remarks.append(GateEvent("warn", f"the gate changed commands of single joints: {listed}"))
     return remarks
 
 
@@ -126,7 +126,7 @@ def report_facts(report: BusReport) -> dict[str, Any]:
         "armed": True,
         "pace": "lockstep" if report.lockstep else "real time",
         **report.outcome.to_dict(),
-        "complete": report.outcome.how is How.COMPLETE,
+        "complete": report.outcome.how is DriveEnding.COMPLETE,
         "duration_s": report.gait_s,
         "approach_s": report.approach_s,
         "whole_s": tally.loop_s,

@@ -31,7 +31,7 @@ from undulog.capture.robot.model import ClockDomain, Robot
 from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
 from ..gait.contract import GaitTick
-from ..gate.outcome import How, Outcome, Remark
+from ..gate.outcome import DriveEnding, GateEvent, Outcome
 from ..twin.session_log import GAIT_UNIT
 from .loop import BusTick
 
@@ -41,7 +41,7 @@ _WAIT_S = 0.02
 _LAST_S = 5.0
 
 
-class GaitTeller:
+class GaitPublisher:
     """One connection to a recorder's control socket.
 
     Attributes:
@@ -280,19 +280,19 @@ class BusSession:
         """Write a metadata record."""
         self.writer.note(name, facts)
 
-    def finish(self, outcome: Outcome, remarks: Sequence[Remark]) -> None:
+    def finish(self, outcome: Outcome, remarks: Sequence[GateEvent]) -> None:
         """Say how it went.
 
         Args:
             remarks: What is worth a line, the warnings among them as reasons for the verdict.
         """
-        level = "error" if outcome.how is How.FAULT else "info"
+        level = "error" if outcome.how is DriveEnding.FAULT else "info"
         why = f": {outcome.why}" if outcome.why else ""
         self.say(level, f"{outcome.how}{why}; {outcome.ended}")
         for each in remarks:
             self.say(*each)
         reasons = [text for kind, text in remarks if kind == "warn"]
-        if outcome.how is How.FAULT:
+        if outcome.how is DriveEnding.FAULT:
             self.writer.set_verdict("bad", [outcome.why, *reasons])
         else:
             self.writer.set_verdict("degraded" if reasons else "good", reasons)

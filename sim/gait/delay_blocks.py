@@ -28,7 +28,7 @@ from undulog.capture.common.strict_table import at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
 from .contract import Readings
-from .wave import Change, Frequency, IntegratedPhase, Swing, Wave, WaveGenerator, started
+from .wave import Change, Frequency, IntegratedPhase, Wave, WaveGenerator, WaveState, started
 
 
 @dataclass(frozen=True)
@@ -161,13 +161,13 @@ class _DelayRhythm:
         self._history = DelayedPhase(line.phase, self._omega, float(self._delays.max()))
         self._sign = -1.0 if line.wave is Wave.HEAD_TO_TAIL else 1.0
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:  # noqa: ARG002
+    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
         line = self._line
         omega = self._omega * change.frequency_factor
         self._history.advance(time_s, omega)
         then = time_s - self._delays
         ramp = np.array([started(one, self._ramp_s) for one in then.tolist()])
-        return Swing(
+        return WaveState(
             amplitude=ramp * line.amplitude * change.amplitude_factor,
             offset=ramp * line.offset + change.offset,
             phase=self._history.at(then),

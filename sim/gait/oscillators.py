@@ -41,7 +41,7 @@ from undulog.capture.common.strict_table import above, at_least, at_most
 from undulog.capture.robot.model import Plane, Robot
 
 from .contract import CONTROL_RATE_HZ, Readings
-from .wave import Change, IntegratedPhase, PlaneGait, Swing, WaveGenerator
+from .wave import Change, IntegratedPhase, PlaneGait, WaveGenerator, WaveState
 
 _State = TypeVar("_State", FloatArray, ComplexArray)
 
@@ -400,7 +400,7 @@ class _OscillatorRhythm:
         self._time_s, self._factor = 0.0, 1.0
         self._felt, self._steady = np.zeros(n), np.zeros(n)
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:
+    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:
         chain, elapsed = self._chain, time_s - self._time_s
         self._turn(elapsed)
         self._kick(time_s)
@@ -412,7 +412,7 @@ class _OscillatorRhythm:
         common = self._phase.advance(time_s, omega)
         if chain.feedback > 0.0:
             self._feel(readings.angle[self._joints], offset)
-        return Swing(
+        return WaveState(
             amplitude=amplitude * self._oscillators.radius,
             offset=offset,
             phase=common + self._oscillators.theta,

@@ -79,7 +79,7 @@ class Change(NamedTuple):
     frequency_factor: float
 
 
-class Swing(NamedTuple):
+class WaveState(NamedTuple):
     """What the n joints of a plane are to do from one tick on: A sin(phase) + Y.
 
     Attributes:
@@ -100,7 +100,7 @@ class Swing(NamedTuple):
 class Rhythm(Protocol):
     """One plane's generator of phases, amplitudes and offsets."""
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:
+    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:
         """Advance to a time and say what to do from then on.
 
         Args:
@@ -340,10 +340,10 @@ class _SerpentineRhythm:
         self._phase = IntegratedPhase(wave.phase, self._omega)
         self._lags = np.arange(joint_count, dtype=np.float64) * wave.signed_lag
 
-    def step(self, time_s: float, change: Change, readings: Readings) -> Swing:  # noqa: ARG002
+    def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
         wave, ramp = self._wave, started(time_s, self._ramp_s)
         omega = self._omega * change.frequency_factor
-        return Swing(
+        return WaveState(
             amplitude=ramp * wave.amplitude * change.amplitude_factor,
             offset=ramp * wave.offset + change.offset,
             phase=self._phase.advance(time_s, omega) + self._lags,

@@ -36,7 +36,7 @@ from .outcome import FaultKind, GateFault, JointStatus
 _IDENTIFIERS_SHOWN = 6
 
 
-class Presence:
+class BusCheck:
     """Counts what is heard by identifier, and finds what must not be there."""
 
     def __init__(self, robot: Robot) -> None:
@@ -178,7 +178,7 @@ _LESS = 0.8
 _MORE = 0.02
 
 
-class Yielding:
+class CurrentLimiter:
     """Keeps currents below their limits, as far as a position servo can be kept there.
 
     A position servo's current follows the distance of its command from the joint's angle. While

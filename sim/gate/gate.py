@@ -23,19 +23,19 @@ from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.robot.model import OnFault
 
 from ..gait.contract import Gait, GaitTick
-from .feedback import Silence, Watch, Yielding
+from .feedback import CurrentLimiter, Silence, Watch
 from .limits import Clamp, Clamped, Ending, GateLimits, Ramp, why_not_from
 from .outcome import (
     MUTE,
+    DriveEnding,
     FaultKind,
+    GateEvent,
     GateFault,
+    GateInput,
     GateStep,
-    Heard,
-    How,
     JointStatus,
     Outcome,
     Phase,
-    Remark,
 )
 
 POSE_S = 2.0
@@ -86,7 +86,7 @@ class Gate:
         self._gait, self._limits, self._place = gait, limits, place
         self._rate_hz, self._listen_s = rate_hz, listen_s
         self._last = round(duration_s * rate_hz)
-        self._watch, self._yielding = Watch(limits), Yielding(limits.current)
+        self._watch, self._yielding = Watch(limits), CurrentLimiter(limits.current)
         self._first: GaitTick | None = None
         self._clamp: Clamp | None = None
         self._way: Ramp | Ending | None = None
@@ -94,7 +94,7 @@ class Gate:
         self._tick: int | None = None  # the last one in which something was sent
         self._reported: GateFault | None = None
         self._said: set[str] = set()
-        self._remarks: list[Remark] = []
+        self._remarks: list[GateEvent] = []
 
     @property
     def done(self) -> bool:
@@ -112,7 +112,9 @@ class Gate:
         names = self._limits.joint_names
         return tuple(name for name in names if f"yields {name}" in self._said)
 
-    def step(self, tick: int, heard: Heard, stop: str = "", *, at_once: bool = False) -> GateStep:
+    def step(
+        self, tick: int, heard: GateInput, stop: str = "", *, at_once: bool = False
+    ) -> GateStep:
         """Say what to do.
 
         Args:
@@ -154,21 +156,21 @@ class Gate:
 
     def lost(self, why: str) -> None:
         """The bus can't be used any more: nothing more is sent."""
-        if self.outcome is None or self.outcome.how is not How.FAULT:
+        if self.outcome is None or self.outcome.how is not DriveEnding.FAULT:
             self.outcome = Outcome(
-                How.FAULT, why, "nothing more was sent", GateFault(FaultKind.BUS, why)
+                DriveEnding.FAULT, why, "nothing more was sent", GateFault(FaultKind.BUS, why)
             )
         self.phase = Phase.DONE
 
     # -- reading the pose ------------------------------------------------------------------
 
-    def _begin(self, tick: int, heard: Heard, stop: str) -> Clamp | None:
+    def _begin(self, tick: int, heard: GateInput, stop: str) -> Clamp | None:
         """Start from the pose, once it is known; None while it isn't."""
         waited_s = tick / self._rate_hz
         if (trouble := heard.trouble or self._reported) is not None:
             raise SourceError(self._place, f"no command was sent: {trouble.text}")
         if stop:
-            self.outcome = Outcome(How.STOPPED, stop, "no command was sent")
+            self.outcome = Outcome(DriveEnding.STOPPED, stop, "no command was sent")
             self.phase = Phase.DONE
             return None
         if waited_s < self._listen_s:
@@ -203,7 +205,9 @@ class Gate:
 
     # -- what is wanted --------------------------------------------------------------------
 
-    def _wanted(self, tick: int, heard: Heard, clamp: Clamp) -> tuple[FloatArray, GaitTick | None]:
+    def _wanted(
+        self, tick: int, heard: GateInput, clamp: Clamp
+    ) -> tuple[FloatArray, GaitTick | None]:
         """What the phase wants to be commanded."""
         if self.phase is Phase.APPROACH and self._way is not None:
             self._progress_s += 1.0 / self._rate_hz  # also where it is late: no jump
@@ -229,7 +233,7 @@ class Gate:
     def _end_in_time(self) -> None:
         """See whether the last command was the last one."""
         if self.phase is Phase.RUN and self.run_s * self._rate_hz >= self._last - 1e-6:
-            self.outcome = Outcome(How.COMPLETE, "", "the servos hold their last commands")
+            self.outcome = Outcome(DriveEnding.COMPLETE, "", "the servos hold their last commands")
             self._become(Phase.DONE)
             return
         length_s = 0.0 if self._way is None else self._way.duration_s
@@ -242,7 +246,7 @@ class Gate:
 
     # -- what goes wrong -------------------------------------------------------------------
 
-    def _heed(self, tick: int, heard: Heard, clamp: Clamp, stop: str, *, at_once: bool) -> None:
+    def _heed(self, tick: int, heard: GateInput, clamp: Clamp, stop: str, *, at_once: bool) -> None:
         """Change the phase where a fault, or who asks to stop, wants it."""
         found = self._trouble(tick, heard, clamp)
         if self.phase is Phase.HOLD and (found is None or found.kind not in MUTE):
@@ -261,10 +265,10 @@ class Gate:
         if at_once:
             self._halt(f"{stop}, twice")
         elif stop and self.phase is not Phase.ENDING:
-            self.outcome = Outcome(How.STOPPED, stop, "")
+            self.outcome = Outcome(DriveEnding.STOPPED, stop, "")
             self._end(clamp, heard.status)
 
-    def _trouble(self, tick: int, heard: Heard, clamp: Clamp) -> GateFault | None:
+    def _trouble(self, tick: int, heard: GateInput, clamp: Clamp) -> GateFault | None:
         if heard.trouble is not None or self._reported is not None:
             return heard.trouble or self._reported
         if heard.late_s > self._limits.late_s:
@@ -277,8 +281,8 @@ class Gate:
     def _fail(self, fault: GateFault, clamp: Clamp, status: JointStatus) -> None:
         self._said.add(f"{fault.kind} {fault.joint}")
         self._remark("error", f"fault: {fault.text}")
-        if self.outcome is None or self.outcome.how is How.STOPPED:
-            self.outcome = Outcome(How.FAULT, fault.text, "", fault)
+        if self.outcome is None or self.outcome.how is DriveEnding.STOPPED:
+            self.outcome = Outcome(DriveEnding.FAULT, fault.text, "", fault)
         if fault.kind in MUTE:
             self._halt(self.outcome.why)
         elif fault.kind is FaultKind.SILENT:
@@ -325,10 +329,10 @@ class Gate:
 
     def _halt(self, why: str) -> None:
         """Send nothing from here on."""
-        before = self.outcome or Outcome(How.STOPPED, why, "")
+        before = self.outcome or Outcome(DriveEnding.STOPPED, why, "")
         self.outcome = Outcome(
             before.how,
-            before.why if before.how is How.FAULT else why,
+            before.why if before.how is DriveEnding.FAULT else why,
             "nothing more was sent; the servos hold their last commands",
             before.fault,
         )
@@ -351,7 +355,7 @@ class Gate:
         self._remark("info", f"gate: {phase}" + (f", {detail}" if detail else ""))
 
     def _remark(self, level: str, text: str) -> None:
-        self._remarks.append(Remark(level, text))
+        self._remarks.append(GateEvent(level, text))
 
     def _quiet(self) -> GateStep:
         return GateStep(self.phase, None, None, None, tuple(self._remarks))

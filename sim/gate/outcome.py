@@ -117,7 +117,7 @@ def jitter(late_s: list[float]) -> Jitter | None:
     )
 
 
-class How(StrEnum):
+class DriveEnding(StrEnum):
     """How it ended."""
 
     COMPLETE = "complete"
@@ -135,7 +135,7 @@ class Outcome:
         fault: The fault, if one ended it.
     """
 
-    how: How
+    how: DriveEnding
     why: str
     ended: str
     fault: GateFault | None = None
@@ -190,7 +190,7 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True)
-class Heard:
+class GateInput:
     """What is known at a tick.
 
     Attributes:
@@ -212,7 +212,7 @@ class Heard:
     bounds: tuple[FloatArray, FloatArray] | None = None
 
 
-class Remark(NamedTuple):
+class GateEvent(NamedTuple):
     """Something to be logged: level and text."""
 
     level: str
@@ -234,4 +234,4 @@ class GateStep(NamedTuple):
     command: FloatArray | None
     wanted: FloatArray | None
     gait: GaitTick | None
-    remarks: tuple[Remark, ...]
+    remarks: tuple[GateEvent, ...]

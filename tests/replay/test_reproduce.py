@@ -7,7 +7,7 @@ import pytest
 
 import undulog as front
 from undulog.capture import Session, SessionWriter
-from undulog.replay.reproduce import sameness
+from undulog.replay.reproduce import compare_logs
 
 ROBOT = """name = "chain5"
 description = "Five yaw joints."
@@ -128,13 +128,13 @@ def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_pat
     assert "plain.mcap has commands and no response" in told
     assert told.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
     altered = again(commands, tmp_path / "altered.mcap", source="altered.mcap")
-    found = sameness(plain, altered)
+    found = compare_logs(plain, altered)
     assert found.differs_s["/joint_commands"] == pytest.approx(2.0)
     # The command acts from its tick on; states of that period arrive two ticks later.
     for topic in ("/odom", "/energy_ledger", "/joint_states"):
         assert 2.0 < found.differs_s[topic] <= 2.05, topic
     assert found.one_sided == ()
-    run = sameness(commands / "run.mcap", plain)
+    run = compare_logs(commands / "run.mcap", plain)
     assert set(run.differs_s) == {"/gait/mode"}  # the commands are all that drives it
     assert run.one_sided == ("/gait",)
 
@@ -146,7 +146,7 @@ def test_a_message_that_only_one_has_is_a_difference(tmp_path):
                 if k == 0:
                     channel = writer.string("/mode")
                 channel.write(10**18 + k * 10**9, "walk")
-    found = sameness(tmp_path / "one.mcap", tmp_path / "two.mcap")
+    found = compare_logs(tmp_path / "one.mcap", tmp_path / "two.mcap")
     assert (found.exact, found.differs_s, found.messages) == (False, {"/mode": 3.0}, 3)
 
 

@@ -14,7 +14,7 @@ from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.drive.motion import find_driven
+from undulog.sim.drive.motion import find_motion
 from undulog.sim.gait.contract import Readings
 from zoo.judging import judge
 from zoo.outputs import OUTPUTS, statements
@@ -75,7 +75,7 @@ def logged_on_the_bus(folder, scenario, faults):
     lines = []
     with process(*UNDULOG, "sim", "serve", scenario, *words) as served:
         port = json.loads(served.stdout.readline())["port"]
-        gait = find_driven(str(scenario)).make(robot, None)
+        gait = find_motion(str(scenario)).make(robot, None)
         encoder, blind = CommandEncoder(robot), Readings.nothing(robot)
         address = parse_address(f"can:socketcand:can0?port={port}")
         with closing(find_virtual_robot(address, Tally(time.time_ns))) as link:

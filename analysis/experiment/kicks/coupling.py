@@ -36,15 +36,15 @@ from ...results.coupling import (
 )
 from ...results.estimate import Estimate
 from .local import (
-    Answers,
     LocalMatrices,
     LtiReading,
-    Measured,
+    MeasuredDerivatives,
+    ResponseMatrices,
     RowSums,
-    answers_of,
     local_matrices,
     lti_reading,
     nonlinearity,
+    response_matrices,
 )
 from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
 from .scatter import RunErrors, sides
@@ -57,7 +57,9 @@ CURVED = 0.3
 """Second order over first order, from which the third may be a tenth of the first."""
 
 
-def kick_size(kicks: Sequence[Kick | None], answers: Answers, matrices: LocalMatrices) -> KickSize:
+def kick_size(
+    kicks: Sequence[Kick | None], answers: ResponseMatrices, matrices: LocalMatrices
+) -> KickSize:
     """Judge the size of the kicks.
 
     Args:
@@ -111,7 +113,9 @@ def _rounded_down(size: float) -> float:
     return math.floor(size * 10**digits) / 10**digits
 
 
-def _curvature(kicks: Sequence[Kick | None], answers: Answers, matrices: LocalMatrices) -> float:
+def _curvature(
+    kicks: Sequence[Kick | None], answers: ResponseMatrices, matrices: LocalMatrices
+) -> float:
     """Second order over first order of the kicks of phase, Frobenius norms over all joints."""
     errors = matrices.steady_errors
     variance = float(np.maximum(errors.variance, errors.within).sum())
@@ -230,9 +234,9 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     others = np.log(experiment.ratio[list(experiment.runs.base)] / first)
     base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
     deviation = experiment.runs.deviation
-    change = answers_of(deviation, experiment.ratio, base)
+    change = response_matrices(deviation, experiment.ratio, base)
     each = [kicks.get(k) for k in used]
-    answers = Answers(
+    answers = ResponseMatrices(
         change[used],
         experiment.log_gain_variance[used],
         experiment.lag_variance[used],
@@ -392,7 +396,7 @@ def _lti(reading: LtiReading) -> Lti:
     )
 
 
-def _matrix(matrix: Measured) -> Matrix:
+def _matrix(matrix: MeasuredDerivatives) -> Matrix:
     return Matrix(
         rows_of(matrix.value),
         rows_of(matrix.error),

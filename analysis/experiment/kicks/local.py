@@ -47,7 +47,7 @@ from .scatter import RunErrors, run_errors
 
 
 @dataclass(frozen=True)
-class Answers:
+class ResponseMatrices:
     """What r runs answered.
 
     Attributes:
@@ -66,7 +66,7 @@ class Answers:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredDerivatives:
     """A matrix of derivatives, row = responding joint, column = commanded joint.
 
     Attributes:
@@ -108,7 +108,9 @@ class RowSums:
     dof: FloatArray
 
 
-def answers_of(deviation: ComplexArray, ratio: ComplexArray, base: ComplexArray) -> ComplexArray:
+def response_matrices(
+    deviation: ComplexArray, ratio: ComplexArray, base: ComplexArray
+) -> ComplexArray:
     """Change of the responses against the base, whenever each run started.
 
     ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
@@ -125,8 +127,8 @@ def answers_of(deviation: ComplexArray, ratio: ComplexArray, base: ComplexArray)
 
 
 def central_differences(
-    kicks: Sequence[Kick], answers: Answers, kind: Kind
-) -> tuple[Measured, Measured]:
+    kicks: Sequence[Kick], answers: ResponseMatrices, kind: Kind
+) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
     """Derivatives of phase and of log amplitude with respect to one kind of kick.
 
     Args:
@@ -168,12 +170,12 @@ def central_differences(
     shared = (None, None)
     if errors is not None:
         shared = (errors.correlation[:m, :m], errors.correlation[m:, m:])
-    return Measured(value[0], error[0], dof[0], shared[0]), Measured(
+    return MeasuredDerivatives(value[0], error[0], dof[0], shared[0]), MeasuredDerivatives(
         value[1], error[1], dof[1], shared[1]
     )
 
 
-def row_sums(matrix: Measured) -> RowSums:
+def row_sums(matrix: MeasuredDerivatives) -> RowSums:
     """Sums over the columns: 1 for P, 0 for R, by time shift.
 
     Args:
@@ -190,10 +192,10 @@ def row_sums(matrix: Measured) -> RowSums:
 
 
 def nonlinearity(
-    P: Measured,
-    R: Measured,
-    G: Measured,
-    S: Measured,
+    P: MeasuredDerivatives,
+    R: MeasuredDerivatives,
+    G: MeasuredDerivatives,
+    S: MeasuredDerivatives,
     seed: int = 1,
     *,
     correlation: FloatArray | None = None,
@@ -227,7 +229,9 @@ def nonlinearity(
     )
 
 
-def stacked(blocks: Sequence[Sequence[Measured]], correlation: FloatArray | None) -> Measured:
+def stacked(
+    blocks: Sequence[Sequence[MeasuredDerivatives]], correlation: FloatArray | None
+) -> MeasuredDerivatives:
     """One matrix of several, for errors that they have in common.
 
     Args:
@@ -239,7 +243,7 @@ def stacked(blocks: Sequence[Sequence[Measured]], correlation: FloatArray | None
         np.block([[getattr(one, part) for one in row] for row in blocks])
         for part in ("value", "error", "dof")
     )
-    return Measured(value, error, dof, correlation)
+    return MeasuredDerivatives(value, error, dof, correlation)
 
 
 def _is(kick: Kick, joint: int, kind: Kind) -> bool:
@@ -270,8 +274,8 @@ class LtiReading:
 
 
 def lti_reading(
-    P: Measured,
-    R: Measured,
+    P: MeasuredDerivatives,
+    R: MeasuredDerivatives,
     response: ComplexArray,
     command: ComplexArray,
     seed: int = 11,
@@ -364,10 +368,10 @@ class LocalMatrices:
         widened: Factor on the errors of each joint's phase, then log amplitude, shape (2, m).
     """
 
-    P: Measured
-    R: Measured
-    G: Measured | None
-    S: Measured | None
+    P: MeasuredDerivatives
+    R: MeasuredDerivatives
+    G: MeasuredDerivatives | None
+    S: MeasuredDerivatives | None
     errors: RunErrors
     steady_errors: RunErrors
     phase_rows: RowSums
@@ -377,7 +381,7 @@ class LocalMatrices:
 
 
 def local_matrices(
-    kicks: Sequence[Kick | None], answers: Answers, *, amplitude: bool
+    kicks: Sequence[Kick | None], answers: ResponseMatrices, *, amplitude: bool
 ) -> LocalMatrices:
     """Estimate the matrices.
 
@@ -387,14 +391,16 @@ def local_matrices(
     """
     kicked = [k for k, one in enumerate(kicks) if one is not None]
     each = [one for one in kicks if one is not None]
-    of_kicks = Answers(
+    of_kicks = ResponseMatrices(
         answers.log[kicked],
         answers.log_gain_variance[kicked],
         answers.phase_variance[kicked],
         answers.dof[kicked],
     )
 
-    def differences(errors: RunErrors | None, kind: Kind) -> tuple[Measured, Measured]:
+    def differences(
+        errors: RunErrors | None, kind: Kind
+    ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
         return central_differences(each, replace(of_kicks, errors=errors), kind)
 
     phase, log_gain = differences(None, Kind.PHASE)
@@ -431,11 +437,13 @@ def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
     return np.maximum(np.where(agree, 1.0, off), max(1.0, float(np.sqrt(np.mean(off**2)))))
 
 
-def _widen(pair: tuple[Measured, Measured], factor: FloatArray) -> tuple[Measured, Measured]:
+def _widen(
+    pair: tuple[MeasuredDerivatives, MeasuredDerivatives], factor: FloatArray
+) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
     """Errors times each row's factor, which so many sums tell."""
     m = len(factor[0])
 
-    def wider(one: Measured, by: FloatArray) -> Measured:
+    def wider(one: MeasuredDerivatives, by: FloatArray) -> MeasuredDerivatives:
         if np.all(by == 1.0):
             return one
         return replace(one, error=one.error * by[:, None], dof=np.minimum(one.dof, m))

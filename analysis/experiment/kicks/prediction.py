@@ -23,7 +23,7 @@ from ...results import formats
 from ...results.coupling import BaseResponse, LocalCoupling, rows_of
 from ...results.estimate import Estimate
 from ...results.oscillators import ClosedLoop, LoopMode, Relaxation
-from .local import Measured, stacked
+from .local import MeasuredDerivatives, stacked
 
 POINTS = 50
 """Times at which what is left of a kick is told."""
@@ -120,7 +120,7 @@ def _generators(
     m = len(coupling.joints)
     correlation = None if coupling.scatter is None else np.array(coupling.scatter.correlation)
     blocks = [
-        [Measured(one.value, one.error, one.dof)]
+        [MeasuredDerivatives(one.value, one.error, one.dof)]
         for one in (measured(coupling.P), measured(coupling.R))
     ]
     P, R = blocks[0][0].value, blocks[1][0].value
@@ -130,7 +130,9 @@ def _generators(
     error = np.concatenate([lag, np.array(base.gain_error) / gain])[:, None]
     dof = np.full_like(error, coupling.scatter.dof if coupling.scatter is not None else np.inf)
     dof = np.minimum(dof, 1e6)
-    own = noise_draws(Measured(np.zeros_like(error), error, dof, correlation), SEED + 1)[..., 0]
+    own = noise_draws(MeasuredDerivatives(np.zeros_like(error), error, dof, correlation), SEED + 1)[
+        ..., 0
+    ]
     drawn = [
         relaxation(P + one[:m], R + one[m:], (felt * np.exp(of[m:] + 1j * of[:m])))
         for one, of in zip(noise, own, strict=True)

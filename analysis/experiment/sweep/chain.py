@@ -63,7 +63,7 @@ class Phasors:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredMatrix:
     """A complex matrix with standard errors.
 
     Attributes:
@@ -100,7 +100,7 @@ class ServoSide:
     D_q: ComplexArray
 
 
-def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> Measured:
+def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> MeasuredMatrix:
     """H = Y C^+, the commands taken as exact.
 
     Args:
@@ -113,7 +113,7 @@ def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> Measur
     """
     weights: ComplexArray = np.linalg.pinv(command).astype(np.complex128)
     power = np.abs(weights) ** 2
-    return Measured(
+    return MeasuredMatrix(
         (response.value @ weights).astype(np.complex128),
         np.sqrt(response.variance @ power),
         _dof(response.variance, response.dof, power),
@@ -122,7 +122,7 @@ def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> Measur
     )
 
 
-def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> Measured:
+def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> MeasuredMatrix:
     """Z = T Y^+.
 
     Args:
@@ -141,7 +141,7 @@ def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> Measured:
     # A joint's torque with its own few bins, the responses together with no fewer than the least.
     least = np.broadcast_to(response.dof.min(axis=0), torque.dof.shape)
     dof = welch_satterthwaite(parts, np.stack([torque.dof, least]))
-    return Measured(
+    return MeasuredMatrix(
         Z,
         np.sqrt(variance @ power),
         _dof(variance, dof, power),
@@ -150,7 +150,7 @@ def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> Measured:
     )
 
 
-def inverse(H: Measured) -> ComplexArray:
+def inverse(H: MeasuredMatrix) -> ComplexArray:
     """Errors that H^-1 may have.
 
     Returns:
@@ -160,7 +160,7 @@ def inverse(H: Measured) -> ComplexArray:
     return (np.linalg.inv(H.value + H.draws) - X).astype(np.complex128)
 
 
-def impedance_behind_servos(H: Measured, servos: ServoSide) -> Measured:
+def impedance_behind_servos(H: MeasuredMatrix, servos: ServoSide) -> MeasuredMatrix:
     """Z = D_r H^-1 - D_q.
 
     Args:
@@ -174,7 +174,7 @@ def impedance_behind_servos(H: Measured, servos: ServoSide) -> Measured:
     size = np.abs(X) ** 2
     scale = np.abs(servos.D_r)[:, None]
     error = scale * np.sqrt(size @ H.error**2 @ size)
-    return Measured(
+    return MeasuredMatrix(
         (servos.D_r[:, None] * X - np.diag(servos.D_q)).astype(np.complex128),
         error,
         np.full_like(error, float(H.dof.min())),

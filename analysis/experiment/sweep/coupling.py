@@ -23,7 +23,7 @@ from ...results.coupling import (
 from ...results.estimate import Estimate
 from ...signals.stretch import Options
 from ..kicks.local import SINGULAR, reciprocity
-from .chain import Measured, impedance, impedance_behind_servos, inverse, servo_side, transfer
+from .chain import MeasuredMatrix, impedance, impedance_behind_servos, inverse, servo_side, transfer
 from .runs import CommandTones, Sweep, SweepData, sweep_data
 from .tones import distortion, sideband_energy
 
@@ -203,7 +203,7 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
         )
 
 
-def _matrix(matrix: Measured) -> ComplexMatrix:
+def _matrix(matrix: MeasuredMatrix) -> ComplexMatrix:
     return ComplexMatrix(
         rows_of(matrix.value.real),
         rows_of(matrix.value.imag),

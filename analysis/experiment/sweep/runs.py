@@ -23,7 +23,7 @@ from undulog.capture.robot.run import Run
 from ...estimators.cycle_sums import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...estimators.series import Series, clean
 from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
-from ...session.analyse import Examined
+from ...session.analyse import FittedSession
 from ...session.runs import SAME_FREQUENCY
 from ...signals.columns import read_columns
 from ...signals.stretch import Options, choose_stretch
@@ -118,7 +118,7 @@ def read_signals(session: SessionView, options: Options) -> Signals:
 
 
 def command_tones(
-    session: SessionView, options: Options, examined: Examined
+    session: SessionView, options: Options, examined: FittedSession
 ) -> CommandTones | None:
     """What a session commands, as tones.
 

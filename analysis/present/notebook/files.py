@@ -25,13 +25,13 @@ from ...results.estimate import Estimate
 from ...results.experiment import Experiment, Reversal
 
 if TYPE_CHECKING:
-    from ...results.shown import Shown
+    from ...results.shown import PresentedResult
 
 
 _NAMES = {**vars(oscillators), **vars(result_energy), **vars(result_over_time)}
 """Types that :mod:`.analysis.results.analysis` names for type checkers only."""
 
-_KINDS: tuple[type[Shown], ...] = (
+_KINDS: tuple[type[PresentedResult], ...] = (
     Analysis,
     Experiment,
     Comparison,
@@ -42,8 +42,8 @@ _KINDS: tuple[type[Shown], ...] = (
 )
 
 
-def save(result: Shown, path: Path, *, force: bool) -> Path:
-    """Write a result as JSON; see :meth:`.analysis.results.shown.Shown.save`.
+def save(result: PresentedResult, path: Path, *, force: bool) -> Path:
+    """Write a result as JSON; see :meth:`.analysis.results.shown.PresentedResult.save`.
 
     Args:
         path: A name that ends in .json.
@@ -59,8 +59,8 @@ def save(result: Shown, path: Path, *, force: bool) -> Path:
     return path
 
 
-def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
-    """Write the tables as Parquet; see :meth:`.analysis.results.shown.Shown.to_parquet`.
+def save_tables(result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:
+    """Write the tables as Parquet; see :meth:`.analysis.results.shown.PresentedResult.to_parquet`.
 
     Args:
         folder: Made if it isn't there.
@@ -84,7 +84,7 @@ def save_tables(result: Shown, folder: Path, *, force: bool) -> list[Path]:
     return list(paths)
 
 
-def load(path: Path | str) -> Shown:
+def load(path: Path | str) -> PresentedResult:
     """Read a result that ``save`` wrote, or ``undulog analyse`` and ``compare`` with ``-o``.
 
     Returns:
@@ -102,7 +102,7 @@ def load(path: Path | str) -> Shown:
     for kind in _KINDS:
         if isinstance(data, dict) and _required(kind) <= set(cast("dict[str, Any]", data)):
             try:
-                return cast("Shown", _build(kind, data))
+                return cast("PresentedResult", _build(kind, data))
             except (KeyError, OverflowError, TypeError, ValueError) as error:
                 raise DataError(f"{path}: a damaged {kind.__name__}: {error!r}") from error
     known = ", ".join(kind.__name__ for kind in _KINDS)

@@ -118,7 +118,7 @@ Frames = dict[str, pd.DataFrame]
 
 @singledispatch
 def frames_of(result: object) -> Frames:
-    """The tables of a result; see :meth:`.analysis.results.shown.Shown.frames`.
+    """The tables of a result; see :meth:`.analysis.results.shown.PresentedResult.frames`.
 
     Args:
         result: A result of this package.

@@ -129,7 +129,7 @@ _number = count(1)
 
 
 def picture_of(result: object, what: str | None = None) -> Picture:
-    """Draw a result; see :meth:`.analysis.results.shown.Shown.plot`.
+    """Draw a result; see :meth:`.analysis.results.shown.PresentedResult.plot`.
 
     Args:
         result: A result of this package.

@@ -21,41 +21,41 @@ from ..text_experiment import render_comparison, render_experiment, reversal_det
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ...results.shown import Shown
+    from ...results.shown import PresentedResult
     from .pictures import Picture
 
 
 class Presenter:
     """A :class:`.Presentation`; each method imports what it needs when called."""
 
-    def text(self, result: Shown) -> str:  # noqa: D102
+    def text(self, result: PresentedResult) -> str:  # noqa: D102
 
         return text_of(result)
 
-    def headline(self, result: Shown) -> str:  # noqa: D102
+    def headline(self, result: PresentedResult) -> str:  # noqa: D102
 
         return headline_of(result)
 
-    def html(self, result: Shown) -> str:  # noqa: D102
+    def html(self, result: PresentedResult) -> str:  # noqa: D102
 
         return html_of(result)
 
-    def frames(self, result: Shown) -> dict[str, pd.DataFrame]:  # noqa: D102
+    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]:  # noqa: D102
         from .frames import frames_of
 
         return frames_of(result)
 
-    def picture(self, result: Shown, what: str | None) -> Picture:  # noqa: D102
+    def picture(self, result: PresentedResult, what: str | None) -> Picture:  # noqa: D102
         from .pictures import picture_of
 
         return picture_of(result, what)
 
-    def save(self, result: Shown, path: Path, *, force: bool) -> Path:  # noqa: D102
+    def save(self, result: PresentedResult, path: Path, *, force: bool) -> Path:  # noqa: D102
         from .files import save
 
         return save(result, path, force=force)
 
-    def save_tables(self, result: Shown, folder: Path, *, force: bool) -> list[Path]:  # noqa: D102
+    def save_tables(self, result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:  # noqa: D102
         from .files import save_tables
 
         return save_tables(result, folder, force=force)
@@ -102,7 +102,7 @@ def _(result: Reversal) -> str:
     runs = f"{result.forward_runs} + {result.reverse_runs} runs"
     differ = pair_order(result.pairs[0]) if result.pairs else "no pair is ordered"
     floor = "" if result.tilt.excluded or not result.pairs else ", or the floor is tilted"
-    return f"Reversal, {runs}: {differ}{floor} ({formats.told_p(result.p)})"
+    return f"Reversal, {runs}: {differ}{floor} ({formats.p_value_text(result.p)})"
 
 
 @headline_of.register

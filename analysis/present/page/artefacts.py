@@ -256,7 +256,7 @@ def _named(names: Sequence[str], count: int) -> str:
     return f"all {count} joints" if len(names) == count > 1 else ", ".join(names)
 
 
-def told_times(spans: tuple[Span, ...]) -> str:
+def times_text(spans: tuple[Span, ...]) -> str:
     """Stretches in words.
 
     Args:
@@ -290,7 +290,7 @@ def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
         flag=one.flag,
         meaning=f"values {text}" + (f"; {one.note}" if one.note else ""),
         about=WHAT[about],
-        times=told_times(one.spans_s),
+        times=times_text(one.spans_s),
         line=_line(one, analysis),
     )
 

@@ -15,7 +15,7 @@ from ...results.analysis import SessionFacts
 from ...results.comparison import BODY, Comparison
 from ...results.estimate import Estimate
 from ...results.formats import scaled
-from ..text_experiment import comparison_method, margin_told
+from ..text_experiment import comparison_method, margin_text
 from .motion import waveforms_drawing
 from .svg import (
     INK,
@@ -201,8 +201,8 @@ def _marks(comparison: Comparison) -> tuple[Markup, ...]:
 def _trials(comparison: Comparison) -> tuple[Trial, ...]:
     return tuple(
         Trial(
-            f"Is the {WORDS[one.quantity]} the same on both sides, within {margin_told(one)}?",
-            f"largest difference {margin_told(one, one.largest)}",
+            f"Is the {WORDS[one.quantity]} the same on both sides, within {margin_text(one)}?",
+            f"largest difference {margin_text(one, one.largest)}",
             one.p,
             "yes, shown to be the same" if one.p < SIGNIFICANT_DIFFERENCE else "not shown",
         )

@@ -165,7 +165,7 @@ def _reasons(health: dict[str, str] | None) -> list[str]:
     return [health.get("verdict", "no verdict"), *map(str, listed)]
 
 
-FAR_APART_S = 86400.0
+LONGEST_MERGE_GAP_S = 86400.0
 """Logs with a longer time between them are merged only on request [s]: one of them is of another
 day's session, or a clock was wrong."""
 
@@ -188,7 +188,7 @@ def merge_logs(
     Args:
         paths: The logs, two or more.
         robot: The robot that the merged session is of, where the logs are of different ones.
-        apart: Merge logs with more than :data:`FAR_APART_S` between them.
+        apart: Merge logs with more than :data:`LONGEST_MERGE_GAP_S` between them.
 
     Raises:
         UsageError: If there are fewer than two logs, one is given twice, they are of different
@@ -364,7 +364,7 @@ def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
         earlier = max(ordered[:k], key=lambda each: each.end_ns)
         gap_s = (later.start_ns - earlier.end_ns) / NS
         sentence = f"{later.path} begins {_span(gap_s)} after {earlier.path} ends"
-        if gap_s > FAR_APART_S and not allowed:
+        if gap_s > LONGEST_MERGE_GAP_S and not allowed:
             raise UsageError(f"{sentence}: not one session; --apart merges them all the same")
         if gap_s > _LATER_S:
             said.append(sentence)

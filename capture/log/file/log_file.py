@@ -26,7 +26,7 @@ from ...common.arrays import IntArray
 from ...common.errors import LogError, NotALogError
 from ..mcap.chunk import LAST_NS, Block, Buffer
 from ..mcap.file import McapFile
-from ..mcap.records import BlockSource, read_heads
+from ..mcap.records import BlockSource, read_message_heads
 from ..wal.tail import MessageKey, WalContents, WalTail, beyond, read_wal
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
@@ -431,7 +431,7 @@ class LogFile:
         data, base = self.payload(block)
         stop = len(data) if block.compression else block.stop
         places = np.concatenate([np.empty(0, dtype=np.int64), *offsets])
-        heads = read_heads(data, places + base, stop)
+        heads = read_message_heads(data, places + base, stop)
         if heads is None:
             where = f"the message index of the chunk at byte {block.start}"
             raise LogError(self.files[block.part].path, f"{where} does not list its messages")

@@ -23,7 +23,7 @@ from ..file.parts import check_chain
 from ..mcap.chunk import Block
 from ..mcap.container_check import Container, check_chunk, check_container
 from ..mcap.file import McapFile
-from ..mcap.records import read_heads
+from ..mcap.records import read_message_heads
 from ..read.session import Session
 from .measures import FileHealth
 from .rules import judge_file, judge_following, verdict_of
@@ -250,7 +250,7 @@ class _Check:
         if not keys:
             return chunk is not None and bool(chunk.crc)
         found = [np.sort(self._file.offsets(block, key)) + base for key in keys]
-        heads = read_heads(data, np.concatenate(found), stop)
+        heads = read_message_heads(data, np.concatenate(found), stop)
         owners = np.repeat(keys, [len(offsets) for offsets in found])
         twice = any((np.diff(offsets) == 0).any() for offsets in found)
         if heads is None or twice or (heads["channel"] != owners).any():

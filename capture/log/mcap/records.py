@@ -106,7 +106,7 @@ FIXED_SIZE = 22
 """What a record's length counts before the message itself."""
 
 
-def read_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] | None:
+def read_message_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] | None:
     """The heads of message records, if whole messages lie where an index says.
 
     Args:

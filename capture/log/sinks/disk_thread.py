@@ -16,7 +16,7 @@ from mcap.records import Metadata
 from ...common.errors import LogWriteError, OutputExistsError
 from ..file.parts import PART_RECORD
 from ..mcap.writer import McapWriter
-from ..wal.segment import FULL, Ballast, sync_folder
+from ..wal.segment import FULL, ReservedSpace, sync_folder
 from ..wal.writer import WriteAheadLog
 from .mcap_sink import write_description, write_error
 
@@ -155,7 +155,7 @@ class _Finish:
 class DiskThread:
     """Writes, hashes and syncs what it is given, in order."""
 
-    def __init__(self, wal: WriteAheadLog, ballast: Ballast) -> None:
+    def __init__(self, wal: WriteAheadLog, ballast: ReservedSpace) -> None:
         """Start the thread.
 
         Args:

@@ -16,7 +16,7 @@ from mcap.records import Header, Metadata
 from ...common.errors import DataError, LogWriteError, OutputExistsError, UndulogError
 from ..file.parts import PART_RECORD, later_parts, part_path
 from ..mcap.writer import McapWriter
-from ..wal.segment import Ballast
+from ..wal.segment import ReservedSpace
 from ..wal.writer import WriteAheadLog, wal_folder
 from .disk_thread import DiskThread, FileDeletedError, PartStream
 from .mcap_sink import (
@@ -104,10 +104,10 @@ class DurableSink:
             sync_interval_s=sync_interval_s,
             force=force,
         )
-        kept: Ballast | None = None
+        kept: ReservedSpace | None = None
         try:
             self._wal.define(Header(PROFILE, library_name()))
-            kept = self._ballast = Ballast(self._wal.folder, ballast)
+            kept = self._ballast = ReservedSpace(self._wal.folder, ballast)
             self._part = PartStream(self.path, 1, force=force)
         except (LogWriteError, OutputExistsError):
             if kept is not None:

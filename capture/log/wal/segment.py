@@ -398,13 +398,13 @@ def _reservation_error(path: Path, size: int, error: OSError) -> LogWriteError:
     return LogWriteError(path, f"{size} bytes can't be reserved: {error.strerror}")
 
 
-BALLAST_NAME = "ballast"
+RESERVED_SPACE_NAME = "ballast"
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Error numbers that more free space would mend."""
 
 
-class Ballast:
+class ReservedSpace:
     """A file that is there only to be deleted."""
 
     def __init__(self, folder: Path, size: int) -> None:
@@ -417,7 +417,7 @@ class Ballast:
         Raises:
             LogWriteError: If there is no room; no file is left then.
         """
-        self.path = folder / BALLAST_NAME
+        self.path = folder / RESERVED_SPACE_NAME
         self._there = size > 0
         if not size:
             return

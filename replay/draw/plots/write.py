@@ -35,7 +35,7 @@ from ...samples.quantities import SIGNALS, quantities, topic_entity
 from ...samples.sampling import mark_gaps, ordered, plot_step
 from ...samples.survey import Survey
 from ...samples.timeline import Clock, Span, Stretch, stretch_length_ns
-from ...samples.tracks import JOINT_STATE, Track, brought_together
+from ...samples.tracks import JOINT_STATE, Track, join_tracks
 from .gait import EVENTS, changes
 from .joints import (
     DEGREES,
@@ -236,7 +236,7 @@ class Plot:
             own = [by_name[name] for name in one.names if name in by_name]
             if not own:
                 continue
-            table = brought_together(own)
+            table = join_tracks(own)
             values = np.full((table.t_ns.size, len(one.names)), np.nan)
             values[:, [one.names.index(name) for name in table.names]] = table.values
             t_ns, values = mark_gaps(table.t_ns, values, span.known_ns)

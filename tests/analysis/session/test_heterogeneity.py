@@ -6,7 +6,7 @@ import pytest
 from undulog.analysis.estimators.intervals import welch_satterthwaite
 from undulog.analysis.response.response import Response
 from undulog.analysis.session.heterogeneity import energy_indices, gini, response_indices, spread
-from undulog.analysis.session.runs import one_gait_coupling
+from undulog.analysis.session.runs import coupling_of_one_gait
 
 BINS = 10
 
@@ -138,10 +138,10 @@ def test_welch_satterthwaite():
 
 
 def test_one_gait_never_identifies_the_coupling():
-    coupling = one_gait_coupling(13)
+    coupling = coupling_of_one_gait(13)
     assert coupling.identifiable is False
     assert coupling.matrix is None
     assert coupling.why == "one gait gives 13 complex numbers for 169 unknown couplings"
     assert "phase-kicks" in coupling.record
     assert "52 runs" in coupling.record
-    assert one_gait_coupling(1).identifiable is one_gait_coupling(0).identifiable is False
+    assert coupling_of_one_gait(1).identifiable is coupling_of_one_gait(0).identifiable is False

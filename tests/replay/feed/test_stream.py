@@ -17,7 +17,7 @@ from undulog.replay.feed.numbers import Analysing, computed
 from undulog.replay.feed.progressive import (
     NoLongerWantedError,
     Task,
-    foreseen,
+    predict_layout,
     same_arrangement,
     show_session,
 )
@@ -183,10 +183,10 @@ def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
         rhythm = clock_of(session).rhythm
     content = written.content
     before = replace(content, charts=(), cycles=(), maps=(), mean=None)
-    assert same_arrangement(foreseen(before, rhythm), content)
-    assert not same_arrangement(foreseen(before, None), content)
+    assert same_arrangement(predict_layout(before, rhythm), content)
+    assert not same_arrangement(predict_layout(before, None), content)
     assert not same_arrangement(before, content)
-    assert foreseen(replace(before, commanded=()), rhythm) == replace(before, commanded=())
+    assert predict_layout(replace(before, commanded=()), rhythm) == replace(before, commanded=())
 
 
 def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_path):

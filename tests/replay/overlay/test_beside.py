@@ -18,10 +18,10 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.common.process import StopRequest
 from undulog.replay.overlay.alignment import Align, align, times_of
-from undulog.replay.overlay.combine import bring_together
+from undulog.replay.overlay.combine import combine_sessions
 from undulog.replay.overlay.layout import all_views
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.write import Converted, write_beside
+from undulog.replay.overlay.write import Converted, write_overlay
 from undulog.replay.samples.timeline import Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000
@@ -495,7 +495,7 @@ def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
     stop = StopRequest()
     stop.signal = signal.SIGTERM
     with pytest.raises(LogWriteError, match="stopped on request"):
-        write_beside(converted, path, Align.TIME, stop=stop)
+        write_overlay(converted, path, Align.TIME, stop=stop)
     assert path.read_bytes() == b"mine"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -523,7 +523,7 @@ def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_
         stop.signal = signal.SIGTERM if done else None
 
     with pytest.raises(LogWriteError, match="stopped on request"):
-        bring_together(files, path, stop=stop, on_step=at_the_first_recording)
+        combine_sessions(files, path, stop=stop, on_step=at_the_first_recording)
     assert steps[0] == "angles"
     assert len(steps) == 2
     assert not list(tmp_path.iterdir())
@@ -533,13 +533,13 @@ def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_
 def window(show, converted, tmp_path_factory):
     """Robot and twin as a user first sees them, after 3 s."""
     path = tmp_path_factory.mktemp("window") / "pair.rrd"
-    write_beside(converted, path, Align.TIME)
+    write_overlay(converted, path, Align.TIME)
     return show(path, 3.0)
 
 
 @pytest.mark.slow
 def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_path):
-    write_beside(converted, tmp_path / "all.rrd", Align.TIME, layout=all_views)
+    write_overlay(converted, tmp_path / "all.rrd", Align.TIME, layout=all_views)
     grid = show(tmp_path / "all.rrd", 3.0)
     assert grid.complaints() == []
     # Bodies, three texts, places, power, differences, heads; three bars and three differences.

@@ -5,8 +5,8 @@ import numpy as np
 from undulog.replay.samples.sampling import hold, interpolate
 from undulog.replay.samples.tracks import (
     Track,
-    brought_together,
     in_turn,
+    join_tracks,
     resampled,
     tables,
     without_filler,
@@ -63,7 +63,7 @@ def test_joints_in_turn_have_one_sample_between_two_of_the_first():
 
 
 def test_joints_in_turn_are_brought_to_the_first_ones_times():
-    table = brought_together([track("a"), track("b", T - 4, 0.1 * (T - 4))])
+    table = join_tracks([track("a"), track("b", T - 4, 0.1 * (T - 4))])
     assert table.names == ("a", "b")
     np.testing.assert_array_equal(table.t_ns, T)
     np.testing.assert_allclose(table.values[:-1, 1], 0.1 * T[:-1], atol=1e-12)

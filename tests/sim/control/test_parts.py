@@ -11,8 +11,8 @@ from undulog.capture.robot.model import Plane, Robot, Sensor, SensorKind
 from undulog.sim import PlaneGait, Readings, Serpentine
 from undulog.sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
 from undulog.sim.control.dead_reckoning import Pose, SlipOdometry
-from undulog.sim.control.heading import RandomCourse, StraightOn, TargetCourse
-from undulog.sim.control.obstacle_monitor import Distances, Lookout, Moment
+from undulog.sim.control.heading import RandomHeadingPolicy, StraightOn, TargetHeadingPolicy
+from undulog.sim.control.obstacle_monitor import ControlInput, Distances, ObstacleMonitor
 from undulog.sim.gait.contract import WALK
 from undulog.sim.scenario.controllers import (
     Controller,
@@ -119,9 +119,13 @@ def test_the_head_bends_by_the_papers_law_and_the_body_follows(d):
 
 def seen(heading, ranges, place=(0.0, 0.0), time_s=0.0, lookout=None):
     """What is in the way of a robot that goes along x while its head looks elsewhere."""
-    lookout = lookout or Lookout(LookoutParameters(half_width_m=0.3, memory_s=2.0), ROLES, SNAKE)
+    lookout = lookout or ObstacleMonitor(
+        LookoutParameters(half_width_m=0.3, memory_s=2.0), ROLES, SNAKE
+    )
     pose = Pose(np.array(place), heading, 0.0)
-    return lookout.step(Moment(time_s, 0.01, 0.0, pose, Readings(STILL, STILL, ranges))), lookout
+    return lookout.step(
+        ControlInput(time_s, 0.01, 0.0, pose, Readings(STILL, STILL, ranges))
+    ), lookout
 
 
 def test_a_swinging_head_sees_what_is_in_the_way_and_on_which_side():
@@ -196,7 +200,7 @@ def test_modes_last_half_a_second():
 
 def test_the_random_walk_draws_from_its_own_stream():
     def offsets(seed):
-        course = RandomCourse(RandomTurns(0.15, 2.0, 6.0), seed)
+        course = RandomHeadingPolicy(RandomTurns(0.15, 2.0, 6.0), seed)
         return np.array([course.step(moment(k / 100)) for k in range(20000)])
 
     one = offsets(7)
@@ -213,7 +217,7 @@ def test_the_random_walk_draws_from_its_own_stream():
 def moment(time_s, place=(0.0, 0.0), heading=0.0, field=None):
     read = {} if field is None else {"compass": np.array(field)}
     pose = Pose(np.array(place), heading, heading)
-    return Moment(time_s, 0.01, math.pi * time_s, pose, Readings(STILL, STILL, {}, {}, read))
+    return ControlInput(time_s, 0.01, math.pi * time_s, pose, Readings(STILL, STILL, {}, {}, read))
 
 
 def north_at(angle):
@@ -225,7 +229,7 @@ def north_at(angle):
 def test_the_course_points_to_the_target_from_wherever_the_robot_started_to_look(start):
     """Whatever way the head looked at first, and however far it has come since."""
     law = TargetHeading(gain=0.35, largest=0.2)
-    course = TargetCourse(law, (3.0, 1.0), 0.3, 0.4, SNAKE)
+    course = TargetHeadingPolicy(law, (3.0, 1.0), 0.3, 0.4, SNAKE)
     assert course.step(moment(0.0)) == 0.0  # the compass has not told anything yet
     course.step(moment(0.01, field=north_at(start)))
     turn = 0.2
@@ -239,14 +243,14 @@ def test_the_course_points_to_the_target_from_wherever_the_robot_started_to_look
 
 
 def test_a_target_that_no_turn_reaches_is_left_behind_first():
-    course = TargetCourse(TargetHeading(), (0.0, 0.5), 0.1, 0.5, SNAKE)
+    course = TargetHeadingPolicy(TargetHeading(), (0.0, 0.5), 0.1, 0.5, SNAKE)
     course.step(moment(0.0, field=north_at(0.0)))
     assert course.step(moment(0.01, field=north_at(0.0))) == 0.0  # at the centre of the turn
     assert course.step(moment(0.02, (2.0, 0.0), field=north_at(0.0))) == -0.2
 
 
 def test_the_course_turns_the_body():
-    course = TargetCourse(TargetHeading(), (0.0, -5.0), 0.3, 0.4, SNAKE)
+    course = TargetHeadingPolicy(TargetHeading(), (0.0, -5.0), 0.3, 0.4, SNAKE)
     gait = controlled(Controller(ControllerKind.TARGET_FOLLOWING), course)
     field = {"compass": np.array(north_at(0.0))}
     ticks = [gait.step(k / 100, Readings(STILL, STILL, {}, {}, field)) for k in range(150)]

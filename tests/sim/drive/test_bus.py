@@ -26,10 +26,10 @@ from undulog.sim import load_scenario
 from undulog.sim.control.adaptive import build_gait
 from undulog.sim.drive.links import find_virtual_robot, sent_text
 from undulog.sim.drive.loop import CommandEncoder, WallPace
-from undulog.sim.drive.motion import find_driven
+from undulog.sim.drive.motion import find_motion
 from undulog.sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
 from undulog.sim.drive.python_can_bus import open_link
-from undulog.sim.gate.outcome import How
+from undulog.sim.gate.outcome import DriveEnding
 from undulog.sim.sensing.contract import JointSample
 from undulog.sim.serve.pacing import Pacer
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
@@ -126,7 +126,7 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, ca
         assert phases == ["run"]
     # The robot did what the twin does with commands rounded to the bus, and said so, rounded.
     with Twin(
-        weak(0.3), Rounded(find_driven("weak-servo-pi3").make(load_robot("snake25"), None))
+        weak(0.3), Rounded(find_motion("weak-servo-pi3").make(load_robot("snake25"), None))
     ) as twin:
         samples = [one for sample in twin.samples() for one in sample.sensed]
     cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])
@@ -161,7 +161,7 @@ def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):
     path = tmp_path / "a.mcap"
     with alive(load_scenario("flat").changed(duration_s=30.0), lockstep=False) as (on, _):
         report = drive_bus(planned("flat", on, path, duration_s=0.5), stop=StopRequest())
-    assert report.outcome.how is How.COMPLETE
+    assert report.outcome.how is DriveEnding.COMPLETE
     assert report.gait_s == 0.5
     assert report.ticks <= 51 <= report.ticks + report.tally.overruns
     assert report.wall_s >= 0.5
@@ -178,7 +178,7 @@ def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):
 
 def planned(what, on, output, *, duration_s=0.2, robot=None):
     return bus_plan(
-        find_driven(what),
+        find_motion(what),
         on,
         robot=robot,
         duration_s=duration_s,
@@ -201,7 +201,7 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
     with alive(weak(9.0)) as (on, _):
         plan = planned("weak-servo-pi3", on, path, duration_s=9.0, robot=robot)
         report = drive_bus(plan, stop=stop, on_tick=ask)
-    assert report.outcome.how is How.STOPPED
+    assert report.outcome.how is DriveEnding.STOPPED
     assert report.outcome.why == "asked to stop (Ctrl-C)"
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
@@ -233,7 +233,7 @@ def test_asked_twice_nothing_more_is_sent(tmp_path):
         plan = planned("weak-servo-pi3", on, tmp_path / "a.mcap", duration_s=9.0)
         report = drive_bus(plan, stop=stop, on_tick=ask)
     assert report.tally.sent == 25 * 26
-    assert report.outcome.how is How.STOPPED
+    assert report.outcome.how is DriveEnding.STOPPED
     assert report.outcome.ended.startswith("nothing more was sent")
 
 
@@ -276,7 +276,7 @@ def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
             commands.write(10**18 + tick * 10_000_000, bent * np.cos(tick / 100))
     with alive(weak(9.0)) as (on, _):
         report = drive_bus(planned(str(recorded), on, path, duration_s=0.3), stop=StopRequest())
-    assert report.outcome.how is How.COMPLETE
+    assert report.outcome.how is DriveEnding.COMPLETE
     way_s = 1.5 * 0.2 / 0.5
     assert report.approach_s == pytest.approx(way_s, abs=0.011)
     with Session.open(path) as session:
@@ -323,7 +323,7 @@ def test_any_bus_of_python_can_will_do(tmp_path):
     with speaking("gate-any", answer):
         plan = planned("flat", "can:virtual:gate-any", tmp_path / "a.mcap", duration_s=0.3)
         report = drive_bus(plan, stop=StopRequest())
-    assert report.outcome.how is How.COMPLETE, report.outcome
+    assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
     assert report.approach_s >= LISTEN_S + 1.5 * 0.1 / 0.5 - 0.02
     assert {len(each) for each in heard.values()} == {report.tally.sent // 25}
     raw = np.array(

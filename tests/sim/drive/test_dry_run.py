@@ -15,7 +15,7 @@ from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
 from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world
 from undulog.sim.drive.dry_run_text import reported, told
-from undulog.sim.drive.motion import find_driven
+from undulog.sim.drive.motion import find_motion
 
 EPOCH_NS = 1_735_689_600_000_000_000
 RATE_HZ = 100
@@ -75,7 +75,7 @@ def waved(robot, tmp_path_factory):
     """A wave of 1.5 s, run dry, and the twin's session of it."""
     folder = tmp_path_factory.mktemp("dry")
     commands = wave(robot, 1.5)
-    driven = find_driven(str(write(folder / "wave.mcap", robot, commands)))
+    driven = find_motion(str(write(folder / "wave.mcap", robot, commands)))
     path = folder / "twin.mcap"
     return commands, dry_run(driven, output=path), path
 
@@ -180,7 +180,7 @@ def test_json_has_si_units_and_nothing_that_is_no_number(waved):
 def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
     commands = np.zeros((60, len(robot.joints)))
     commands[20:, 2] = 0.3
-    driven = find_driven(str(write(tmp_path / "step.mcap", robot, commands)))
+    driven = find_motion(str(write(tmp_path / "step.mcap", robot, commands)))
     path = tmp_path / "twin.mcap"
     run = dry_run(driven, output=path)
     assert run.verdict is Verdict.CLAMPED
@@ -200,7 +200,7 @@ def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
 
 
 def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
-    driven = find_driven(str(write(tmp_path / "wave.mcap", robot, wave(robot, 3.0, 0.5))))
+    driven = find_motion(str(write(tmp_path / "wave.mcap", robot, wave(robot, 3.0, 0.5))))
     world = nominal_world(robot)
     joints = list(robot.joints)
     weak = dataclasses.replace(joints[2].servo, stall_torque=0.01)
@@ -221,7 +221,7 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
 
 def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_same(robot, tmp_path):
     bare = dataclasses.replace(robot, safety=Safety(max_rate=4.0))
-    driven = find_driven(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
+    driven = find_motion(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
     run = dry_run(driven, robot=bare)
     assert run.verdict is Verdict.REFUSED
     assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
@@ -286,7 +286,7 @@ def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, capsys):
 
 
 def test_a_twin_that_fails_leaves_a_session_that_says_so(robot, tmp_path):
-    driven = find_driven(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
+    driven = find_motion(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
     world = dataclasses.replace(nominal_world(robot), physics_rate_hz=200)
     path = tmp_path / "twin.mcap"
     with pytest.raises(SimulationError, match="the twin failed at 0"):

@@ -14,9 +14,9 @@ from undulog.capture.bus.encoding import poll_frames
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.capture.robot.description import load_robot
-from undulog.sim.drive.motion import find_driven
+from undulog.sim.drive.motion import find_motion
 from undulog.sim.drive.over_bus import bus_plan, drive_bus
-from undulog.sim.gate.outcome import How
+from undulog.sim.gate.outcome import DriveEnding
 
 SHIPPED = load_robot("arcsnake-joint")
 SAFETY = """
@@ -88,7 +88,7 @@ def planned(tmp_path, robot, channel, angles):
         for k, angle in enumerate(angles):
             channel_of.write(10**18 + k * 10_000_000, np.array([angle]))
     return bus_plan(
-        find_driven(str(recorded)),
+        find_motion(str(recorded)),
         f"can:virtual:{channel}",
         duration_s=None,
         output=tmp_path / "a.mcap",
@@ -109,7 +109,7 @@ def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     angles = 0.5 + 0.2 * np.sin(np.arange(121).clip(max=40) / 10)  # then it catches up
     with servo("polled", math.degrees(0.3)) as one:
         report = drive_bus(planned(tmp_path, robot, "polled", angles), stop=StopRequest())
-    assert report.outcome.how is How.COMPLETE, report.outcome
+    assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
     requests = [data for data in one.heard if data[0] == 0x92]
     commands = [data for data in one.heard if data[0] == 0xA4]
     assert len(requests) + len(commands) == report.tally.sent == len(one.heard)

@@ -10,7 +10,7 @@ import pytest
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import ControlServer
-from undulog.sim.drive.session import GaitTeller
+from undulog.sim.drive.session import GaitPublisher
 from undulog.sim.gait.contract import GaitTick
 
 NAMES = tuple(f"horizontal.{key}" for key in ("A", "omega", "lag", "offset", "phase"))
@@ -54,7 +54,7 @@ def control_socket(path, refuse=()):
 
 def test_everything_is_told_in_order(tmp_path):
     with control_socket(tmp_path / "a.sock") as (heard, _):
-        teller = GaitTeller(tmp_path / "a.sock", NAMES)
+        teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.note("drives")
         for k in range(300):
             teller.tell(tick(k, "walk" if k < 200 else "avoid"), 10**18 + k)
@@ -75,7 +75,7 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
     names = (*NAMES, "joint01.A", "steer.distance")
     values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, np.nan, np.inf])
     with control_socket(tmp_path / "a.sock") as (heard, _):
-        teller = GaitTeller(tmp_path / "a.sock", names)
+        teller = GaitPublisher(tmp_path / "a.sock", names)
         teller.tell(GaitTick(np.zeros(25), values, "walk", ()), 1)
         teller.close()
     told = [1.0, 2.0, 3.0, 4.0, 5.0, None, None]
@@ -84,7 +84,7 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
 
 def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
     with control_socket(tmp_path / "a.sock") as (heard, _):
-        teller = GaitTeller(tmp_path / "a.sock", ())
+        teller = GaitPublisher(tmp_path / "a.sock", ())
         teller.tell(tick(0, "replay", count=0), 1)
         teller.close()
     assert heard == [{"do": "mode", "text": "replay"}]
@@ -93,7 +93,7 @@ def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
 
 def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
     with control_socket(tmp_path / "a.sock") as (_, end):
-        teller = GaitTeller(tmp_path / "a.sock", NAMES)
+        teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.tell(tick(0), 1)
         teller_told(teller, 1)
         end()
@@ -103,7 +103,7 @@ def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
     assert teller.told == 1
     assert "went" in teller.error
     with control_socket(tmp_path / "b.sock", refuse=("gait",)):
-        teller = GaitTeller(tmp_path / "b.sock", NAMES)
+        teller = GaitPublisher(tmp_path / "b.sock", NAMES)
         teller.tell(tick(0), 1)
         teller.close()
     assert (teller.told, teller.error) == (0, "a source writes that topic")
@@ -115,4 +115,4 @@ def teller_told(teller, count):
 
 def test_no_recorder_there_is_an_error(tmp_path):
     with pytest.raises(ControlError, match="no recorder listens there"):
-        GaitTeller(tmp_path / "none.sock", NAMES)
+        GaitPublisher(tmp_path / "none.sock", NAMES)

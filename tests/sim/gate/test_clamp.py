@@ -14,7 +14,7 @@ from undulog.capture import load_robot
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import OnFault
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.gate.feedback import Yielding
+from undulog.sim.gate.feedback import CurrentLimiter
 from undulog.sim.gate.limits import Clamp, Ending, Ramp, Spacing, gate_limits
 from undulog.sim.gate.outcome import JointStatus
 
@@ -130,7 +130,7 @@ def test_an_ending_starts_where_the_joints_are(how):
 
 def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():
     limit = np.array([1.0, 1.0, np.nan])
-    yielding = Yielding(limit)
+    yielding = CurrentLimiter(limit)
     wanted, angle = np.array([0.3, 0.3, 0.3]), np.array([0.1, 0.1, np.nan])
     current = np.array([8.0 * 0.2, 0.5, 5.0])  # of a stiff servo: proportional to the distance
     pushed = []

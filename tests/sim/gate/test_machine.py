@@ -11,10 +11,18 @@ from undulog.capture.log.messages.frames import DIR_TX, ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import OnFault
 from undulog.capture.sources.events import BUS_OFF
 from undulog.sim.gait.contract import GaitTick, Readings
-from undulog.sim.gate.feedback import Presence
+from undulog.sim.gate.feedback import BusCheck
 from undulog.sim.gate.gate import HOLD_S, POSE_S, Gate
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.outcome import FaultKind, GateFault, Heard, How, JointStatus, Phase, jitter
+from undulog.sim.gate.outcome import (
+    DriveEnding,
+    FaultKind,
+    GateFault,
+    GateInput,
+    JointStatus,
+    Phase,
+    jitter,
+)
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)
@@ -47,7 +55,7 @@ def heard(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0
     status = JointStatus(
         all_of(angle), all_of(current), all_of(temperature), all_of(voltage), all_of(silence_s)
     )
-    return Heard(Readings(status.angle, all_of(0.0)), status, **more)
+    return GateInput(Readings(status.angle, all_of(0.0)), status, **more)
 
 
 def gate(gait, *, duration_s=1.0, limits=LIMITS, listen_s=0.0):
@@ -89,7 +97,7 @@ class Bench:
 def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():
     bench = Bench(start=0.1)
     bench.until(Phase.DONE)
-    assert bench.gate.outcome.how is How.COMPLETE
+    assert bench.gate.outcome.how is DriveEnding.COMPLETE
     way = np.abs(bench.gait.at(0.0) - 0.1).max()
     ramp_ticks = int(np.ceil(1.5 * way / 0.5 * RATE_HZ - 1e-9)) - 1
     sent = np.array(bench.sent)
@@ -192,7 +200,7 @@ def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
         np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
     if how is OnFault.HOLD:
         np.testing.assert_allclose(bench.sent[-1], bench.sent[-5], atol=1e-12)
-    assert bench.gate.outcome.how is How.FAULT
+    assert bench.gate.outcome.how is DriveEnding.FAULT
     assert bench.gate.step(bench.tick, heard(0.0)).command is None  # and nothing after it
 
 
@@ -241,7 +249,7 @@ def test_asked_to_stop_it_ends_and_asked_again_at_once():
     assert bench.gate.phase is Phase.ENDING
     bench.step(stop="asked")
     assert bench.step(stop="asked", at_once=True).command is None
-    assert (bench.gate.phase, bench.gate.outcome.how) == (Phase.DONE, How.STOPPED)
+    assert (bench.gate.phase, bench.gate.outcome.how) == (Phase.DONE, DriveEnding.STOPPED)
     assert bench.gate.outcome.why == "asked, twice"
 
 
@@ -255,7 +263,7 @@ def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
         remarks += bench.step(stop="asked", temperature=99.0).remarks
     said = [text for level, text in remarks if level == "error"]
     assert said == ["fault while ending: joint01: temperature 99 degC, more than 70 degC for 0.3 s"]
-    assert bench.gate.outcome.how is How.STOPPED
+    assert bench.gate.outcome.how is DriveEnding.STOPPED
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
 
 
@@ -282,7 +290,7 @@ def test_a_bus_that_stays_silent_gets_no_ramp():
     for k in range(int(HOLD_S * RATE_HZ)):
         bench.step(received=False, silence_s=k / RATE_HZ)
     assert bench.gate.phase is Phase.DONE
-    assert (bench.gate.outcome.how, bench.gate.outcome.fault.kind) == (How.FAULT, "silent")
+    assert (bench.gate.outcome.how, bench.gate.outcome.fault.kind) == (DriveEnding.FAULT, "silent")
     assert bench.gate.outcome.ended.startswith("nothing more was sent")
 
 
@@ -291,7 +299,7 @@ def test_asked_to_stop_before_anything_was_sent_nothing_is():
     bench.step()
     assert bench.step(stop="asked").command is None
     assert (bench.gate.outcome.how, bench.gate.outcome.ended) == (
-        How.STOPPED,
+        DriveEnding.STOPPED,
         "no command was sent",
     )
 
@@ -331,7 +339,7 @@ def test_a_gait_that_fails_and_a_log_that_can_not_be_written_end_as_a_fault_does
         assert isinstance(bench.gate.gait_error, ZeroDivisionError)
         assert outcome.why == "the gait failed: ZeroDivisionError: no range"
     else:
-        assert (outcome.how, outcome.why) == (How.FAULT, "the disk is full")
+        assert (outcome.how, outcome.why) == (DriveEnding.FAULT, "the disk is full")
 
 
 def frames_of(*identifiers, way=0):
@@ -342,7 +350,7 @@ def frames_of(*identifiers, way=0):
 
 
 def test_who_is_on_the_bus():
-    presence = Presence(ROBOT)
+    presence = BusCheck(ROBOT)
     assert presence.add(frames_of(0x201, 0x202, 0x300)) is None
     assert presence.another_robot() is None
     assert presence.add(frames_of(0x101, way=DIR_TX)) is None  # an echo of our own
@@ -352,7 +360,7 @@ def test_who_is_on_the_bus():
     presence.add(frames_of(*[0x14B] * 7))
     assert "heard 4 are of snake25" in presence.another_robot()
     # A request and its reply that share an identifier can't be told apart.
-    assert Presence(load_robot("arcsnake-joint")).add(frames_of(0x14B)) is None
+    assert BusCheck(load_robot("arcsnake-joint")).add(frames_of(0x14B)) is None
 
 
 def test_lateness_is_summed_up_as_numpy_has_it():

@@ -20,7 +20,7 @@ from undulog.sim.drive.loop import CommandEncoder
 from undulog.sim.gait.contract import GaitTick, Readings
 from undulog.sim.gate.gate import Gate
 from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.outcome import FaultKind, GateFault, Heard, JointStatus, Phase
+from undulog.sim.gate.outcome import FaultKind, GateFault, GateInput, JointStatus, Phase
 
 ROBOT = load_robot("snake25")
 COUNT, RATE_HZ = len(ROBOT.joints), 100
@@ -93,7 +93,7 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
         nonlocal tick
         gait.wish = wish
         status = JointStatus(angle, current, unknown, unknown, np.zeros(COUNT))
-        heard = Heard(
+        heard = GateInput(
             Readings(angle, unknown),
             status,
             trouble=more["trouble"],

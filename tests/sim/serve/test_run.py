@@ -26,7 +26,7 @@ from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder
-from undulog.sim.drive.motion import find_driven
+from undulog.sim.drive.motion import find_motion
 from undulog.sim.gait.contract import Readings
 
 PATIENCE_S = 300
@@ -135,7 +135,7 @@ def heedless(scenario, port, control):
     del control
     robot, gait = (
         load_robot("snake25"),
-        find_driven(str(scenario)).make(load_robot("snake25"), None),
+        find_motion(str(scenario)).make(load_robot("snake25"), None),
     )
     encoder, blind = CommandEncoder(robot), Readings.nothing(robot)
     address = parse_address(f"can:socketcand:can0?host=127.0.0.1&port={port}")

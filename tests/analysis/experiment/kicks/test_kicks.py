@@ -5,12 +5,12 @@ import pytest
 
 from undulog.analysis.experiment.kicks.coupling import predict, valid_to
 from undulog.analysis.experiment.kicks.local import (
-    Answers,
-    Measured,
-    answers_of,
+    MeasuredDerivatives,
+    ResponseMatrices,
     central_differences,
     lti_reading,
     nonlinearity,
+    response_matrices,
     row_sums,
 )
 from undulog.analysis.experiment.kicks.runs import (
@@ -65,11 +65,11 @@ def run_all(system, command, kicks, turns=None):
         commands = commands * np.exp(1j * turns)[:, None]
         deviation = np.stack([deviation_of(one, command) for one in commands])
     ratio = np.stack([system(one) / one for one in commands])
-    return answers_of(deviation, ratio, system(command) / command)
+    return response_matrices(deviation, ratio, system(command) / command)
 
 
 def measure(log, kicks, variance=0.0, dof=10.0):
-    answers = Answers(
+    answers = ResponseMatrices(
         log, np.full(log.shape, variance), np.full(log.shape, variance), np.full(log.shape, dof)
     )
     P, R = central_differences(kicks, answers, Kind.PHASE)
@@ -121,7 +121,9 @@ def test_intervals_cover_what_was_planted():
     for _ in range(count):
         noise = sigma * (rng.normal(size=log.shape) + 1j * rng.normal(size=log.shape))
         estimated = sigma**2 * rng.chisquare(dof, (2, *log.shape)) / dof
-        answers = Answers(log + noise, estimated[0], estimated[1], np.full(log.shape, float(dof)))
+        answers = ResponseMatrices(
+            log + noise, estimated[0], estimated[1], np.full(log.shape, float(dof))
+        )
         P, R = central_differences(kicks, answers, Kind.PHASE)
         S, G = central_differences(kicks, answers, Kind.AMPLITUDE)
         for k, one in enumerate((P, R, G, S)):
@@ -222,8 +224,8 @@ def test_an_asymmetric_p_is_not_directed_coupling():
 
 
 def test_a_singular_reading_is_not_inverted():
-    flat = Measured(np.full((3, 3), 1 / 3), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
-    nothing = Measured(np.zeros((3, 3)), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
+    flat = MeasuredDerivatives(np.full((3, 3), 1 / 3), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
+    nothing = MeasuredDerivatives(np.zeros((3, 3)), np.full((3, 3), 1e-3), np.full((3, 3), 9.0))
     reading = lti_reading(flat, nothing, np.ones(3, complex), np.ones(3, complex))
     assert reading.asymmetry.value is None
     assert reading.condition_number > 1e10

@@ -9,7 +9,7 @@ import pytest
 from support.kick_runs import kicked
 from undulog.analysis.experiment.answer import kick_answer
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.local import Answers, local_matrices
+from undulog.analysis.experiment.kicks.local import ResponseMatrices, local_matrices
 from undulog.analysis.experiment.kicks.runs import Kick, KickExperiment, Kind, sort_kicks
 from undulog.analysis.experiment.kicks.scatter import run_errors
 
@@ -101,7 +101,7 @@ def test_a_copied_file_is_no_repeat():
     kicks = kick_tables.plan(4, 1)
     (answers,) = kick_tables.experiments(np.random.default_rng(1), 1, kicks, H, c, scatter=1e-3)
     twice = [*kicks, None]
-    again = Answers(
+    again = ResponseMatrices(
         *(
             np.vstack([part, part[:1]])
             for part in (

@@ -11,7 +11,7 @@ from support import twin_chains
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
 from undulog.sim import load_scenario
-from undulog.sim.drive.motion import find_driven
+from undulog.sim.drive.motion import find_motion
 from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import Driver, record
 
@@ -60,7 +60,7 @@ def measured(folder, plan, *words, kernels=Kernels.NUMBA):
     driven = []
     for seed, file in enumerate(sorted(runs.glob("*.mcap"))):
         world = load_scenario(folder / "free.toml").changed(seed=seed + 1)
-        one = find_driven(str(file), world)
+        one = find_motion(str(file), world)
         driven.append(runs / f"driven{seed:02d}.mcap")
         scenario = one.scenario(world, None)
         driver = Driver(one.make(scenario.robot, scenario), one.facts, one.attachments)

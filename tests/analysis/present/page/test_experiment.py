@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from undulog.analysis.present.page import tables as typeset
-from undulog.analysis.present.page.artefacts import artefact_rows, told_times
+from undulog.analysis.present.page.artefacts import artefact_rows, times_text
 from undulog.analysis.present.page.matrix import Entries, entries_of, matrix_picture
 from undulog.analysis.present.page.mirror import profiles
 from undulog.analysis.present.page.page import render
@@ -172,10 +172,10 @@ def test_sentences_on_the_page(text, set_as):
 
 
 def test_times_of_artefacts():
-    assert told_times(()) == "throughout"
-    assert told_times(((2.0, 3.5), (7.1, 7.1))) == "2.00 to 3.50 s, 7.10 s"
+    assert times_text(()) == "throughout"
+    assert times_text(((2.0, 3.5), (7.1, 7.1))) == "2.00 to 3.50 s, 7.10 s"
     many = tuple((float(k), k + 0.5) for k in range(6))
-    assert told_times(many).endswith("3.00 to 3.50 s and 2 more, 3.00 s in all")
+    assert times_text(many).endswith("3.00 to 3.50 s and 2 more, 3.00 s in all")
 
 
 def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
