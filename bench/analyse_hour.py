@@ -72,12 +72,12 @@ def verdict(what: str, value: float, bar: float, unit: str) -> bool:
 
 
 def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bool:
-    """Run both verbs and print; whether all bars are met.
+    """Run both commands and print; whether all bars are met.
 
     Args:
         path: The session.
         part: Its length over an hour; the bars of time shrink with it.
-        runs: Of each verb.
+        runs: Of each command.
         adaptive: Whether its gait varies all the time.
 
     Returns:

@@ -32,7 +32,7 @@ REST_S = 5.0
 PATIENCE_S = 600.0
 SIZE = "--window-size=1440x900"
 
-# The verb as it is, but for the window, which a machine without a display can't open.
+# The command as it is, but for the window, which a machine without a display can't open.
 VIEW = f"""
 import sys
 import undulog

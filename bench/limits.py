@@ -1,7 +1,7 @@
 """Time of reading as each dimension of a log is doubled: at most linear.
 
-For each dimension two logs are written, the second twice as large in it, and each verb reads both
-in a process of its own. Twice as much may cost at most 2.3 times the processor time beyond that of
+For each dimension two logs are written, the second twice as large in it, and each command reads
+both in a process of its own. Twice as much may cost at most 2.3 times the processor time beyond that of
 a small log; what takes less than a tenth of a second in all is not judged.
 
 Run: python bench/limits.py [--runs 3] [DIMENSION...]
@@ -118,7 +118,7 @@ DIMENSIONS: dict[str, tuple[Callable[[HostileLog, int], None], int]] = {
 
 
 def cost(arguments: list[str]) -> tuple[float, float]:
-    """Processor time [s] and peak memory [MiB] of a verb, in a fork: its imports are paid for."""
+    """Processor time [s] and peak memory [MiB] of a command, in a fork that has its imports."""
     process = os.fork()
     if not process:
         with Path(os.devnull).open("w") as sink, contextlib.redirect_stdout(sink):

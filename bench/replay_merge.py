@@ -4,7 +4,7 @@
 100 Hz, each sampled at a time of its own, sensors, odometry and gait) twice, converts both, and
 merges the two recordings three times as ``undulog view A B`` does: chunks get their session's name
 in front, those of the second session are moved along both timelines, and all go into one file; then
-the whole of what that verb does once both are converted, with the differences. Beside it the same
+all that the command does once both are converted, with the differences. Beside it the same
 row by row, on a hundredth of the rows of every entity: each row is read from its recording and sent
 by itself. And Rerun's own ``rerun rrd merge``, which puts no names in front and moves nothing. The
 best of three runs counts; processor time is printed beside, since other processes disturb it less.

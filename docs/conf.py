@@ -32,7 +32,7 @@ napoleon_numpy_docstring = False
 
 
 def _command_line_page() -> str:
-    """The help of every verb, as the terminal shows it."""
+    """The help of every command, as the terminal shows it."""
     import os
     from contextlib import redirect_stdout
     from io import StringIO

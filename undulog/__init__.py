@@ -1,4 +1,4 @@
-"""The front door: one command, ``undulog``; each verb is imported when it is used.
+"""The command line ``undulog``: each command is imported when it is used.
 
 Exit codes: 0 done, 1 the work failed, 2 wrong usage.
 """
@@ -113,7 +113,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "view": ("undulog.replay.commands.view:view", "See a session in Rerun."),
     "info": ("undulog.capture.commands.info:info", "Versions and extras, for a bug report."),
 }
-"""Verb to the function behind it and its line in the list of verbs."""
+"""Command to the function behind it and its line in the list of commands."""
 
 _GROUPS = {
     "plan": "Write the commands of an experiment around a recorded gait.",
@@ -141,10 +141,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 
 def build(arguments: Sequence[str] = ()) -> App:
-    """The command with all its verbs, none of them imported.
+    """The command with all its commands, none of them imported.
 
     Args:
-        arguments: The command line; the verb that it names takes its help from its own
+        arguments: The command line; the command that it names takes its help from its own
             docstring, the others only have their line in the list.
 
     Returns:
@@ -158,7 +158,7 @@ def build(arguments: Sequence[str] = ()) -> App:
         name="undulog",
         help="Record, simulate, measure and replay undulating robots. "
         "Every session is one MCAP file that explains itself. "
-        "Every verb takes `--max-chunk-mib N`: larger chunks (256 MiB by default) are not read.",
+        "Every command takes `--max-chunk-mib N`: larger chunks (256 MiB by default) are not read.",
         version=lambda: version("undulog"),
         help_format="markdown",
         help_epilogue="Example: `undulog sim run flat -o run.mcap && undulog analyse run.mcap`",
@@ -180,10 +180,10 @@ def build(arguments: Sequence[str] = ()) -> App:
 
 
 def _group(name: str, arguments: Sequence[str]) -> App:
-    """A group of verbs; where it is a verb itself, that is imported when the group is asked for.
+    """A group of commands; if it is a command itself, that is imported when the group is used.
 
     ``undulog record can:...`` records, ``undulog record stop`` ends a recording: a word that names
-    a verb of the group is that verb, anything else goes to the group's own.
+    a command of the group is that command, anything else goes to the group's own.
     """
     from cyclopts import App
 
@@ -214,10 +214,10 @@ def run(arguments: Sequence[str]) -> int:
             raise UsageError("an argument is empty; is it a variable of the shell that isn't set?")
         arguments = _without_chunk_limit(arguments)
         result = build(arguments)(arguments, exit_on_error=False, print_error=False)
-    except UnknownCommandError:  # its own text would import every verb
+    except UnknownCommandError:  # its own text would import every command
         return _complain(_unknown(arguments), 2)
     except CycloptsError as error:
-        return _complain(f"{error}\nTry 'undulog --help', or --help after the verb.", 2)
+        return _complain(f"{error}\nTry 'undulog --help', or --help after the command.", 2)
     except (UndulogError, ImportError) as error:
         known = error if isinstance(error, UndulogError) else _missing_extra(error, arguments)
         if known is None:
@@ -270,7 +270,7 @@ def _discard_output() -> None:
 
 
 def _without_chunk_limit(arguments: Sequence[str]) -> list[str]:
-    """Take ``--max-chunk-mib``, an option of every verb, to the environment of all that it starts.
+    """Move ``--max-chunk-mib``, an option of every command, into the environment.
 
     Raises:
         UsageError: If its value is no positive whole number.
@@ -300,11 +300,11 @@ def _unknown(arguments: Sequence[str]) -> str:
     typed = " ".join(words if words and words[0] in _GROUPS else words[:1])
     options = [word for word in arguments if word.startswith("-")]
     if options and (arguments[0] in options or typed in _GROUPS):
-        place = f" of 'undulog {typed}'" if typed in _GROUPS else " in front of a verb"
+        place = f" of 'undulog {typed}'" if typed in _GROUPS else " in front of a command"
         return f"there is no option '{options[0]}'{place}. Try 'undulog --help'."
     near = get_close_matches(typed, VERBS, n=1)
     hint = f"Did you mean '{near[0]}'? " if near else ""
-    return f"there is no verb '{typed}'. {hint}There are: {', '.join(VERBS)}."
+    return f"there is no command '{typed}'. {hint}There are: {', '.join(VERBS)}."
 
 
 def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtraError | None:

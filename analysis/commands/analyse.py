@@ -1,4 +1,4 @@
-"""The verb ``analyse``: sessions in, numbers out."""
+"""Command ``analyse``: sessions in, numbers out."""
 
 from __future__ import annotations
 

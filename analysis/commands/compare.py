@@ -1,4 +1,4 @@
-"""The verb ``compare``: two sessions, or two groups of them."""
+"""Command ``compare``: two sessions, or two groups of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the verbs of the analysis ask and say in the same way."""
+"""What the commands of the analysis ask and say in the same way."""
 
 from __future__ import annotations
 

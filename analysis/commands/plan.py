@@ -1,4 +1,4 @@
-"""The verbs ``plan ...``: from a recorded gait to the sessions of commands of an experiment."""
+"""Commands ``plan ...``: from a recorded gait to the sessions of commands of an experiment."""
 
 from __future__ import annotations
 

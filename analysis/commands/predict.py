@@ -1,4 +1,4 @@
-"""The verb ``predict``: from kicks of an open loop to the closed loop."""
+"""Command ``predict``: from kicks of an open loop to the closed loop."""
 
 from __future__ import annotations
 

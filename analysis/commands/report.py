@@ -1,4 +1,4 @@
-"""The verb ``report``: sessions in, one HTML page out."""
+"""Command ``report``: sessions in, one HTML page out."""
 
 from __future__ import annotations
 

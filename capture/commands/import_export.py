@@ -1,4 +1,4 @@
-"""The verbs ``import`` and ``log export``."""
+"""Commands ``import`` and ``log export``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is installed: the verb ``info``, and the versions that go into results."""
+"""What is installed: the command ``info``, and the versions that go into results."""
 
 from __future__ import annotations
 

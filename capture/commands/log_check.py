@@ -1,4 +1,4 @@
-"""The verb ``log check``: the health of a session, from its data alone."""
+"""Command ``log check``: the health of a session, from its data alone."""
 
 from __future__ import annotations
 

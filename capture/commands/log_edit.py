@@ -1,4 +1,4 @@
-"""The verbs ``log cut`` and ``log merge``: an edit always writes a new file."""
+"""Commands ``log cut`` and ``log merge``: an edit always writes a new file."""
 
 from __future__ import annotations
 

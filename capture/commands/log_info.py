@@ -1,4 +1,4 @@
-"""The verb ``log info``: what a log holds, of our making or not."""
+"""Command ``log info``: what a log holds, of our making or not."""
 
 from __future__ import annotations
 

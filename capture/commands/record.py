@@ -1,4 +1,4 @@
-"""The verb ``record``."""
+"""Command ``record``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verbs ``record status``, ``mark``, ``note``, ``split``, ``stop`` and ``unit``.
+"""Commands ``record status``, ``mark``, ``note``, ``split``, ``stop`` and ``unit``.
 
 They speak to running recorders by their control sockets.
 """

@@ -1,4 +1,4 @@
-"""What every verb prints in the same way: lines, errors, progress and JSON.
+"""What every command prints in the same way: lines, errors, progress and JSON.
 
 All text for a terminal passes :func:`plain`: names in a log are untrusted, and a terminal obeys the
 control characters in them.

@@ -4,7 +4,7 @@
 
     UndulogError
     |- UsageError (ValueError)              wrong options or arguments; exit code 2
-    |  |- MissingExtraError (ImportError)   a verb whose extra is not installed
+    |  |- MissingExtraError (ImportError)   a command whose extra is not installed
     |  |- OutputExistsError (FileExistsError)
     |  |- SettingsError                    settings of a recording, all faults listed
     |  `- JointSetError (DataError)        commands of another joint set than the robot's
@@ -50,7 +50,7 @@ class UsageError(UndulogError, ValueError):
 
 
 class MissingExtraError(UsageError, ImportError):
-    """A verb needs an optional part that is not installed."""
+    """A command needs an optional part that is not installed."""
 
     def __init__(self, verb: str, extra: str, missing: str) -> None:
         """Build the message.

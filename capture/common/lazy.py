@@ -3,7 +3,7 @@
 Packages that another package imports at once and that hardly any run needs.
 
 python-can imports asammdf wherever that is installed, and with it pandas and more: a second, and
-70 MB in a recorder, for a format that one verb reads. The command defers it; a program that uses
+70 MB in a recorder, for a format that one command reads. The command defers it; a program that uses
 undulog as a library is left alone, since its own imports are not ours to change.
 """
 

@@ -106,7 +106,7 @@ def spawn_relay(path: Path, arguments: Sequence[str] = ()) -> RelayProcess:
 
     Args:
         path: The socket that the relay will make.
-        arguments: Further options of the verb, e.g. ``--web``.
+        arguments: Further options of the command, e.g. ``--web``.
 
     Returns:
         The relay; look at :meth:`RelayProcess.poll` now and then.

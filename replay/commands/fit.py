@@ -1,4 +1,4 @@
-"""The verb ``sim fit``."""
+"""Command ``sim fit``."""
 
 from __future__ import annotations
 

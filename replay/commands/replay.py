@@ -1,4 +1,4 @@
-"""The verb ``replay``."""
+"""Command ``replay``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb ``view``."""
+"""Command ``view``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb ``view`` with ``--clip``."""
+"""Command ``view`` with ``--clip``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb ``view`` with two or more sessions."""
+"""Command ``view`` with two or more sessions."""
 
 from __future__ import annotations
 

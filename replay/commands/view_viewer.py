@@ -1,4 +1,4 @@
-"""The verb ``view`` with one session and a viewer: the picture comes while it is converted."""
+"""Command ``view`` with one session and a viewer: the picture comes while it is converted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb ``drive``."""
+"""Command ``drive``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Armed driving over a bus, for the verbs that offer it."""
+"""Armed driving over a bus, for the commands that offer it."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ def drive_on_bus(
     force: bool = False,
     as_json: bool = False,
 ) -> int:
-    """What a verb does on a bus: a dry run in the twin, or armed; and say how it went.
+    """What a command does on a bus: a dry run in the twin, or armed; and say how it went.
 
     Args:
         driven: What to drive.

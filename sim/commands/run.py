@@ -1,4 +1,4 @@
-"""The verbs ``sim list`` and ``sim run``."""
+"""Commands ``sim list`` and ``sim run``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb ``sim serve``."""
+"""Command ``sim serve``."""
 
 from __future__ import annotations
 

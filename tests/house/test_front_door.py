@@ -1,4 +1,4 @@
-"""The command line: every verb has help with an example, and wrong words exit with 2."""
+"""The command line: every command has help with an example, and wrong words exit with 2."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module: str) -
 def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert undulog.run(["analyze", "x.mcap"]) == 2
     said = capsys.readouterr().err
-    assert "no verb 'analyze'" in said
+    assert "no command 'analyze'" in said
     assert "Did you mean 'analyse'?" in said
 
 

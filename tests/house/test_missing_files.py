@@ -1,4 +1,4 @@
-"""A file that isn't there is told alike by every verb: one line that names it, exit code 1."""
+"""A file that isn't there is told alike by every command: one line that names it, exit code 1."""
 
 from __future__ import annotations
 

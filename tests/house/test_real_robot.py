@@ -1,4 +1,4 @@
-"""A real robot's CAN trace through the verbs, as its owner would type them."""
+"""A real robot's CAN trace through the commands, as its owner would type them."""
 
 from __future__ import annotations
 

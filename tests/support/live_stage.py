@@ -57,7 +57,7 @@ class Recorder:
 
 
 class Relay:
-    """The verb in a process of its own."""
+    """The command in a process of its own."""
 
     def __init__(self, socket_path, output, *more):
         self.output = output

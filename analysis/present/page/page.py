@@ -260,7 +260,7 @@ def _environment() -> Environment:
 
 
 def _commands_to_make_it_again(provenance: Provenance) -> str:
-    """The numbers again, and this page again; compare is one verb for both."""
+    """The numbers again, and this page again; compare is one command for both."""
     command = plain(provenance.command)
     numbers = "undulog analyse "
     if not command.startswith(numbers):

@@ -1,4 +1,4 @@
-"""What the verbs of the analysis refuse before they work, and what they say of a bad file."""
+"""What the commands of the analysis refuse before they work, and what they say of a bad file."""
 
 import json
 

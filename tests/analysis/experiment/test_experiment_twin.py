@@ -75,7 +75,7 @@ def test_the_weak_servo_is_named(answered):
 
 
 def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
-    """From a recorded gait to the pair, by the verbs, on a floor that falls by 1 degree."""
+    """From a recorded gait to the pair, by the commands, on a floor that falls by 1 degree."""
     (tmp_path / "chain.toml").write_text(ROBOT)
     like, folder = tmp_path / "like.mcap", tmp_path / "plan"
     (tmp_path / "like.toml").write_text(wave())
@@ -119,7 +119,7 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
 
 
 def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
-    """From a recorded gait to its coupling, by the verbs: plan, drive, analyse."""
+    """From a recorded gait to its coupling, by the commands: plan, drive, analyse."""
     (tmp_path / "chain.toml").write_text(ROBOT)
     scenario = tmp_path / "wave.toml"
     scenario.write_text(wave(noise=0.0005))

@@ -1,4 +1,4 @@
-"""Sessions whose generator logged its phases, analysed by the verb."""
+"""Sessions whose generator logged its phases, analysed by the command."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The verbs import and log export, as the command line calls them."""
+"""The commands import and log export, as the command line calls them."""
 
 import json
 import os

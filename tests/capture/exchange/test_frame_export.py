@@ -374,7 +374,7 @@ def test_a_real_trace_as_ros_messages(arcsnake, tmp_path: Path):
             np.testing.assert_array_equal(data, own["data"])
 
 
-# -- the verb ------------------------------------------------------------------------------
+# -- the command ------------------------------------------------------------------------------
 
 
 def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path: Path, capsys):

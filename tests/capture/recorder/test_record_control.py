@@ -1,4 +1,4 @@
-"""The verbs that speak to a running recorder: real recorders, real command lines."""
+"""The commands that speak to a running recorder: real recorders, real command lines."""
 
 import contextlib
 import json
@@ -51,7 +51,7 @@ def recorder(place):
 
 
 def said(capsys, *words):
-    """Exit code and output of a verb."""
+    """Exit code and output of a command."""
     code = undulog.run(["record", *words])
     out, err = capsys.readouterr()
     return code, out, err

@@ -185,7 +185,7 @@ def service(unit, tmp_path):
 
 
 def control(runtime, *words):
-    """Run a verb of the control socket as the operator would."""
+    """Run a command of the control socket as the operator would."""
     environ = {**os.environ, "RUNTIME_DIRECTORY": str(runtime)}
     return undulog("record", *words, env=environ)
 

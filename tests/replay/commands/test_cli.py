@@ -1,4 +1,4 @@
-"""The verb ``view`` as it is used: files, errors, and a server that only this machine reaches."""
+"""Command ``view`` as it is used: files, errors, and a server that only this machine reaches."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The verb ``view`` as it is used: a process of its own, and Rerun's viewer without a window."""
+"""Command ``view`` as it is used: a process of its own, and Rerun's viewer without a window."""
 
 import os
 import signal

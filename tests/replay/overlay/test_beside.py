@@ -135,7 +135,7 @@ def make(chain):
 
 
 def view(capsys, *words, code=0):
-    """Runs the verb; returns its standard output, or its complaint."""
+    """Runs the command; returns its standard output, or its complaint."""
     got = undulog.run(["view", *map(str, words)])
     told = capsys.readouterr()
     assert got == code, told.err

@@ -1,4 +1,4 @@
-"""The verb ``report``: answer on the terminal, page on disk, nothing overwritten by accident."""
+"""Command ``report``: answer on the terminal, page on disk, nothing overwritten by accident."""
 
 import json
 

@@ -49,7 +49,7 @@ def with_bomb(path: Path, packed: bytes, size: int, *, whole: bool = True, **opt
 
 
 def run(*commands: list[object], most: int = ROOM) -> list[str]:
-    """Run verbs in a process of its own and give what each prints; none may fail.
+    """Run commands in a process of its own and give what each prints; none may fail.
 
     Its memory is held against a limit.
     """
