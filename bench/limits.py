@@ -1,8 +1,8 @@
 """Time of reading as each dimension of a log is doubled: at most linear.
 
 For each dimension two logs are written, the second twice as large in it, and each command reads
-both in a process of its own. Twice as much may cost at most 2.3 times the processor time beyond that of
-a small log; what takes less than a tenth of a second in all is not judged.
+both in a process of its own. Twice as much may cost at most 2.3 times the processor time beyond
+that of a small log; what takes less than a tenth of a second in all is not judged.
 
 Run: python bench/limits.py [--runs 3] [DIMENSION...]
 """
