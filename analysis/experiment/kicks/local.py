@@ -264,7 +264,7 @@ class LtiReading:
         H: Response per command, shape (m, m).
         condition_number: Of H, 2-norm: what its inversion may multiply relative errors by.
         asymmetry: ||X - X'|| / ||X|| off the diagonal; 0 = reciprocal.
-        band_energy: Share of X's off-diagonal energy within |i - j| <= each of ``BANDS``.
+        band_energy: Share of X's off-diagonal energy within ``|i - j|`` <= each of ``BANDS``.
     """
 
     H: ComplexArray

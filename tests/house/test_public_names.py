@@ -1,0 +1,30 @@
+"""The public names of the four packages: what a release may not lose without a word."""
+
+import importlib
+
+import pytest
+
+PUBLIC = {
+    "analysis": (
+        "Analysis Choices Comparison Estimate Experiment Index JointResult LinearCoupling "
+        "LocalCoupling Margins Options Picture Reversal analyse_experiment analyse_session "
+        "compare_sessions load render"
+    ),
+    "capture": (
+        "Channel JointSignals Robot Session SessionView SessionWriter Signal load_robot robot_names"
+    ),
+    "replay": ("Content Recording write_recording"),
+    "sim": (
+        "AccelerometerModel Box CompassModel Cylinder FrictionLaw Gait GaitTick Ground "
+        "InfraredModel Noise ObstacleMaterial PlaneGait RandomField Readings Scenario "
+        "SensorModels Serpentine SerpentineGait ServoPolling SonarModel Target Twin Wall Wave "
+        "World load_scenario parse_scenario record scenario_names"
+    ),
+}
+
+
+@pytest.mark.parametrize("package", sorted(PUBLIC))
+def test_public_names_are_these_and_can_be_imported(package):
+    module = importlib.import_module(f"undulog.{package}")
+    assert sorted(module.__all__) == sorted(PUBLIC[package].split())
+    assert all(hasattr(module, name) for name in module.__all__)
