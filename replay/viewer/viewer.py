@@ -21,15 +21,16 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 from urllib.parse import quote
-
-from rerun.experimental import View, ViewerClient
 
 from undulog.capture.common.errors import MissingExtraError, UndulogError, UsageError
 from undulog.capture.common.process import StopRequest, interruptible
 
 from ..samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
+
+if TYPE_CHECKING:
+    from rerun.experimental import View, ViewerClient
 
 LOOPBACK = "127.0.0.1"
 
@@ -406,6 +407,8 @@ def client_of(
     Raises:
         UndulogError: If it ends before, or doesn't answer within a minute.
     """
+    from rerun.experimental import ViewerClient
+
     deadline = time.monotonic() + _START_S
     while True:
         try:

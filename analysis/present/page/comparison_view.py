@@ -137,7 +137,7 @@ class ComparisonView:
     differences: Drawing | None
     waveforms: Drawing | None
     trials: tuple[Trial, ...]
-    comparison_method: str
+    method: str
 
 
 def comparison_view(comparison: Comparison) -> ComparisonView:
@@ -152,7 +152,7 @@ def comparison_view(comparison: Comparison) -> ComparisonView:
         differences=differences_of(comparison, "differences") if joints_of(comparison) else None,
         waveforms=waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
         trials=_trials(comparison),
-        comparison_method=comparison_method(comparison),
+        method=comparison_method(comparison),
     )
 
 
