@@ -25,7 +25,8 @@ from rerun.experimental import ViewerClient
 
 from undulog.capture import Session
 from undulog.replay import write_recording
-from undulog.replay.viewer.viewer import LOOPBACK, client_of, free_ports, viewer_binary
+from undulog.replay.viewer.headless import client_of
+from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 BAR_S = 3.0
 REST_S = 5.0

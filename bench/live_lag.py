@@ -33,7 +33,8 @@ from rerun.experimental import ViewerClient
 from undulog.capture.log.sinks.mcap_sink import Description
 from undulog.capture.recorder.live_feed import LiveFeed
 from undulog.replay.samples.timeline import SESSION_TIME
-from undulog.replay.viewer.viewer import LOOPBACK, client_of, free_ports, viewer_binary
+from undulog.replay.viewer.headless import client_of
+from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 LAG_MS = 150.0
 """The bar."""

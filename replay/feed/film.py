@@ -29,7 +29,7 @@ from undulog.capture.common.process import StopRequest
 
 from ..layout import build_views
 from ..samples.content import Content
-from ..viewer.viewer import HeadlessViewer
+from ..viewer.headless import HeadlessViewer
 
 GIF_FPS = 50
 """More frames a second than this a browser slows down to ten."""

@@ -4,9 +4,8 @@
 session that they speak of can be seen with it. Modules that a test names carry a mark on the body,
 at their bars and below the maps.
 
-A session's analysis in a process of its own, which can be ended at any time.
-
-It takes seconds and memory that the picture needs first; once it is done all of that is free.
+While a viewer waits, the analysis runs in a process of its own, which can be ended at any time: it
+takes seconds and memory that the picture needs first, and once it is done all of that is free.
 """
 
 from __future__ import annotations
@@ -105,18 +104,12 @@ def main(arguments: Sequence[str]) -> None:
         arguments: The session's path, the topics of commands and responses.
     """
     os.nice(_NICENESS)
-    from undulog.analysis.signals.stretch import Options
-
     path, command, response = arguments
     options = Options(command_topic=command, response_topic=response)
     folder = Path(tempfile.gettempdir())  # its columns lie there in files without names
     with Session.open(path, column_folder=folder) as session:
         layer = computed(session, options)
     pickle.dump(layer, sys.stdout.buffer)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
 
 
 def computed(session: SessionView, options: Options | None = None) -> Layer:
@@ -244,3 +237,7 @@ def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
                 yield Named(
                     module.name, f"deviates from the others' model, {p_value_text(module.p)}"
                 )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
