@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ...common.arrays import IntArray
 from ...common.errors import DataError, RobotFileError
@@ -24,6 +23,9 @@ from ..messages.frames import FrameArray, join_batches
 from .joint_states import JointReader
 from .sample_times import StampClock
 from .signals import JointSignals
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class OpenLog:
@@ -131,6 +133,8 @@ class OpenLog:
         return read
 
     def _table(self, topic: str, found: Messages) -> pd.DataFrame:
+        import pandas as pd  # a third of a second, which only tables need
+
         groups = self._groups(topic, found)
         shift_ns = self._clock.shift_ns(topic)
         frames = [_frame(group, shift_ns) for group in groups]
@@ -144,6 +148,8 @@ class OpenLog:
 
 def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
     """One layout group as a table."""
+    import pandas as pd
+
     columns: dict[str, Any] = {}
     for path, text in group.strings.items():
         columns[path] = np.full(len(group), text, dtype=object)

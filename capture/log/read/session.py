@@ -15,10 +15,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from ...common.errors import MissingChannelError
@@ -30,6 +29,9 @@ from ..columns.topics import Channel
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .open_log import OpenLog
 from .signals import JointSignals
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _NS = 1_000_000_000
 _NO_NAMES: Mapping[str, str] = MappingProxyType({})

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,8 @@ class JointSignals:
             Columns ``joint`` (categorical, in chain order), ``t_ns`` and the field's name with its
             unit, e.g. ``position [rad]``; one row a sample.
         """
+        import pandas as pd
+
         counts = [len(t) for t in self.t_ns]
         joint = np.repeat(np.array(self.names, dtype=object), counts)
         order = pd.CategoricalDtype(categories=list(self.names), ordered=True)
