@@ -285,7 +285,7 @@ def test_no_space_to_begin_with(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("floor", ["10MB", "0"], ids=["floor", "to the last byte"])
 def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path):
-    output, bus = disk_of / "run.mcap", tmp_path / "bus.sock"
+    output, bus = disk_of("64m") / "run.mcap", tmp_path / "bus.sock"
     rng = np.random.default_rng(0)
     frames, _ = polling(400)
     sent = []

@@ -300,11 +300,11 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
     commands = [line[2:] for line in section.splitlines() if line.startswith("$ ")]
     serve, record, drive, stop = (shlex.split(command)[1:] for command in commands)
     options = {"env": os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}, "cwd": tmp_path}
-    with process(*serve, **options) as robot:
+    with process(*UNDULOG, *serve, **options) as robot:
         line = robot.stdout.readline().rstrip()
         assert line == f"snake25 is on can0 at 127.0.0.1:{port}; it waits for commands"
         assert line in section
-        with process(*record, **options) as recording:
+        with process(*UNDULOG, *record, **options) as recording:
 
             def connected():
                 said = undulog("record", "status", "--json", **options)
