@@ -204,7 +204,7 @@ def undulog(kind: str, folder: Path, seconds: float, per_packet: int, *, granted
             ]
         stack.enter_context(contention(folder))
         cpu, _ = waited(senders, recorder.pid)
-        recorder.send_signal(signal.SIGINT)
+        recorder.send_signal(signal.SIGTERM)
         recorder.communicate(timeout=120)
     with Session.open(output) as session:
         stamps = [numbered(session, name, folder / f"sent-{k}.npz") for k, name in enumerate(BUSES)]

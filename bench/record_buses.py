@@ -132,9 +132,9 @@ def start_undulog(
 
 
 def finish_undulog(outcome: Outcome, process: subprocess.Popen[str], output: Path) -> None:
-    """Stop it as a user would, and count what is in the file."""
+    """Stop it as a service manager does, and count what is in the file."""
     time.sleep(1.0)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
     text, _ = process.communicate(timeout=120)
     report = json.loads(text)
     outcome.tick_p99_ms = float(report["recorder"]["tick_p99_s"]) * 1e3
