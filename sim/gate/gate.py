@@ -83,6 +83,7 @@ class Gate:
         self.held_ticks = 0
         """Ticks in which nothing was sent as the bus was silent, those left out among them."""
         self._silent_ticks = 0  # those of the silence that were counted by then
+        self._received_again = False  # in the tick before this one, while holding
         self._gait, self._limits, self._place = gait, limits, place
         self._rate_hz, self._listen_s = rate_hz, listen_s
         self._last = round(duration_s * rate_hz)
@@ -303,11 +304,20 @@ class Gate:
         return GateFault(FaultKind.SILENT, text, "", silent_s, limit_s, since_s)
 
     def _go_on_holding(self, clamp: Clamp, status: JointStatus, *, at_once: bool) -> None:
-        """Hold until a joint is received, then end; not for ever, and not if asked twice."""
+        """Hold until a joint is received, then end; not for ever, and not if asked twice.
+
+        The ending begins one control tick later: what the stall held up arrives as the bus comes
+        back, and the first command of the ending doesn't join it.
+        """
         if not self.silence.silent:
-            self._remark("info", "gate: a joint was received again")
-            self._end(clamp, status)
+            if self._received_again:
+                self._end(clamp, status)
+            else:
+                self._received_again = True
+                self.held_ticks += 1
+                self._remark("info", "gate: a joint was received again")
             return
+        self._received_again = False
         self.held_ticks += self.silence.ticks - self._silent_ticks
         self._silent_ticks = self.silence.ticks
         if at_once or self.silence.ticks >= HOLD_S * self._rate_hz:
