@@ -17,7 +17,6 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from undulog.analysis.present.notebook.files import load
@@ -55,12 +54,7 @@ class Analysing:
         """Nothing to do: it is started when there is time for it."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End it."""
         if self._process is not None and self._process.poll() is None:
             self._process.kill()  # it has nothing to put in order

@@ -8,7 +8,6 @@ then the sensors look at all of it, then the gait is asked with what they have t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -110,12 +109,7 @@ class Twin:
         """Enter the block that owns the physics world."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Free the physics world."""
         self.close()
 

@@ -37,7 +37,6 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from mcap.opcode import Opcode
@@ -149,12 +148,7 @@ class WriteAheadLog:
         """Nothing to do: the log is open."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close; keeps what was not released."""
         self.close()
 

@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeAlias
 
 from mcap.records import Attachment, Channel, Metadata, Schema
@@ -353,12 +352,7 @@ class SessionWriter(ChannelOpeners):
         """Nothing to do: the session is open."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Finalise the session, also when the block is left by an exception."""
         self.close()
 
