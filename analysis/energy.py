@@ -445,7 +445,7 @@ def _goes_nowhere(way: FloatArray, distance: Estimate, robot: Robot) -> list[str
     if total >= least and distance.ci95 is not None and distance.ci95[0] > 0:
         return []
     moved = f"the centre of mass moves by {1000 * total:.3g} mm in {way.size} cycles"
-    return [f"{moved}, which can't be told from 0"]
+    return [f"{moved}, which does not differ significantly from 0"]
 
 
 def _sums(found: Sequence[Energy | None]) -> dict[str, FloatArray] | None:

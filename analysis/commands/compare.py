@@ -108,7 +108,7 @@ def _sides(
         raise UsageError(f"either two files, or --a and --b, not both; {_EXAMPLE}")
     if files and len(files) != 2:
         raise UsageError(
-            f"compare takes two sessions, here are {len(files)}; of groups say which is which: "
+            f"compare takes two sessions, here are {len(files)}; for groups name the sides: "
             "--a A1.mcap A2.mcap --b B1.mcap B2.mcap"
         )
     if not files and not (a and b):

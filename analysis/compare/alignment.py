@@ -207,8 +207,8 @@ def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
         numbers = run.ratio.tobytes()
         if numbers in seen:
             raise DataError(
-                f"{run.label} gives the very numbers of {seen[numbers]} on side {side}: a copy is "
-                "not a run of its own"
+                f"{run.label} is a copy of the numbers of {seen[numbers]} on side {side}: a copy "
+                "is not a run of its own"
             )
         seen[numbers] = run.label
 

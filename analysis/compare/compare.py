@@ -202,8 +202,9 @@ def _warn(
 ) -> None:
     if design == "sessions":
         warn(
-            "one session a side: the intervals know the noise within each session, not how one "
-            "run differs from the next; record several runs a side and give them with --a and --b"
+            "one session a side: the intervals cover the noise within each session, not how "
+            "one run differs from the next; record several runs a side "
+            "and give them with --a and --b"
         )
         inputs = [next(iter(one.analysis.provenance.inputs.values())) for one in (a[0], b[0])]
         if inputs[0] == inputs[1]:

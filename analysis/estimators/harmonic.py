@@ -211,7 +211,7 @@ def _solve(moments: Moments, model: HarmonicModel) -> Solved:
         inverse: FloatArray = np.linalg.inv(gram[:p, :p]).astype(np.float64)
     except np.linalg.LinAlgError as error:
         raise DataError(
-            "the harmonics cannot be told apart at these sampling times; take a longer window "
+            "the harmonics cannot be separated at these sampling times; take a longer window "
             "or fewer harmonics"
         ) from error
     theta = inverse @ cross[:p]

@@ -118,15 +118,16 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
     """
     where = f"Oscillators, {chain.plane}:"
     if not chain.identifiable:
-        record = f" To tell it, record {chain.record}." if chain.record else ""
+        record = f" To decide it, record {chain.record}." if chain.record else ""
         yield f"{where} coupling not identifiable: {chain.why}.{record}"
         return
     number = chain.condition_number
     condition = formats.MISSING if number is None else f"{number:.3g}"
     strongest = max(chain.links, key=lambda link: link.K.value or 0.0)
     yield (
-        f"{where} {len(chain.links)} couplings told (condition number {condition}); the strongest "
-        f"is {strongest.source} on {strongest.target}, K = {formats.estimate(strongest.K, ' 1/s')}."
+        f"{where} {len(chain.links)} couplings identified (condition number {condition}); "
+        f"the strongest is {strongest.source} on {strongest.target}, "
+        f"K = {formats.estimate(strongest.K, ' 1/s')}."
     )
     yield f"K [1/s]: {'; '.join(_link(link) for link in chain.links)}."
     fed = [one for one in chain.oscillators if one.feedback.value is not None]
@@ -319,7 +320,7 @@ def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False
         left = np.linalg.norm(last - last.mean()) / np.linalg.norm(first - first.mean())
         sheet.print()
         sheet.print(
-            f"Of the kick {100 * left:.0f} % of what tells the phases apart is left after "
+            f"Of the kick {100 * left:.0f} % of the phase differences is left after "
             f"{loop.relaxation.times_s[-1]:.1f} s; all phases over time with --json."
         )
     sheet.print(

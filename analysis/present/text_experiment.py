@@ -66,7 +66,7 @@ def render_comparison(
 
 def _changed(changed: tuple[Change, ...]) -> list[str]:
     if not changed:
-        return ["What was changed: the sessions say nothing of it; what they say is the same."]
+        return ["What was changed: not recorded; the recorded facts are the same."]
     lines = ["What was changed (A, then B):"]
     for one in changed[:MOST_CHANGES]:
         a, b = (

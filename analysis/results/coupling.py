@@ -43,8 +43,8 @@ def rows_of(values: FloatArray) -> Rows:
 
 
 LTI_LABEL = (
-    "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); how far it "
-    "is from that, the nonlinearity says"
+    "as if the chain were linear and time-invariant: H_ij = (a_i/c_j)(P_ij - j R_ij); the "
+    "nonlinearity measures the departure from that"
 )
 
 

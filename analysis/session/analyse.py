@@ -99,7 +99,7 @@ def warn_flags(
     ]
     if lost:
         warn(
-            f"{', '.join(lost)}: no response at the gait frequency that can be told from noise: "
+            f"{', '.join(lost)}: no response at the gait frequency that differs from noise: "
             "gain and lag are null"
         )
 

@@ -290,7 +290,7 @@ def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]
         numbers = run.ratio.tobytes()
         if numbers in first:
             why[k] = (
-                f"gives the very numbers of {runs[first[numbers]].label}: a copy is not a run of "
+                f"is a copy of the numbers of {runs[first[numbers]].label}: a copy is not a run of "
                 "its own"
             )
             continue

@@ -106,8 +106,8 @@ class FrameTally:
             )
         if self.undirected:
             lines.append(
-                f"{self.undirected.total()} frames not decoded, since only their direction tells "
-                f"what they are and the log has none: {counts_text(self.undirected)}"
+                f"{self.undirected.total()} frames not decoded: they differ only in direction, "
+                f"which the log does not have: {counts_text(self.undirected)}"
             )
         return lines
 
@@ -118,7 +118,7 @@ class FrameTally:
             lines.append(f"{self.remote} remote frames, which carry no data")
         if self.unknown:
             lines.append(
-                f"{self.unknown.total()} frames of identifiers that no database knows: "
+                f"{self.unknown.total()} frames with identifiers that are in no database: "
                 f"{counts_text(self.unknown)}"
             )
         if self.silent:

@@ -158,7 +158,7 @@ def _column_map(
     from ..exchange.csv_import import column_map_from_options, read_column_map
 
     if (columns is None) == (not options):
-        given = "not both" if options else "to say what its columns mean"
+        given = "not both" if options else "to describe its columns"
         raise UsageError(f"{log} needs --columns MAP.toml or --map options, {given}")
     if columns is not None:
         return read_column_map(columns, robot)

@@ -52,7 +52,7 @@ def log_recover(
 
 def _tell_recovered(report: RecoverReport) -> None:
     messages = sum(report.messages.values())
-    missing = {None: "how many are missing can't be told", 0: "none is missing"}
+    missing = {None: "how many are missing is unknown", 0: "none is missing"}
     lost = missing.get(report.missing, f"{report.missing} are missing")
     echo(
         f"{report.output}: {messages} messages over {report.duration_s:.2f} s, "

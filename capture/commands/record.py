@@ -183,7 +183,7 @@ def _print_report(report: RecordReport) -> None:
     for name, counts in report.sources.items():
         parts = [f"{counts['frames']} frames"]
         dropped = counts["dropped"]
-        parts.append("losses can't be told" if dropped is None else f"{dropped} lost before us")
+        parts.append("losses unknown" if dropped is None else f"{dropped} lost before us")
         for key, what in (
             ("malformed", "malformed"),
             ("error_frames", "error frames"),

@@ -324,7 +324,7 @@ class Table:
             elif choices is not None and word not in choices:
                 self.faults.add(where, shown(word), listed(choices, word))
             elif word in good:
-                self.faults.add(where, shown(word), "a word that is not there already")
+                self.faults.add(where, shown(word), "a key that is not there already")
             else:
                 good[word] = None
         return tuple(good)

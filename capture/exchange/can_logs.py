@@ -344,8 +344,8 @@ def _blocks(  # noqa: PLR0917
         )
     if unmarked:
         log.problems.append(
-            f"{unmarked} frames of more than 8 bytes are CAN FD frames; the log doesn't say so, "
-            "and shorter ones count as classic"
+            f"{unmarked} frames of more than 8 bytes are CAN FD frames; the log does not mark "
+            "them, and shorter ones count as classic"
         )
     if len(rows):
         yield rows.block(1.0)

@@ -76,7 +76,7 @@ def decoded_source(
         return None
     if len(buses) > 1:
         raise UsageError(
-            f"which of {', '.join(buses)} is the bus of {robot.name}? --bus NAME says so; the "
+            f"which of {', '.join(buses)} is the bus of {robot.name}? Choose it by --bus NAME; the "
             "others are kept raw"
         )
     return buses[0] if buses else None

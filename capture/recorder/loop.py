@@ -381,7 +381,7 @@ class Recorder:
             if not bus.decodes:
                 continue
             for level, what, found in (
-                ("info", "identifiers that no database knows", bus.tally.unknown),
+                ("info", "identifiers that are in no database", bus.tally.unknown),
                 ("warn", "frames too short for", bus.tally.short),
             ):
                 fresh = set(found) - self._told[name]

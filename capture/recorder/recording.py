@@ -271,7 +271,7 @@ class Recording:
 
     def stop(self) -> None:
         """End the recording after this tick."""
-        self._recorder.ending = Ending("it was asked to stop")
+        self._recorder.ending = Ending("it was stopped")
 
     # -- in the loop -------------------------------------------------------------------------
 

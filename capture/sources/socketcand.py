@@ -138,7 +138,7 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     if found is None:
         told = _TOLD.fullmatch(message)
         if told is not None:
-            tally.events.say("warn", f"the server says: {told[1]!r}")
+            tally.events.say("warn", f"the server answered: {told[1]!r}")
         elif not _WORD.fullmatch(message):
             tally.malformed("malformed message", 1)
         return None
@@ -364,5 +364,5 @@ def _expect(sock: socket.socket, rest: bytes, word: bytes) -> bytes:
         with contextlib.suppress(OSError):
             sock.shutdown(socket.SHUT_RDWR)
         said = answer[:80]
-        raise OSError(errno.EPROTO, f"the server says {said!r} instead of '< {word.decode()} >'")
+        raise OSError(errno.EPROTO, f"the server answered {said!r}, not '< {word.decode()} >'")
     return rest

@@ -279,8 +279,8 @@ def _checked(lack: LackOfFit) -> Iterator[str]:
     open_laws = [one.label for one in lack.alternatives if one.widens and one.could_be]
     if open_laws:
         yield (
-            f"Not told by this session: {' or '.join(open_laws)} would do as well; intervals have "
-            "it in them."
+            f"Not determined by this session: {' or '.join(open_laws)} would do as well; "
+            "intervals have it in them."
         )
     yield f"Fits: nothing but noise is shown at {what} ({_p(lack.p)}){off}."
 
@@ -312,7 +312,7 @@ def _undetermined(calibration: Calibration) -> Iterator[str]:
     for ridge in calibration.ridges:
         yield f"  answers alike: {_ridge(ridge)}"
     for line in calibration.would_tell:
-        yield f"  what would tell {line}"
+        yield f"  what would determine {line}"
 
 
 def _ridge(ridge: CorrelatedParameters) -> str:

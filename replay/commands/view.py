@@ -73,7 +73,7 @@ def view(
     if single is not None and (len(files) != 1 or clip is not None):
         raise UsageError(f"{', '.join(single.given)}: needs one session, and no --clip")
     if shot is not None and clip is None:
-        raise UsageError(f"{', '.join(shot.given)}: says how a clip is filmed; give --clip as well")
+        raise UsageError(f"{', '.join(shot.given)}: an option of clips; give --clip as well")
     if clip is not None:
         view_clip(files[0], clip, shot or ClipOptions(), force=force, json=json)
         return

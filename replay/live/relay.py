@@ -321,7 +321,7 @@ def relay_to_file(path: Path, output: Path) -> RelayReport:
 
         report = _run(Relay(inbox, save, one_session=True), request, None, until_end=True)
         if not report.sessions:
-            raise DataError(f"{path}: no recording was heard; nothing is written")
+            raise DataError(f"{path}: no recording was received; nothing is written")
         require_whole(draft, output)
         return report
 

@@ -129,7 +129,7 @@ def _table(sides: Sequence[Side]) -> str:
 
 def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
     if not changed:
-        said = f"{other.name} says of itself what {first.name} does: nothing was changed."
+        said = f"{other.name} is described as {first.name}: nothing was changed."
         return escaped(said)
     lines = [escaped(f"What was changed ({first.name}, then {other.name}):"), ""]
     for one in changed[:_CHANGES]:

@@ -343,7 +343,7 @@ def _placements(
             found[name] = placed
             told.append(placement_text(placed, name, first))
     if len(bodies) > 1 and place is Place.WORLD:
-        told.append("every body is drawn where its own session says that it was")
+        told.append("every body is drawn at the pose of its own session")
     return found
 
 
@@ -431,7 +431,7 @@ def _title(shown: Sequence[Shown]) -> str:
 def _legend(shown: Sequence[Shown], title: str) -> str:
     bodies = [one for one in shown if one.body]
     if not bodies:
-        return "No session says enough to draw a body."
+        return "No session has the data to draw a body."
     scale = body_title(bodies[0].content)
     return (
         f"{title}. {scale}. The grey wireframe and lines are commanded, of {shown[0].side.name}. "

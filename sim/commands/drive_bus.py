@@ -133,10 +133,10 @@ class ArmedRun:
         lines += [f"{driven.kind} for {plan.robot.name}, {first}", *more]
         lines.append(f"session: {plan.output}")
         if plan.recorder is not None:
-            told = f"was told {report.told} samples of the gait"
-            lines.append(f"the recorder at {plan.recorder} {told}")
+            received = f"received {report.told} samples of the gait"
+            lines.append(f"the recorder at {plan.recorder} {received}")
         if report.not_told is not None:
-            lines.append(f"warning: it was not told all: {report.not_told}")
+            lines.append(f"warning: it did not receive all: {report.not_told}")
         return lines
 
     def complain(self) -> int:
@@ -274,5 +274,5 @@ def _only_recorder() -> Path | None:
     found = find_sockets(os.environ)
     if len(found) > 1:
         listed = "\n".join(f"  --recorder {path}" for path in found)
-        raise UsageError(f"{len(found)} recorders run; which one is told the gait?\n{listed}")
+        raise UsageError(f"{len(found)} recorders run; which one is to receive the gait?\n{listed}")
     return found[0] if found else None

@@ -78,7 +78,7 @@ def serve(
     from ..scenario.scenario_file import load_scenario
 
     if socketcand is None and unix is None:
-        raise UsageError("nobody could reach this robot: give --socketcand PORT or --unix PATH")
+        raise UsageError("this robot could not be reached: give --socketcand PORT or --unix PATH")
     if lockstep and socketcand is None:
         raise UsageError("in lockstep the robot waits for commands: give --socketcand PORT")
     if fast and not lockstep:
@@ -87,9 +87,7 @@ def serve(
         duration_s=LONGEST_S if duration is None else duration, seed=seed
     )
     if chosen.robot.bus is None:
-        raise UsageError(
-            f"{chosen.robot.name} has no bus map, so there is nothing that it could say on a bus"
-        )
+        raise UsageError(f"{chosen.robot.name} has no bus map, so it has no frames for a bus")
     plan = _Plan(
         chosen,
         None if socketcand is None else parse_address(socketcand),
@@ -214,7 +212,7 @@ class _Report:
 
 def _told(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:
     pace = served.pace
-    first = f"{plan.scenario.robot.name} lived {served.duration_s:g} s of {plan.scenario.name}"
+    first = f"{plan.scenario.robot.name} ran for {served.duration_s:g} s of {plan.scenario.name}"
     if plan.fast:
         first += ", not in real time"
     elif plan.lockstep:

@@ -182,7 +182,7 @@ def _approach(run: DryRun) -> str:
         return "first pose: straight joints"
     how_long = f"a ramp of {run.approach_s:.2f} s from straight joints"
     if math.isnan(run.approach_s):
-        how_long = "no ramp_rate says how fast to go there"
+        how_long = "no ramp_rate gives the speed of the way there"
     return f"first pose: {run.joints[farthest].name} farthest, at {angle:.1f}°; {how_long}"
 
 

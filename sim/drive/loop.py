@@ -160,8 +160,8 @@ class LockstepPace:
 
 
 _WORDS = {
-    signal.SIGINT: "asked to stop (Ctrl-C)",
-    signal.SIGTERM: "asked to stop (SIGTERM)",
+    signal.SIGINT: "stop requested (Ctrl-C)",
+    signal.SIGTERM: "stop requested (SIGTERM)",
     signal.SIGHUP: "the console is gone",
 }
 
@@ -176,7 +176,7 @@ def stop_reason(stop: StopRequest, *, console_gone: bool) -> str:
         A few words; empty if it is not to stop.
     """
     if stop.signal is not None:
-        return _WORDS.get(stop.signal, f"asked to stop ({stop.signal.name})")
+        return _WORDS.get(stop.signal, f"stop requested ({stop.signal.name})")
     return _WORDS[signal.SIGHUP] if console_gone else ""
 
 

@@ -265,7 +265,7 @@ class MotionSource:
         where = world or self.world()
         if where is None:
             raise UsageError(
-                f"{self.name} does not say in which world it ran; name one, e.g. --on twin:flat"
+                f"{self.name} does not name the world it ran in; name one, e.g. --on twin:flat"
             )
         for plane in self.planes:
             if not len(where.robot.joint_indices(plane)):

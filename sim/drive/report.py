@@ -8,7 +8,7 @@ from typing import Any
 from ..gate.outcome import DriveEnding, GateEvent, Jitter, Outcome
 from .loop import LoopTally
 
-UNASKED = "joints were received more often than asked: commands are not confirmed by replies"
+UNASKED = "joints were received more often than requested: commands are not confirmed by replies"
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def remarks_of(report: BusReport) -> list[GateEvent]:
     if report.waits:
         text = (
             f"commands that followed a late one and waited: {report.waits}, up to "
-            f"{report.longest_wait_s * 1e3:.2f} ms, so that no joint was told to be too fast"
+            f"{report.longest_wait_s * 1e3:.2f} ms, so that no command was too fast"
         )
         remarks.append(GateEvent("info", text))
     changed = {why: count for why, count in report.cuts.items() if count}

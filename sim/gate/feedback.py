@@ -75,7 +75,7 @@ class BusCheck:
         errors = (ids & ERROR_FLAG) != 0
         if (ids[errors] & BUS_OFF).any():
             return GateFault(
-                FaultKind.BUS_OFF, "bus-off: a controller left the bus, and nobody may hear it"
+                FaultKind.BUS_OFF, "bus-off: a controller left the bus, and its frames may be lost"
             )
         data = ids[~errors & ((ids & REMOTE_FLAG) == 0) & (frames["dir"] == DIR_RX)]
         data = data.astype(np.int64)
@@ -88,8 +88,8 @@ class BusCheck:
             return None
         return GateFault(
             FaultKind.STRANGER,
-            f"somebody else commands {self._robot_name} on this bus: frame "
-            f"{identifier_text(int(others[0]))} was heard; end that controller first",
+            f"another controller commands {self._robot_name} on this bus: frame "
+            f"{identifier_text(int(others[0]))} was received; end that controller first",
         )
 
     def another_robot(self) -> str | None:
@@ -101,7 +101,7 @@ class BusCheck:
             for identifier, _ in self.strange.most_common(_IDENTIFIERS_SHOWN)
         )
         return (
-            f"another robot is on this bus: of {self.strange.total() + self.known} frames heard "
+            f"another robot is on this bus: of {self.strange.total() + self.known} frames received "
             f"{self.known} are of {self._robot_name}; others have the identifiers {listed}"
         )
 

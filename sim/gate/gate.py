@@ -185,7 +185,7 @@ class Gate:
         if (why := why_not_from(angle, limits, waited_s)) is not None:
             raise SourceError(self._place, f"no command was sent: {why}")
         if not measured:
-            why = f"joints told their angles too rarely in {waited_s:.2g} s to supervise a drive"
+            why = f"too few reports of joint angles in {waited_s:.2g} s to supervise a drive"
             raise SourceError(self._place, f"no command was sent: {why}")
         clamp = self._clamp = Clamp(limits, angle, 1.0 / self._rate_hz)
         first = self._first = self._gait.step(0.0, heard.readings)

@@ -31,7 +31,7 @@ _EXAMPLES = {
     "max_rate": "4.0            # rad/s, of commands",
     "ramp_rate": "0.5           # rad/s, to the first pose and down again",
     "max_tracking_error": "0.35 # rad, between command and measured angle",
-    "reply_timeout_s": "0.25    # a joint that says nothing for so long is lost",
+    "reply_timeout_s": "0.25    # a joint that reports nothing for so long is lost",
     "max_late_s": "0.2          # a control tick that is later stops the drive",
     "max_current": "1.4         # A",
     "max_temperature": "70.0    # degC",
@@ -397,8 +397,8 @@ def why_not_from(angle: FloatArray, limits: GateLimits, waited_s: float) -> str 
     if unknown:
         silent = _listed([names[i] for i in unknown], len(names))
         return (
-            f"the pose is not known, {silent} told no angle within {waited_s:.2g} s; is the robot "
-            "switched on, and does it report unasked?"
+            f"the pose is not known, {silent} reported no angle within {waited_s:.2g} s; is the "
+            "robot switched on, and does it report unasked?"
         )
     beyond = np.maximum(limits.lower - angle, angle - limits.upper)
     worst = int(np.argmax(beyond - limits.tracking_error))

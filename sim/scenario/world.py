@@ -314,7 +314,7 @@ def _gravity(table: Table) -> tuple[float, float, float]:
             table.fault("slope_heading", "leave it out: there is no slope")
         return read_field(table, World, "gravity")
     if "gravity" in table:
-        table.fault("gravity", "leave it out: slope says it")
+        table.fault("gravity", "leave it out: slope gives it")
     return tilted_gravity(slope, heading)
 
 

@@ -367,7 +367,7 @@ class VirtualRobot:
     def _tell_cuts(self) -> None:
         for name in sorted(self._latch.cut - self._told_cut):
             self._told_cut.add(name)
-            self._say("warn", f"{name} was told to go beyond its limits, and stops there")
+            self._say("warn", f"{name} was commanded beyond its limits, and stops there")
 
     def _listed(self, chosen: BoolArray) -> str:
         """Some joints by name."""

@@ -174,7 +174,7 @@ class SocketcandServer:
         idle = [client for client in self._clients.values() if not client.raw]
         if len(self._clients) >= MOST_CLIENTS and idle:
             longest = min(idle, key=lambda client: (client.bus_open, client.heard))
-            self._drop(longest, "was silent and gives its place to another one")
+            self._drop(longest, "was silent; its place goes to another one")
         if len(self._clients) >= MOST_CLIENTS:
             self._say("warn", f"no more than {MOST_CLIENTS} clients are let in")
             sock.close()

@@ -214,7 +214,7 @@ def record(
             writer.set_verdict("good")
         elif driver is not None:  # it was asked to come to rest, and has
             planned = f"{scenario.duration_s:g} s"
-            log.say("info", f"at rest at {sample.time_s:g} s of {planned}: it was asked to stop")
+            log.say("info", f"at rest at {sample.time_s:g} s of {planned}: it was stopped")
             writer.set_verdict("good")
         else:
             text = f"stopped at {sample.time_s:g} s of {scenario.duration_s:g} s"

@@ -32,7 +32,7 @@ NONLINEAR = 0.01
 
 _VALIDITY = {
     False: "without contact: the linear chain, at these frequencies, at any small amplitude",
-    None: "only if the robot touched nothing, which its sessions don't say",
+    None: "only if the robot touched nothing, which its sessions don't record",
     True: "in contact: what a linear chain explains best of these very motions, no more",
 }
 
@@ -186,7 +186,7 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
             "run settle longer (--start, or plan with a longer --settle)"
         )
     if beside.value is None:
-        warn("too short to tell energy beside the tones; record two periods of the multisine")
+        warn("too short to measure energy beside the tones; record two periods of the multisine")
     bent = [one for one in tones if (one.distortion or 0.0) > NONLINEAR]
     if bent:
         at = ", ".join(

@@ -275,7 +275,7 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
             inverse: FloatArray = np.linalg.inv(rows @ rows.T).astype(np.float64)
         except np.linalg.LinAlgError as error:
             raise DataError(
-                "the tones cannot be told apart at these sampling times; take a longer window"
+                "the tones cannot be separated at these sampling times; take a longer window"
             ) from error
         theta: FloatArray = values @ rows.T @ inverse
         amplitude[members] = theta[:, 1::2] + 1j * theta[:, 2::2]
@@ -323,6 +323,6 @@ def _level(
         power += list((squared / kept[chosen]).T)
     if not power:
         raise DataError(
-            "the record is too short to tell noise from the tones; take a longer window"
+            "the record is too short to separate noise from the tones; take a longer window"
         )
     return np.mean(power, axis=0), len(power)

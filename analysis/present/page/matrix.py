@@ -374,6 +374,6 @@ def _caption(entries: Entries) -> str:
         "A stroke stands in negative cells."
     )
     if entries.half is not None:
-        text += " Numbers in italics can't be told from 0 (95 %, one by one)."
+        text += " Numbers in italics do not differ significantly from 0 (95 %, one by one)."
     hint = "its intervals" if len(entries.rows) <= MOST_IN_CELLS else "its numbers"
     return f"{text} Point at a row, or reach it with the tab key, for {hint}."

@@ -145,7 +145,7 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
     caption = (
         "Identical modules mirror: the profile with the wave from tail to head, read from tail to "
         "head, lies on the other one, whatever the free ends do to both. The intervals of the "
-        "differences hold all together at 95 %: one that leaves out zero tells a pair apart. "
+        "differences hold all together at 95 %: a pair differs where its interval leaves out zero. "
         "The name of a weak module stands at its difference."
     )
     return Drawing(svg, caption)

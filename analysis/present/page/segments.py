@@ -271,7 +271,7 @@ def _segments_caption(joints: Sequence[JointResult]) -> str:
         "Bars are 95 % intervals."
     )
     if any(j.flags for j in joints):
-        text += " An exclamation mark stands over flagged joints; the table says why."
+        text += " An exclamation mark stands over flagged joints; the table gives the reason."
     if any(j.energy_net_j is not None for j in joints):
         text += (
             " Energy over the analysed windows: the marker is the net mechanical energy E_net, "

@@ -104,7 +104,7 @@ def coupling_trials(coupling: Coupling) -> list[Trial]:
                 "Is the chain linear and time-invariant around this gait?",
                 f"nonlinearity {formats.percent(index)}",
                 None,
-                "a deviation could not be shown" if linear else "no: what H says is a reading only",
+                "a deviation could not be shown" if linear else "no: H is descriptive only",
             )
         )
     if coupling.held_out:

@@ -257,8 +257,8 @@ def _common_robot(sources: Sequence[RawLog], told: str | None) -> str:
     if len(robots) > 1:
         listed = ", ".join(f"{name} ({path})" for name, path in reversed(robots.items()))
         raise UsageError(
-            f"the logs are of different robots: {listed}; a session is of one: --robot NAME "
-            "says which, and its description keeps its name"
+            f"the logs are of different robots: {listed}; a session has one robot: choose it by "
+            "--robot NAME; its description keeps its name"
         )
     return next(iter(robots), "")
 

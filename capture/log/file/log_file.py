@@ -165,13 +165,13 @@ class Recovered:
                 f"{self.from_wal} of them from its write-ahead log"
             )
         if self.missing is None:
-            missing = "how many are missing can't be told"
+            missing = "how many are missing is unknown"
         elif self.missing:
             missing = f"{self.missing} of {self.accepted} are missing"
         elif self.looked:
             missing = "none is missing"
         else:
-            missing = "none is missing as far as can be told"
+            missing = "none is known to be missing"
         return (
             f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
             f"from its write-ahead log; {missing}"

@@ -230,7 +230,7 @@ def _stranger(opened: dict[int, McapFile], number: int) -> str:
     """Why a file does not belong to those before it; empty if it does."""
     file = opened[number]
     if number > 1 and _part_record(file).get("part") != str(number):
-        return f"does not say that it is part {number}"
+        return f"is not marked as part {number}"
     before = [opened[other] for other in opened if other < number]
     if any(_session_id(file) != _session_id(other) for other in before):
         return "is of another session"
@@ -251,9 +251,9 @@ def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list
         return told
     if "next" in end and last + 1 not in there:
         name = part_path(first, last + 1).name
-        told.append(f"part {last + 1} ({name}) is missing; whether more followed it can't be told")
+        told.append(f"part {last + 1} ({name}) is missing; whether more followed it is unknown")
     elif "next" not in end and "parts" not in end and last > 1:
-        told.append(f"part {last} does not say that it is the last: more may have followed")
+        told.append(f"part {last} is not marked as the last: more may have followed")
     return told
 
 

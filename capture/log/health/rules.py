@@ -139,7 +139,7 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault
         for text in _edges_and_jitter(health, start_ns, end_ns):
             add(1, text)
     elif joints and timing.count > FROZEN_SAMPLES:
-        add(0, "no steady rhythm, so single gaps can't be told")
+        add(0, "no steady rate, so single gaps can't be found")
     if timing.backward:
         add(1, f"{timing.backward} stamps go back in time")
     if timing.duplicates:

@@ -200,7 +200,7 @@ def require_space(path: Path, needed: int) -> None:
     try:
         free = free_bytes(path)
     except OSError as error:
-        raise LogWriteError(path, f"can't tell the free space: {error.strerror}") from error
+        raise LogWriteError(path, f"can't read the free space: {error.strerror}") from error
     if free < needed:
         raise LogWriteError(path, _shortage(needed, free))
 

@@ -258,7 +258,7 @@ def test_no_frame_goes_unaccounted_for(muxed):
     ]
     assert tally.notes() == [
         "7 remote frames, which carry no data",
-        "11 frames of identifiers that no database knows: 7FF (6), 00000005 (5)",
+        "11 frames with identifiers that are in no database: 7FF (6), 00000005 (5)",
         "4 frames of known identifiers with nothing that the map names: 005 (4)",
     ]
     shares = tally.decoded + tally.errors + tally.remote
@@ -311,8 +311,8 @@ def test_without_directions_shared_identifiers_are_not_guessed():
     assert samples == ()
     assert tally.problems() == [
         (
-            "2 frames not decoded, since only their direction tells what they are and the log has "
-            "none: 14B (2)"
+            "2 frames not decoded: they differ only in direction, which the log does not have: "
+            "14B (2)"
         )
     ]
 

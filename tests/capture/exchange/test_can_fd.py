@@ -343,8 +343,8 @@ def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
     report, frames = imported(tmp_path / "x.csv", tmp_path, "/can_fd/can0")
     long = [message for message in some_messages() if len(message.data) > 8]
     assert report.problems[0] == (
-        f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log doesn't say so, and "
-        "shorter ones count as classic"
+        f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log does not mark them, "
+        "and shorter ones count as classic"
     )
     found = [bytes(frame["data"][: frame["len"]]) for frame in frames]
     assert found == [bytes(message.data) for message in long]

@@ -191,8 +191,8 @@ def test_unknown_identifiers_are_told_and_kept(tmp_path):
         process.send_signal(signal.SIGINT)
         ended(process)
     said = events(output)
-    assert ("can0", "identifiers that no database knows: 7AB") in said
-    assert ("can0", "200 frames of identifiers that no database knows: 7AB (200)") in said
+    assert ("can0", "identifiers that are in no database: 7AB") in said
+    assert ("can0", "200 frames with identifiers that are in no database: 7AB (200)") in said
     with Session.open(output) as session:
         assert (session.frames("/can/can0")["id_flags"] == 0x7AB).sum() == 200
 

@@ -264,7 +264,7 @@ def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path,
     path = tmp_path / "w.rrd"
     told = json.loads(view(capsys, *files, "--place", "world", "--save", path, "--json"))
     assert told["sessions"][1]["placed"] is None
-    assert "every body is drawn where its own session says that it was" in told["warnings"]
+    assert "every body is drawn at the pose of its own session" in told["warnings"]
     with pytest.raises(KeyError):
         read_back(path).static("/b/world", "Transform3D:translation")
 

@@ -202,7 +202,7 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
         plan = planned("weak-servo-pi3", on, path, duration_s=9.0, robot=robot)
         report = drive_bus(plan, stop=stop, on_tick=ask)
     assert report.outcome.how is DriveEnding.STOPPED
-    assert report.outcome.why == "asked to stop (Ctrl-C)"
+    assert report.outcome.why == "stop requested (Ctrl-C)"
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
         said = [message.msg for _, message in session.messages("/rosout")]
@@ -219,7 +219,7 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
         assert not ending[:, -1].any()
         assert np.abs(np.diff(commands[:, 80:])).max() <= 0.5 * 0.01 * (1 + 1e-9)
         assert ending.shape[1] == pytest.approx(100 * (1.5 * np.abs(held).max() / 0.5 + 0.2), abs=1)
-    assert said[-1].startswith("stopped: asked to stop (Ctrl-C); the joints were ")
+    assert said[-1].startswith("stopped: stop requested (Ctrl-C); the joints were ")
 
 
 def test_asked_twice_nothing_more_is_sent(tmp_path):
@@ -402,14 +402,15 @@ def test_joints_that_say_nothing_are_named(capsys, tmp_path):
 
     code, said = refused("gate-silent", say, capsys, tmp_path)
     assert code == 1
-    assert "no command was sent: the pose is not known, joint07 told no angle within 2 s" in said
+    why = "the pose is not known, joint07 reported no angle within 2 s"
+    assert f"no command was sent: {why}" in said
 
 
 def test_somebody_who_commands_already_is_not_joined(capsys, tmp_path):
     frame = can.Message(arbitration_id=0x103, data=bytes(2), is_extended_id=False)
     code, said = refused("gate-two", lambda bus: bus.send(frame), capsys, tmp_path)
     assert code == 1
-    assert "no command was sent: somebody else commands snake25 on this bus: frame 103" in said
+    assert "no command was sent: another controller commands snake25 on this bus: frame 103" in said
 
 
 @contextmanager

@@ -214,7 +214,7 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
         commands = np.array(session.joints("/joint_commands").values)
         modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
         said = [message.msg for _, message in session.messages("/rosout")]
-    assert said[-1].endswith("of 3600 s: it was asked to stop")
+    assert said[-1].endswith("of 3600 s: it was stopped")
     assert [mode for _, mode in modes] == ["walk", "stop"]
     assert not commands[:, -1].any()
     begun = modes[1][0] // 10_000_000

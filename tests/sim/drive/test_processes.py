@@ -130,7 +130,7 @@ def test_several_recorders_have_to_be_told_apart(tmp_path, alone):
         words = ("drive", "flat", "--on", on, "--arm", "-o", str(tmp_path / "c.mcap"))
         drove = undulog(*words, "--duration", "0.2", env=alone)
         assert drove.returncode == 2
-        assert "2 recorders run; which one is told the gait?" in drove.stderr
+        assert "2 recorders run; which one is to receive the gait?" in drove.stderr
         sockets = [line.split()[-1] for line in drove.stderr.splitlines()[1:]]
         chosen = undulog(
             *(*words, "--duration", "0.2", "--recorder", sockets[1], "--json"),
@@ -151,8 +151,8 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
             told, complained = driving.communicate(timeout=60)
     assert driving.returncode == 1
     why = {
-        signal.SIGTERM: "asked to stop (SIGTERM)",
-        signal.SIGINT: "asked to stop (Ctrl-C)",
+        signal.SIGTERM: "stop requested (SIGTERM)",
+        signal.SIGINT: "stop requested (Ctrl-C)",
         signal.SIGHUP: "the console is gone",
     }[number]
     assert complained.startswith(f"error: {why}; the joints were brought straight within ")

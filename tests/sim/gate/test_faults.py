@@ -274,9 +274,11 @@ def test_ctrl_c_brings_the_joints_down(small, session, tmp_path):
         on_stage.wait_for_commands(controller, 60)
         controller.send_signal(signal.SIGINT)
         _, err, written = ended(on_stage, controller, path)
-    assert err.startswith("error: asked to stop (Ctrl-C); the joints were brought straight within ")
+    assert err.startswith(
+        "error: stop requested (Ctrl-C); the joints were brought straight within "
+    )
     assert not errors(written)
-    gate_stage.check_ramp_down(written, "gate: ending, asked to stop (Ctrl-C)")
+    gate_stage.check_ramp_down(written, "gate: ending, stop requested (Ctrl-C)")
 
 
 @pytest.mark.slow
@@ -288,7 +290,7 @@ def test_a_second_ctrl_c_ends_it_at_once(small, session, tmp_path):
         time.sleep(0.2)
         controller.send_signal(signal.SIGINT)
         _, err, written = ended(on_stage, controller, path)
-    assert "asked to stop (Ctrl-C)" in err
+    assert "stop requested (Ctrl-C)" in err
     assert "nothing more was sent; the servos hold their last commands" in err
     ending = written.after("gate: ending")
     assert all(len(angle) <= 60 for angle in ending.values())  # the way down takes more

@@ -119,7 +119,7 @@ def test_nothing_is_sent_until_every_joint_is_known():
 
     for _ in range(int(POSE_S * RATE_HZ)):
         assert bench.step(unknown).command is None
-    with pytest.raises(SourceError, match="joint04, joint09 told no angle within 2 s"):
+    with pytest.raises(SourceError, match="joint04, joint09 reported no angle within 2 s"):
         bench.step(unknown)
     assert bench.sent == []
 

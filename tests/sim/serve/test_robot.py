@@ -235,7 +235,7 @@ def test_silence_of_the_controller_is_told_and_so_is_its_return(scenario, runnin
     until("no command for 0.5 s: joint01, joint02, joint03, joint04 hold their angles")
     live.command([0.1] * JOINTS)
     until("commands are back")
-    until("joint01 was told to go beyond its limits, and stops there")
+    until("joint01 was commanded beyond its limits, and stops there")
 
 
 # -- pacing ----------------------------------------------------------------------------------

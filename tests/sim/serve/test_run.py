@@ -318,7 +318,7 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
         robot.send_signal(signal.SIGINT)
         told, _ = robot.communicate(timeout=60)
         assert robot.returncode == 0
-        assert re.match(r"snake25 lived [\d.]+ s of flat ", told)
+        assert re.match(r"snake25 ran for [\d.]+ s of flat ", told)
     with Session.open(tmp_path / "run.mcap") as session:
         commanded, measured = (session.joints(f"/joint_{w}") for w in ("commands", "states"))
         assert commanded.names == measured.names == session.robot.joint_names

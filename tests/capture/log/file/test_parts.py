@@ -254,7 +254,7 @@ def test_a_folder_with_other_sessions_is_refused_and_part_names_are_not_enough(t
     [
         (1, r"part 1 (run.mcap) is missing"),
         (2, r"part 2 (run_0002.mcap) is missing"),
-        (3, r"part 3 (run_0003.mcap) is missing; whether more followed it can't be told"),
+        (3, r"part 3 (run_0003.mcap) is missing; whether more followed it is unknown"),
     ],
 )
 def test_a_missing_part_is_told(tmp_path, gone, told):
