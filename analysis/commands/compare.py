@@ -51,7 +51,7 @@ def compare(
         a: Runs of side A, instead of two files.
         b: Runs of side B.
         paired: Run i of B belongs to run i of A.
-        any_gait: Compare although the gaits differ; the result says so.
+        any_gait: Compare although the gaits differ; the result notes it.
         margin_gain: Gains that differ by less count as the same, as a share.
         margin_lag_deg: Lags that differ by less count as the same [degrees].
         output: Write the result to this file: a page if its name ends in .html, else .json.

@@ -1,4 +1,4 @@
-"""What the commands of the analysis ask and say in the same way."""
+"""Options and output shared by the commands of the analysis."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[Sess
 
     Args:
         files: Sessions (MCAP).
-        bar: Is told which one, and how many are done.
+        bar: Receives each name, and how many are done.
         done: How many were done before.
 
     Yields:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 LEAST, MOST = 0.01, 0.12
-"""Kicks that the analysis takes for kicks; of others it says that they are too small or large."""
+"""Kicks that the analysis accepts; others are reported as too small or large."""
 
 
 def phase_kicks(
@@ -37,7 +37,7 @@ def phase_kicks(
     measure: float = 10.0,
     json: bool = False,
 ) -> None:
-    """Write the commands of kicks around a recorded gait, which tell its coupling.
+    """Write the commands of kicks around a recorded gait, which identify its coupling.
 
     Six runs of the gait itself, which show how much runs differ, four of each driven joint (phase
     +0.05 and -0.05 rad, amplitude +5 and -5 %), three held-out random patterns. Drive each with
@@ -83,7 +83,7 @@ def reversal(
     measure: float = 10.0,
     json: bool = False,
 ) -> None:
-    """Write the commands of a recorded gait and of its reverse, which tell boundary from module.
+    """Write the commands of a recorded gait and of its reverse, which separate boundary from module.
 
     The robot is turned by 180 degrees in half of the runs of each direction, so that a tilted floor
     cancels. The heading is in each file's name and metadata; the twin starts with it, a robot has
@@ -178,7 +178,7 @@ def lag_sweep(
     measure: float = 10.0,
     json: bool = False,
 ) -> None:
-    """Write the commands of a lag sweep, which tells the coupling of a chain without contact.
+    """Write the commands of a lag sweep, which identifies the coupling of a chain without contact.
 
     As many gaits as joints are driven, of small amplitude and of the lags 2 pi k/m. For a robot
     that touches nothing (hung up, floating, or a twin with surface = "none"): on the ground every

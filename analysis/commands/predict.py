@@ -34,7 +34,7 @@ def predict(
 
     Generators phi' = omega + eps (2 q/A cos phi - b), each with its own servo's angle q, have no
     other coupling than the body. The matrices P and R that kicks of the open loop gave
-    (`undulog plan phase-kicks`) say how their phases relax or grow, with nothing fitted: rates and
+    (`undulog plan phase-kicks`) give how their phases relax or grow, with nothing fitted: rates and
     patterns with 95 % intervals, and what is left of a kick.
 
     Example: `undulog predict kicks.json --eps 0.3 --kick joint05=0.2 -o predicted.json`

@@ -32,7 +32,7 @@ def report(
     """Write the offline report: one HTML page that needs no network and no script.
 
     Several sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
-    tell boundary from module, kicks of single joints tell the coupling.
+    separate boundary from module, kicks of single joints identify the coupling.
 
     Example: `undulog report run.mcap -o run.html`
 

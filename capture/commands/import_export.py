@@ -32,7 +32,7 @@ def import_log(
     """Turn another tool's log into a session.
 
     CAN traces (candump .log, .asc, .blf, .trc, python-can .csv and .db, .mf4) keep every frame and
-    its direction; the robot's bus map says which of them are joint commands, states and sensor
+    its direction; the robot's bus map defines which of them are joint commands, states and sensor
     values. Any other CSV needs a column map, as a file or as --map options.
 
     Example: `undulog import trace.log -o run.mcap --robot arcsnake-joint`
@@ -87,7 +87,7 @@ def export_log(
 ) -> None:
     """Write a session for other tools: its raw CAN frames, or its joint columns as a table.
 
-    The suffix of the output says the format. Frames: .log (candump), .blf and .asc (Vector), .mcap
+    The suffix of the output selects the format. Frames: .log (candump), .blf and .asc (Vector), .mcap
     (ROS 2, one can_msgs/msg/Frame a frame). Columns: .csv and .parquet, one row a sample of a
     joint at its own time. What a format can't hold is counted in a warning.
 

@@ -28,7 +28,7 @@ def log_recover(
     What the MCAP file has in whole chunks and what only the write-ahead log beside it
     (`run.mcap.wal`) has come together, each message once; of a split session all parts. A log
     without a write-ahead log gives what can still be read of it. The record `undulog.recovered`
-    says what was found and what is missing. The originals stay as they are: delete them when the
+    lists what was found and what is missing. The originals stay as they are: delete them when the
     new file has been looked at. Reading needs no recovery: `log info`, `log check`, `analyse` and
     all others read an unfinished session as it is.
 
@@ -80,10 +80,10 @@ def log_cut(
 
     The window is half-open in log time: a message at --start is in, one at --stop is not, so that
     cuts laid side by side hold every message once. Message bytes, sequence numbers and times stay
-    as they are, and so do attachments and metadata; the record `undulog.edit` says what was cut
-    from what. Topics that speak only when something changes (`/gait/mode`, `/robot_description`,
-    `/tf_static`, whatever was recorded as transient local) may have said their last word before
-    the window: that is told, and --carry-state copies it, with the log time of --start.
+    as they are, and so do attachments and metadata; the record `undulog.edit` describes
+    the cut. Topics published only on a change (`/gait/mode`, `/robot_description`,
+    `/tf_static`, whatever was recorded as transient local) may have their last message before
+    the window: that is reported, and --carry-state copies it, with the log time of --start.
 
     Example: `undulog log cut run.mcap --start 8 --stop 16 -o steady.mcap`
 

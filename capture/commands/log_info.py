@@ -25,7 +25,7 @@ def describe(session: Session) -> dict[str, Any]:
 
     Returns:
         ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``. A
-        topic's ``read`` says whether its messages can be read: those of other encodings are only
+        topic's ``read`` states whether its messages can be read: those of other encodings are only
         listed; ``frames`` is the number of CAN FD frames of their topics, None for others. Without
         messages there is no start.
     """
@@ -79,7 +79,7 @@ def _fd_frames(session: Session, channel: Channel) -> int | None:
             len(session.fd_frames(channel.topic, start_ns=start_ns, stop_ns=stop_ns))
             for start_ns, stop_ns in pairwise([*edges, None])
         )
-    except DataError:  # somebody else's topic of that name
+    except DataError:  # a foreign topic of that name
         return None
 
 

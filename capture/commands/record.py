@@ -51,7 +51,7 @@ def record(
     transmits), `unix:PATH` (frames from other processes) or `twin:SCENARIO`; `NAME=` before it
     names it in the session. What was accepted survives the death of the recorder: it is in a
     write-ahead log beside the file. Ctrl-C, SIGTERM and SIGHUP end the recording with a whole
-    file. `undulog record status`, `mark`, `note`, `split` and `stop` speak to it meanwhile.
+    file. `undulog record status`, `mark`, `note`, `split` and `stop` control it meanwhile.
 
     Example: `undulog record can:socketcan:can0 --robot snake25 -o run.mcap`
 
@@ -67,7 +67,7 @@ def record(
         sources: What to record.
         output: The session to write, `.mcap`; `{time}` in it becomes the time of the start.
         robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML:
-            its bus map says what the frames mean. A twin brings its own.
+            its bus map defines the frames. A twin brings its own.
         bus: Name of the source that is the robot's bus, where there are several.
         duration: End by itself after this time, e.g. `30s`, `1h30min`.
         split_size: Begin a new file after this size, e.g. `1GB`.
@@ -148,7 +148,7 @@ def _nothing() -> str:
 
 
 def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
-    """Start the live view; returns what tells, once, why it has ended by itself."""
+    """Start the live view; return a function that gives, once, why it ended by itself."""
     from ..recorder.live_feed import spawn_relay
 
     complaints: list[str] = []

@@ -1,6 +1,6 @@
 """Commands ``record status``, ``mark``, ``note``, ``split``, ``stop`` and ``unit``.
 
-They speak to running recorders by their control sockets.
+They reach running recorders through their control sockets.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def mark(
     Example: `undulog record mark slipped on wet sand`
 
     Args:
-        text: What there is to say of it; it goes to `/rosout`.
+        text: Remark on it; it goes to `/rosout`.
         level: `info`, `warn` or `error`.
         socket: The recorder's control socket, where several run.
         json: Report as one JSON object.
@@ -108,7 +108,7 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
     Example: `undulog record stop --wait`
 
     Args:
-        wait: Wait until the file is whole, and say what it is.
+        wait: Wait until the file is complete, and print its name.
         socket: The recorder's control socket, where several run.
         json: Report as one JSON object.
     """

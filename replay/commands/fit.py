@@ -36,7 +36,7 @@ def fit(
 
     The session's commands are given to the twin again and again, its parameters changed until its
     joint angles match the recorded ones. Each parameter comes with a 95 % interval, and those that
-    the session can't tell are named, with what would tell them. The robot description that is
+    the session does not determine are named, with what would determine them. The robot description that is
     written has the fitted servo; the ground's friction belongs to a scenario: `--scenario`.
 
     Example: `undulog sim fit run.mcap --on twin:flat --modules -o fitted.toml`
@@ -51,10 +51,10 @@ def fit(
             damping, and the ground's friction. The others stay as they are.
         module: Fit this joint's own stall torque, too, e.g. `joint05`.
         modules: Try every module, and name the one that differs.
-        delay: Fit a dead time, too; the twin has none, so it is told and not written.
+        delay: Fit a dead time, too; the twin has none, so it is reported and not written.
         spread: Relative standard deviation of the parameters, as known before the session.
         within: A parameter counts as determined if its interval is within this share of it.
-        settle: The first seconds to leave out, instead of what the session says.
+        settle: The first seconds to leave out, instead of the session's own.
         kernels: What computes the forces: `numba` is faster; `auto` takes it where it is installed.
         force: Replace the outputs if they are there.
         json: Print one JSON object instead of text.

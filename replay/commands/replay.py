@@ -37,14 +37,14 @@ def replay(
     force: bool = False,
     json: bool = False,
 ) -> int:
-    """Run a recorded experiment again, in the twin or on the robot, and say what differs.
+    """Run a recorded experiment again, in the twin or on the robot, and report what differs.
 
     The session's commands are given to the twin of its robot at their own times, and the run is
     recorded. In the world that a twin's session ran in, it is the same to the last bit. With
-    `--set` one value of that world is another; then it says from when on that mattered, and what
+    `--set` one value of that world is another; then it reports from when on that mattered, and what
     differs as `undulog compare` has it.
 
-    On a bus it is a dry run in the twin, which says what it would take. With `--arm` the commands
+    On a bus it is a dry run in the twin, which reports what it would take. With `--arm` the commands
     are sent, behind the same safety gate as those of `undulog drive`.
 
     Example: `undulog replay run.mcap --on twin --set servo.stall_torque=0.2 -o weak.mcap`
@@ -59,7 +59,7 @@ def replay(
         duration: How long in seconds, instead of as long as there are commands.
         arm: Send the commands.
         robot: The robot on the bus, a name or a TOML file; by default the session's own.
-        recorder: Control socket of the recorder that is told the gait; by default the only one
+        recorder: Control socket of the recorder that receives the gait; by default the only one
             that runs.
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
@@ -124,7 +124,7 @@ def replay(
 
 
 def _show(comparison: Comparison) -> None:
-    """Print a comparison below what was said."""
+    """Print a comparison below the output before it."""
     from undulog.analysis.commands.options import show
     from undulog.analysis.present.text_experiment import render_comparison
 

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ClipOptions:
-    """What the command line says of a clip; None is what it doesn't say.
+    """The command line's options of a clip; None for those not given.
 
     Attributes:
         start: With `--clip`: where it begins, in seconds of the session.
         end: With `--clip`: where it ends.
-        fps: With `--clip`: frames a second; 25 where nothing is said.
+        fps: With `--clip`: frames a second; 25 by default.
         speed: With `--clip`: seconds of the session in a second of the clip, e.g. 0.25.
-        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 where nothing is said.
+        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 by default.
     """
 
     start: Annotated[float | None, Parameter(name="--from")] = None

@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class OverlayOptions:
-    """What the command line says of sessions side by side; None is what it doesn't say.
+    """The command line's options of sessions side by side; None for those not given.
 
     Attributes:
         align: With several sessions, what happens at once: the same `time` since each one's first
-            sample (where nothing is said), the same time since the start of its `gait`, or the
+            sample (the default), the same time since the start of its `gait`, or the
             same `phase` of the gait.
         names: With several sessions: what they are called, with commas, e.g. `robot,twin`; the
-            files' names where nothing is said.
+            files' names by default.
         place: With several sessions: whether bodies are laid on the first one at the `start`
-            (where nothing is said) or stay where each session's `world` has them.
+            (the default) or stay where each session's `world` has them.
     """
 
     align: Annotated[Literal["time", "gait", "phase"] | None, Parameter(name="--align")] = None

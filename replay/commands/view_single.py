@@ -1,4 +1,4 @@
-"""What the command line says of one session: which numbers, which tab, which topics."""
+"""The command line's options of one session: which numbers, which tab, which topics."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _STATES = "/joint_states"
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class SingleOptions:
-    """How one session is shown; None where nothing is said.
+    """How one session is shown; None where an option is not given.
 
     Attributes:
         result: With one session: show what was found before instead of analysing now, `.json` of
             `undulog analyse`. Results of an experiment or a comparison that it is part of mark the
             modules they name. May be given several times.
-        tab: With one session: the tab in front, `session` where nothing is said; the mean cycle's
+        tab: With one session: the tab in front, `session` by default; the mean cycle's
             plays at once.
         command_topic: With one session: JointState topic of the commands, in a bag of another make.
         response_topic: With one session: JointState topic of the responses.

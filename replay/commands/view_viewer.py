@@ -118,7 +118,7 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         if page:
             process.wait_until_it_listens()
             echo(page)
-        # Rerun would tell a closed window as errors of its own, in colours.
+        # Rerun would report a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
         from ..feed.numbers import Analysing
         from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
@@ -144,7 +144,7 @@ def _make_way() -> None:
 
 
 def _known(session: SessionView, single: SingleOptions) -> Layer:
-    """What results say of it."""
+    """Its entry in results."""
     if not single.result:
         return Layer(None)
     from ..feed.numbers import read_results

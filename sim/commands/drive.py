@@ -37,9 +37,9 @@ def drive(
     """Drive a gait, a plan or recorded commands on the twin or over a bus.
 
     On the twin it runs faster than real time and is recorded like `undulog sim run`. Over a bus it
-    is a dry run: it runs in the twin and says what it would take. With `--arm` commands are sent,
+    is a dry run: it runs in the twin and reports what it would take. With `--arm` commands are sent,
     100 times a second, behind a safety gate: it reads the pose, ramps to the first one, keeps to
-    the limits of the robot's file, and ends as that says on a fault, on Ctrl-C (twice: at once)
+    the limits of the robot's file, and ends as defined there on a fault, on Ctrl-C (twice: at once)
     and when the console goes.
 
     Example: `undulog drive flat --on 'can:socketcand:can0?port=29536' --arm -o driven.mcap`
@@ -50,10 +50,10 @@ def drive(
         on: `twin` (the world that it was made for), `twin:SCENARIO`, or a bus,
             `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
         output: The session file to write, `.mcap`; a dry run needs none.
-        duration: How long to drive in seconds, instead of what the gait or plan says.
+        duration: How long to drive in seconds, instead of the gait's or plan's duration.
         arm: Send the commands.
         robot: The robot on the bus, a name or a TOML file; by default the one that it was made for.
-        recorder: Control socket of the recorder that is told the gait; by default the only one
+        recorder: Control socket of the recorder that receives the gait; by default the only one
             that runs.
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.

@@ -39,7 +39,7 @@ def run_dry(
     force: bool = False,
     as_json: bool = False,
 ) -> int:
-    """Run it in the twin, and say what it would take.
+    """Run it in the twin, and report what it would take.
 
     Args:
         driven: What to drive.
@@ -178,7 +178,7 @@ def drive_armed(
 
     Raises:
         UsageError: If something of it can't be.
-        SourceError: If nobody is there, or the robot is no robot to start with.
+        SourceError: If the bus is silent, or the robot is no robot to start with.
     """
     if output is None:
         raise UsageError(
@@ -204,7 +204,7 @@ def drive_armed(
             bar.update(min(tick.time_s, plan.duration_s), f"{tick.step.phase}, {pace}")
 
         report = drive_bus(plan, stop=stop, on_tick=show, console=console)
-        console.gone()  # what is said from here on goes nowhere then
+        console.gone()  # output is discarded from here on
     return ArmedRun(plan, report)
 
 
@@ -220,7 +220,7 @@ def drive_on_bus(
     force: bool = False,
     as_json: bool = False,
 ) -> int:
-    """What a command does on a bus: a dry run in the twin, or armed; and say how it went.
+    """What a command does on a bus: a dry run in the twin, or armed; and report the outcome.
 
     Args:
         driven: What to drive.
@@ -238,7 +238,7 @@ def drive_on_bus(
 
     Raises:
         UsageError: If something of it can't be.
-        SourceError: If nobody is there, or the robot is no robot to start with.
+        SourceError: If the bus is silent, or the robot is no robot to start with.
     """
     if not arm:
         if recorder is not None:

@@ -258,7 +258,7 @@ def _told(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
 
 
 def _touched(contact_s: dict[str, float]) -> str:
-    """What to say of the links that touched obstacles."""
+    """Describe the links that touched obstacles."""
     if not contact_s:
         return "no link touched an obstacle"
     longest = max(contact_s, key=contact_s.__getitem__)

@@ -47,7 +47,7 @@ def serve(
 
     Clients reach the bus as one of a socketcand server on this computer; a recorder that listens at
     a Unix socket gets its frames there, too. Frames are those of the robot's DBC, and so are the
-    commands that the robot takes; the scenario's gait is not looked at. It lives until Ctrl-C or
+    commands that the robot takes; the scenario's gait is not looked at. It runs until Ctrl-C or
     SIGTERM, both of which end it in good order.
 
     Example: `undulog sim serve flat --socketcand 29536 --wait`
@@ -61,7 +61,7 @@ def serve(
         unix: Send all frames to the recorder that listens at this path, once it is there.
         bus: Name of the bus.
         duration: Simulated seconds to live, rather than until it is stopped.
-        wait: Begin with the first command, so that nobody misses anything.
+        wait: Begin with the first command, so that no client misses anything.
         lockstep: Wait at each control tick until every servo has a command for it: the same
             commands then give the same run, whatever the machine does meanwhile. Begins with the
             first command, too.
