@@ -83,7 +83,7 @@ def reversal(
     measure: float = 10.0,
     json: bool = False,
 ) -> None:
-    """Write the commands of a recorded gait and of its reverse, which separate boundary from module.
+    """Write the commands of a recorded gait and of its reverse, to separate boundary from module.
 
     The robot is turned by 180 degrees in half of the runs of each direction, so that a tilted floor
     cancels. The heading is in each file's name and metadata; the twin starts with it, a robot has

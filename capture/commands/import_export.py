@@ -87,8 +87,8 @@ def export_log(
 ) -> None:
     """Write a session for other tools: its raw CAN frames, or its joint columns as a table.
 
-    The suffix of the output selects the format. Frames: .log (candump), .blf and .asc (Vector), .mcap
-    (ROS 2, one can_msgs/msg/Frame a frame). Columns: .csv and .parquet, one row a sample of a
+    The suffix of the output selects the format. Frames: .log (candump), .blf and .asc (Vector),
+    .mcap (ROS 2, one can_msgs/msg/Frame a frame). Columns: .csv and .parquet, one row a sample of a
     joint at its own time. What a format can't hold is counted in a warning.
 
     Example: `undulog log export run.mcap -o trace.log`

@@ -36,8 +36,8 @@ def fit(
 
     The session's commands are given to the twin again and again, its parameters changed until its
     joint angles match the recorded ones. Each parameter comes with a 95 % interval, and those that
-    the session does not determine are named, with what would determine them. The robot description that is
-    written has the fitted servo; the ground's friction belongs to a scenario: `--scenario`.
+    the session does not determine are named, with what would determine them. The written robot
+    description has the fitted servo; the ground's friction belongs to a scenario: `--scenario`.
 
     Example: `undulog sim fit run.mcap --on twin:flat --modules -o fitted.toml`
 

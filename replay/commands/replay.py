@@ -44,8 +44,8 @@ def replay(
     `--set` one value of that world is another; then it reports from when on that mattered, and what
     differs as `undulog compare` has it.
 
-    On a bus it is a dry run in the twin, which reports what it would take. With `--arm` the commands
-    are sent, behind the same safety gate as those of `undulog drive`.
+    On a bus it is a dry run in the twin, which reports what it would take. With `--arm` the
+    commands are sent, behind the same safety gate as those of `undulog drive`.
 
     Example: `undulog replay run.mcap --on twin --set servo.stall_torque=0.2 -o weak.mcap`
 

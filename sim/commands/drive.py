@@ -37,8 +37,8 @@ def drive(
     """Drive a gait, a plan or recorded commands on the twin or over a bus.
 
     On the twin it runs faster than real time and is recorded like `undulog sim run`. Over a bus it
-    is a dry run: it runs in the twin and reports what it would take. With `--arm` commands are sent,
-    100 times a second, behind a safety gate: it reads the pose, ramps to the first one, keeps to
+    is a dry run: it runs in the twin and reports what it would take. With `--arm` commands are
+    sent, 100 times a second, behind a safety gate: it reads the pose, ramps to the first one, keeps to
     the limits of the robot's file, and ends as defined there on a fault, on Ctrl-C (twice: at once)
     and when the console goes.
 
