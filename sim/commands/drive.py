@@ -38,9 +38,9 @@ def drive(
 
     On the twin it runs faster than real time and is recorded like `undulog sim run`. Over a bus it
     is a dry run: it runs in the twin and reports what it would take. With `--arm` commands are
-    sent, 100 times a second, behind a safety gate: it reads the pose, ramps to the first one, keeps to
-    the limits of the robot's file, and ends as defined there on a fault, on Ctrl-C (twice: at once)
-    and when the console goes.
+    sent, 100 times a second, behind a safety gate: it reads the pose, ramps to the first one,
+    keeps to the limits of the robot's file, and ends as defined there on a fault, on Ctrl-C (twice:
+    at once) and when the console goes.
 
     Example: `undulog drive flat --on 'can:socketcand:can0?port=29536' --arm -o driven.mcap`
 
