@@ -47,8 +47,16 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 test: $(READY)  ## all tests but the slow ones
 	$(BIN)/python -m pytest -m "not slow"
 
+# Two processes at once: tests that compute, and tests of processes, time and pictures.
+COMPUTING = tests/analysis tests/docs tests/zoo tests/replay/calibrate \
+  $(addprefix tests/sim/,control gait physics scenario sensing twin)
+
 slow: $(READY)  ## the slow tests
-	$(BIN)/python -m pytest -m slow
+	@log=$$(mktemp); \
+	$(BIN)/python -m pytest -p no:cacheprovider -m slow $(COMPUTING) >$$log 2>&1 & first=$$!; \
+	trap "kill $$first; rm -f $$log; exit 130" INT TERM; \
+	$(BIN)/python -m pytest -m slow $(addprefix --ignore=,$(COMPUTING)); second=$$?; \
+	wait $$first; first=$$?; cat $$log; rm -f $$log; exit $$((first + second))
 
 zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)

@@ -224,7 +224,8 @@ def test_a_half_open_connection_ends_without_a_ramp(folder, tmp_path, kind):
     assert drive.report["fault"]["kind"] == "silent"
     assert drive.report["held_s"] == pytest.approx(10.0, abs=1.0)
     assert drive.report["ended"].startswith("nothing more was sent")
-    assert drive.phases == ["reading the pose", "run", "hold", "done"]
+    assert drive.phases[:3] == ["reading the pose", "run", "hold"]
+    assert drive.phases[-2:] == ["hold", "done"]
 
 
 HEALTHY = {
