@@ -85,32 +85,11 @@ def record(
         quiet: Nothing on the terminal.
         json: Report as one JSON object at the end.
     """
+    options = locals()  # the arguments, by name
     from ..common.process import interruptible
-    from ..recorder.settings import resolve
+    from ..recorder.settings import PARSERS, resolve
 
-    resolved = resolve(
-        {
-            "sources": sources,
-            "output": output,
-            "robot": robot,
-            "bus": bus,
-            "duration": duration,
-            "split_size": split_size,
-            "split_time": split_time,
-            "ring": ring,
-            "floor": floor,
-            "socket": socket,
-            "operator": operator,
-            "notes": notes,
-            "metadata": metadata,
-            "live": live,
-            "fast": fast,
-            "force": force,
-            "quiet": quiet,
-        },
-        os.environ,
-        settings,
-    )
+    resolved = resolve({name: options[name] for name in PARSERS}, os.environ, settings)
     with interruptible() as stop:
         report = _run(resolved, stop)
     if json:

@@ -26,12 +26,8 @@ A file::
     quiet = false                   # nothing on the terminal
     metadata = { place = "tank 2" } # further facts for the session
 
-Required are ``sources`` and ``output``.
-
-One value of each setting, from TOML, from text, or from the command line's own types.
-
-A parser takes what was given and returns the value, or raises a DataError whose text says what
-would be valid.
+Required are ``sources`` and ``output``. A parser takes what TOML, a text or the command line's own
+types give and returns the value, or raises a DataError whose text says what would be valid.
 """
 
 from __future__ import annotations
@@ -41,7 +37,7 @@ import re
 import shlex
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
@@ -56,7 +52,6 @@ _Number = TypeVar("_Number", int, float)
 
 _YES, _NO = ("true", "1", "yes", "on"), ("false", "0", "no", "off")
 _FACT = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
-_SMALLEST_PART = SIZE_UNITS["MB"]
 
 
 def _flag(value: object) -> bool:
@@ -146,29 +141,12 @@ def _at_least(
     return checked
 
 
-PARSERS: Mapping[str, Callable[[object], Any]] = MappingProxyType(
-    {
-        "sources": _sources,
-        "robot": _word,
-        "bus": _word,
-        "output": _output,
-        "force": _flag,
-        "duration": _at_least(parse_duration_s, 0.001, "a duration of at least 1ms"),
-        "split_size": _at_least(parse_size, _SMALLEST_PART, "a size of at least 1MB"),
-        "split_time": _at_least(parse_duration_s, 1.0, "a duration of at least 1s"),
-        "ring": _at_least(parse_duration_s, 1.0, "a duration of at least 1s"),
-        "floor": parse_size,
-        "socket": _path,
-        "live": _flag,
-        "operator": _word,
-        "notes": _text,
-        "metadata": _facts,
-        "fast": _flag,
-        "quiet": _flag,
-    }
-)
-"""Name of a setting to what reads its value."""
+def _read_by(parse: Callable[[object], Any]) -> Mapping[str, Callable[[object], Any]]:
+    """Metadata of a field that is a setting."""
+    return {"parse": parse}
 
+
+_AT_LEAST_1_S = _read_by(_at_least(parse_duration_s, 1.0, "a duration of at least 1s"))
 
 ENVIRONMENT_PREFIX = "UNDULOG_RECORD_"
 """Begins the name of every environment variable that is a setting."""
@@ -178,8 +156,6 @@ FILE_VARIABLE = f"{ENVIRONMENT_PREFIX}SETTINGS"
 
 DEFAULT_FLOOR = 500 * SIZE_UNITS["MB"]
 """A recording ends in good order when less disk is free [B]."""
-
-_NONE: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -208,36 +184,38 @@ class RecordSettings:
             or ``default``.
     """
 
-    sources: tuple[str, ...]
-    output: Path
-    robot: str | None = None
-    bus: str | None = None
-    force: bool = False
-    duration_s: float | None = None
-    split_size: int | None = None
-    split_time_s: float | None = None
-    ring_s: float | None = None
-    floor: int = DEFAULT_FLOOR
-    socket: Path | None = None
-    live: bool = False
-    operator: str = ""
-    notes: str = ""
-    metadata: Mapping[str, str] = field(default_factory=lambda: _NONE)
-    fast: bool = False
-    quiet: bool = False
-    origin: Mapping[str, str] = field(default_factory=lambda: _NONE, compare=False)
+    sources: tuple[str, ...] = field(metadata=_read_by(_sources))
+    output: Path = field(metadata=_read_by(_output))
+    robot: str | None = field(default=None, metadata=_read_by(_word))
+    bus: str | None = field(default=None, metadata=_read_by(_word))
+    force: bool = field(default=False, metadata=_read_by(_flag))
+    duration_s: float | None = field(
+        default=None,
+        metadata=_read_by(_at_least(parse_duration_s, 0.001, "a duration of at least 1ms")),
+    )
+    split_size: int | None = field(
+        default=None,
+        metadata=_read_by(_at_least(parse_size, SIZE_UNITS["MB"], "a size of at least 1MB")),
+    )
+    split_time_s: float | None = field(default=None, metadata=_AT_LEAST_1_S)
+    ring_s: float | None = field(default=None, metadata=_AT_LEAST_1_S)
+    floor: int = field(default=DEFAULT_FLOOR, metadata=_read_by(parse_size))
+    socket: Path | None = field(default=None, metadata=_read_by(_path))
+    live: bool = field(default=False, metadata=_read_by(_flag))
+    operator: str = field(default="", metadata=_read_by(_word))
+    notes: str = field(default="", metadata=_read_by(_text))
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str], metadata=_read_by(_facts))
+    fast: bool = field(default=False, metadata=_read_by(_flag))
+    quiet: bool = field(default=False, metadata=_read_by(_flag))
+    origin: Mapping[str, str] = field(default_factory=dict[str, str], compare=False)
 
-    def as_json(self) -> dict[str, dict[str, Any]]:
-        """Every setting with its value and where that comes from.
 
-        Returns:
-            Name to ``value`` (plain JSON) and ``origin``.
-        """
-        return {
-            name: {"value": _plain(getattr(self, _attribute(name))), "origin": self.origin[name]}
-            for name in PARSERS
-            if name in self.origin
-        }
+_FIELDS = {each.name.removesuffix("_s"): each for each in fields(RecordSettings) if each.metadata}
+
+PARSERS: Mapping[str, Callable[[object], Any]] = MappingProxyType(
+    {name: each.metadata["parse"] for name, each in _FIELDS.items()}
+)
+"""Name of a setting to what reads its value."""
 
 
 @dataclass(frozen=True)
@@ -282,7 +260,6 @@ def resolve(
     if file is not None:
         layers.append(_file(file, faults))
     values: dict[str, Any] = {}
-    origin: dict[str, str] = {}
     given: dict[str, tuple[_Layer, object]] = {}
     for name, parse in PARSERS.items():
         for layer in layers:
@@ -290,19 +267,17 @@ def resolve(
             if raw is None:
                 continue
             value = _parsed(layer, name, raw, parse, faults)
-            if name not in origin:
-                origin[name] = layer.origin
+            if name not in given:
                 given[name] = layer, raw
-                if value is not None:
-                    values[_attribute(name)] = value
-        origin.setdefault(name, "default")
+                values[_FIELDS[name].name] = value
     _check_together(given, faults)
     if found := faults.all():
         raise SettingsError(found)
+    origin = {name: given[name][0].origin if name in given else "default" for name in PARSERS}
     if file is not None and origin["robot"] == _origin(file):
         values["robot"] = _beside(file, values["robot"])
     values["output"] = _timed(values["output"], time.time_ns() if now_ns is None else now_ns)
-    return RecordSettings(**values, origin=MappingProxyType(origin))
+    return RecordSettings(**values, origin=origin)
 
 
 def _command_line(cli: Mapping[str, object]) -> _Layer:
@@ -404,17 +379,3 @@ def _beside(file: Path, robot: str) -> str:
 def _timed(output: Path, now_ns: int) -> Path:
     start = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
     return Path(os.fspath(output).replace("{time}", f"{start:%Y%m%dT%H%M%SZ}"))
-
-
-def _attribute(name: str) -> str:
-    return f"{name}_s" if name in ("duration", "split_time", "ring") else name
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, tuple):
-        return list(cast("tuple[object, ...]", value))
-    if isinstance(value, Mapping):
-        return dict(cast("Mapping[str, object]", value))
-    return value

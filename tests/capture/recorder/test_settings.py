@@ -172,12 +172,9 @@ def test_the_command_line_beats_the_environment_beats_the_file(tmp_path, name, p
     winner = max((i for i in range(3) if present[i]), default=None)
     assert settings.origin[name] == ("default" if winner is None else origins[winner])
     wanted = None if winner is None else PARSERS[name](GOOD[name][winner])
-    shown = settings.as_json()[name]["value"]
     if winner is not None:
-        plain = str(wanted) if isinstance(wanted, Path) else wanted
-        plain = list(plain) if isinstance(plain, tuple) else plain
-        assert shown == (dict(plain) if name == "metadata" else plain)
-    json.dumps(settings.as_json())
+        attribute = f"{name}_s" if name in {"duration", "split_time", "ring"} else name
+        assert getattr(settings, attribute) == wanted
 
 
 def test_every_setting_is_tested_and_the_docstring_s_example_holds_all(tmp_path):
