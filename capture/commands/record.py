@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from ..common.console import complain, echo, emit_json
 from ..common.errors import UndulogError
+from .record_control import counted_faults
 
 if TYPE_CHECKING:
     from ..common.process import StopRequest
@@ -109,7 +110,7 @@ def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
     terminal = Terminal(sys.stderr, quiet=settings.quiet)
     with ExitStack() as relay:
         recording = Recording(settings, stop, notifier=Notifier(os.environ))
-        watch = _live_view(recording.live_socket, relay) if settings.live else _nothing
+        watch = _live_view(recording.live_socket, relay) if settings.live else str
 
         def show(snapshot: RecorderSnapshot) -> None:
             if complaint := watch():
@@ -120,10 +121,6 @@ def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
             return recording.run(show)
         finally:
             terminal.close()
-
-
-def _nothing() -> str:
-    return ""
 
 
 def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
@@ -163,13 +160,6 @@ def _print_report(report: RecordReport) -> None:
         parts = [f"{counts['frames']} frames"]
         dropped = counts["dropped"]
         parts.append("losses unknown" if dropped is None else f"{dropped} lost before us")
-        for key, what in (
-            ("malformed", "malformed"),
-            ("error_frames", "error frames"),
-            ("reconnects", "reconnects"),
-        ):
-            if counts[key]:
-                parts.append(f"{counts[key]} {what}")
-        echo(f"  {name}: {', '.join(parts)}")
+        echo(f"  {name}: {', '.join([*parts, *counted_faults(counts)])}")
     for reason in report.reasons:
         echo(f"  reason: {reason}")

@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 
 
 _Words = Annotated[str, Parameter(show_default=False)]
+_FAULTS = ("malformed", "error_frames", "reconnects")
+
+
+def counted_faults(source: Mapping[str, Any]) -> list[str]:
+    """What a source counts and should not have to, where it does: ``3 error frames``."""
+    return [f"{source[key]} {key.replace('_', ' ')}" for key in _FAULTS if source.get(key)]
 
 
 def status(*, socket: Path | None = None, json: bool = False) -> int:
@@ -63,9 +69,7 @@ def mark(
         socket: The recorder's control socket, where several run.
         json: Report as one JSON object.
     """
-    with _recorder(socket) as recorder:
-        reply = recorder.ask({"do": "mark", "text": " ".join(text), "level": level})
-    _tell("marked", reply, as_json=json)
+    _ask({"do": "mark", "text": " ".join(text), "level": level}, "marked", socket, as_json=json)
 
 
 def note(
@@ -83,9 +87,7 @@ def note(
     """
     if not text:
         raise UsageError("a note needs a text: undulog record note battery changed")
-    with _recorder(socket) as recorder:
-        reply = recorder.ask({"do": "note", "text": " ".join(text), "level": level})
-    _tell("noted", reply, as_json=json)
+    _ask({"do": "note", "text": " ".join(text), "level": level}, "noted", socket, as_json=json)
 
 
 def split(*, socket: Path | None = None, json: bool = False) -> None:
@@ -97,9 +99,7 @@ def split(*, socket: Path | None = None, json: bool = False) -> None:
         socket: The recorder's control socket, where several run.
         json: Report as one JSON object.
     """
-    with _recorder(socket) as recorder:
-        reply = recorder.ask({"do": "split"})
-    _tell("split", reply, as_json=json)
+    _ask({"do": "split"}, "split", socket, as_json=json)
 
 
 def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) -> int:
@@ -184,14 +184,9 @@ def _source(source: Mapping[str, Any]) -> str:
         parts.append(f"{frames} frames")
     if (rate_hz := source.get("rate_hz")) is not None:
         parts.append(f"{rate_hz:.0f} frames/s")
-    for key, what in (
-        ("dropped", "lost before us"),
-        ("malformed", "malformed"),
-        ("error_frames", "error frames"),
-        ("reconnects", "reconnects"),
-    ):
-        if source.get(key):
-            parts.append(f"{source[key]} {what}")
+    if source.get("dropped"):
+        parts.append(f"{source['dropped']} lost before us")
+    parts += counted_faults(source)
     return f"{source.get('name')}: {', '.join(parts)}"
 
 
@@ -216,12 +211,16 @@ def _facts(reply: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
+def _ask(request: Mapping[str, Any], done: str, socket: Path | None, *, as_json: bool) -> None:
+    with _recorder(socket) as recorder:
+        reply = recorder.ask(request)
+    _tell(done, reply, as_json=as_json)
+
+
 def _tell(done: str, reply: Mapping[str, Any], *, as_json: bool) -> None:
     if as_json:
         emit_json(dict(reply))
+    elif reply:
+        echo(f"{done}: {', '.join(f'{name} {value}' for name, value in reply.items())}")
     else:
-        echo(": ".join([done, *([_plain(reply)] if reply else [])]))
-
-
-def _plain(reply: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in reply.items())
+        echo(done)

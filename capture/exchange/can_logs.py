@@ -150,23 +150,20 @@ _HIGHEST_ID = 0x1FFF_FFFF
 _MOST_BYTES = 64
 
 
-def _read_errors() -> tuple[type[Exception], ...]:
-    """What python-can's readers raise on damaged files."""
-    from can.io.blf import BLFParseError
-
-    return (
-        ValueError,  # text that is no number, a wrong file version
-        LookupError,
-        TypeError,
-        AttributeError,  # of None
-        ArithmeticError,  # infinite or huge times
-        EOFError,
-        OSError,
-        struct.error,
-        zlib.error,
-        sqlite3.Error,
-        BLFParseError,
-    )
+_READ_ERRORS = (
+    ValueError,  # text that is no number, a wrong file version
+    LookupError,
+    TypeError,
+    AttributeError,  # of None
+    ArithmeticError,  # infinite or huge times
+    EOFError,
+    OSError,
+    struct.error,
+    zlib.error,
+    sqlite3.Error,
+    BLFParseError,
+)
+"""What python-can's readers raise on a damaged file."""
 
 
 @contextmanager
@@ -241,7 +238,7 @@ def _reader(path: Path) -> MessageReader:
         if log_suffix(path) == ".db":
             _check_database(path)
         return LogReader(path)
-    except _read_errors() as error:
+    except _READ_ERRORS as error:
         raise ImportFormatError(path, f"can't be read: {error}") from error
 
 
@@ -303,7 +300,7 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
         for message in reader:
             yield message
             count += 1
-    except _read_errors() as error:
+    except _READ_ERRORS as error:
         text = f"can't be read after {count} frames: {error}"
         raise ImportFormatError(path, text) from error
 
@@ -388,25 +385,21 @@ def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, 
     if bus not in log.buses:
         log.buses.append(bus)
     # An error frame tells what happened on the bus, and is of neither kind.
-    if (message.is_fd or len(message.data) > 8) and not message.is_error_frame:
-        rows.append_fd(
-            t_ns=t_ns,
-            # There are no remote frames in CAN FD: python-can takes empty ones for such.
-            id_flags=message.arbitration_id | (flags & ~REMOTE_FLAG),
-            fd_flags=(FD_BRS if message.bitrate_switch else 0)
-            | (FD_ESI if message.error_state_indicator else 0),
-            way=DIR_RX if message.is_rx else DIR_TX,
-            bus=log.buses.index(bus),
-            data=bytes(message.data[:64]),
-        )
-        return
+    is_fd = (message.is_fd or len(message.data) > 8) and not message.is_error_frame
+    data = bytes(message.data[: 64 if is_fd else 8])
+    if is_fd:
+        flags &= ~REMOTE_FLAG  # none in CAN FD: python-can takes empty frames for such
     rows.append(
         t_ns=t_ns,
         id_flags=message.arbitration_id | flags,
-        dlc=message.dlc,
+        length=len(data) if is_fd else message.dlc,
         way=DIR_RX if message.is_rx else DIR_TX,
         bus=log.buses.index(bus),
-        data=bytes(message.data[:8]),
+        data=data,
+        fd_flags=(FD_BRS if message.bitrate_switch else 0)
+        | (FD_ESI if message.error_state_indicator else 0)
+        if is_fd
+        else None,
     )
 
 

@@ -107,29 +107,23 @@ def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
         buses.append(bus)
     # No block holds a later time; nor does a stamp, so such frames are left out anyway.
     t_ns = min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LAST_NS)
-    way = DIR_TX if way in {"T", "t"} else DIR_RX
     if fd_flags is not None:
-        rows.append_fd(
-            t_ns=t_ns,
-            id_flags=(identifier & ID_MASK) | flags,
-            fd_flags=int(fd_flags, 16),
-            way=way,
-            bus=buses.index(bus),
-            data=bytes.fromhex(fd_data),
-        )
-        return
-    if remote_dlc is not None:
-        dlc, data = int(remote_dlc or 0), ""
+        content = bytes.fromhex(fd_data)
+        length = len(content)
+    elif remote_dlc is not None:
+        content, length = b"", int(remote_dlc or 0)
         flags |= REMOTE_FLAG
     else:
-        dlc = int(raw_dlc, 16) if raw_dlc else len(data) // 2
+        content = bytes.fromhex(data)
+        length = int(raw_dlc, 16) if raw_dlc else len(content)
     rows.append(
         t_ns=t_ns,
         id_flags=(identifier & ID_MASK) | flags,
-        dlc=dlc,
-        way=way,
+        length=length,
+        way=DIR_TX if way in {"T", "t"} else DIR_RX,
         bus=buses.index(bus),
-        data=bytes.fromhex(data),
+        data=content,
+        fd_flags=None if fd_flags is None else int(fd_flags, 16),
     )
 
 
@@ -139,7 +133,7 @@ def candump_lines(
     bus: IntArray,
     *,
     directions: bool,
-    nanoseconds: bool | None = None,
+    nanoseconds: bool,
 ) -> Iterator[str]:
     """Frames as candump writes them.
 
@@ -147,15 +141,12 @@ def candump_lines(
         frames: The frames, classic or CAN FD, in the order wanted, shape (n,).
         bus: Index into ``buses`` for each frame, shape (n,).
         directions: Whether to write ``R`` and ``T``.
-        nanoseconds: Whether times have nine decimals rather than six, as candump has them; if
-            None, where one of these times needs them.
+        nanoseconds: Whether times have nine decimals rather than six, as candump has them.
 
     Yields:
         One line a frame, with its line end.
     """
     t_ns: NDArray[np.uint64] = frames["t_host_ns"]
-    if nanoseconds is None:
-        nanoseconds = bool((t_ns % 1000).any())
     digits, unit = (9, 1) if nanoseconds else (6, 1000)
     fd = holds_fd(frames)
     columns = (

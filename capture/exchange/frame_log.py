@@ -27,10 +27,6 @@ FRAMES_PER_BLOCK = 65_536
 """Readers hand out blocks of this many frames, so no log is held in memory whole."""
 
 
-def _no_buses() -> IntArray:
-    return np.empty(0, dtype=np.int64)
-
-
 @dataclass(frozen=True)
 class LogBlock:
     """A stretch of a log.
@@ -50,7 +46,7 @@ class LogBlock:
     bus: IntArray
     done: float
     fd_frames: FrameArray = field(default_factory=lambda: empty_fd_frames(0))
-    fd_bus: IntArray = field(default_factory=_no_buses)
+    fd_bus: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     is_fd: BoolArray | None = None
 
     def __len__(self) -> int:
@@ -151,90 +147,67 @@ class FrameLog:
     problems: list[str] = field(default_factory=list[str])
 
 
-@dataclass
-class _Columns:
-    """Columns of frames of one kind."""
+class _Rows:
+    """The frames of one kind, classic or CAN FD, of a block that is being built."""
 
-    t_ns: list[int] = field(default_factory=list[int])
-    id_flags: list[int] = field(default_factory=list[int])
-    length: list[int] = field(default_factory=list[int])
-    way: list[int] = field(default_factory=list[int])
-    bus: list[int] = field(default_factory=list[int])
-    data: bytearray = field(default_factory=bytearray)
-
-    def append(self, t_ns: int, id_flags: int, length: int, way: int, bus: int) -> None:
-        """Add a frame; its data are added by the caller."""
-        self.t_ns.append(t_ns)
-        self.id_flags.append(id_flags)
-        self.length.append(length)
-        self.way.append(way)
-        self.bus.append(bus)
+    def __init__(self) -> None:
+        self.rows: list[tuple[int, int, int, int, int]] = []
+        self.data = bytearray()
 
     def fill(self, frames: FrameArray, length: str) -> IntArray:
-        """Copy all into records; returns the buses."""
-        frames["t_host_ns"] = self.t_ns
-        frames["id_flags"] = self.id_flags
-        frames[length] = self.length
-        frames["dir"] = self.way
+        """Fill records, their length under its name there; returns the buses."""
+        columns = np.array(self.rows, dtype=np.int64).reshape(-1, 5).T
+        frames["t_host_ns"], frames["id_flags"], frames[length], frames["dir"], bus = columns
         frames["data"] = np.frombuffer(self.data, np.uint8).reshape(frames["data"].shape)
-        return np.array(self.bus, dtype=np.int64)
+        return bus
 
 
 class BlockBuilder:
-    """A block in the making."""
+    """Gathers frames one by one."""
 
     def __init__(self) -> None:
         """Start empty."""
-        self._classic, self._fd = _Columns(), _Columns()
+        self._classic, self._fd = _Rows(), _Rows()
         self._fd_flags: list[int] = []
         self._is_fd: list[bool] = []
 
     def __len__(self) -> int:
-        """Number of frames so far."""
+        """Number of frames."""
         return len(self._is_fd)
 
     def append(
-        self, *, t_ns: int, id_flags: int, dlc: int, way: int, bus: int, data: bytes | bytearray
-    ) -> None:
-        """Add a classic frame.
-
-        Args:
-            t_ns: Its time [Unix ns].
-            id_flags: Identifier with the flags of :mod:`.capture.log.messages.frames`.
-            data: Up to 8 bytes.
-        """
-        self._is_fd.append(False)
-        self._classic.append(t_ns, id_flags, dlc, way, bus)
-        self._classic.data += data.ljust(8, b"\0")
-
-    def append_fd(
         self,
         *,
         t_ns: int,
         id_flags: int,
-        fd_flags: int,
+        length: int,
         way: int,
         bus: int,
         data: bytes | bytearray,
+        fd_flags: int | None = None,
     ) -> None:
-        """Add a CAN FD frame.
+        """Add one frame.
 
         Args:
-            t_ns: Its time [Unix ns].
-            id_flags: Identifier with the flags of :mod:`.capture.log.messages.frames`.
-            fd_flags: Flags that CAN FD alone has.
-            data: Up to 64 bytes.
+            t_ns: Its time [ns].
+            length: The DLC of a classic frame, the bytes of a CAN FD frame.
+            bus: Index into :attr:`FrameLog.buses`.
+            data: At most 8 bytes, of a CAN FD frame 64.
+            fd_flags: ``FD_BRS`` and ``FD_ESI``; None for a classic frame.
         """
-        self._is_fd.append(True)
-        self._fd_flags.append(fd_flags)
-        self._fd.append(t_ns, id_flags, len(data), way, bus)
-        self._fd.data += data.ljust(64, b"\0")
+        self._is_fd.append(fd_flags is not None)
+        kind, room = self._classic, 8
+        if fd_flags is not None:
+            kind, room = self._fd, 64
+            self._fd_flags.append(fd_flags)
+        kind.rows.append((t_ns, id_flags, length, way, bus))
+        kind.data += data.ljust(room, b"\0")
 
     def block(self, done: float) -> LogBlock:
-        """The frames so far as a block.
+        """The frames as records.
 
         Args:
-            done: How much of the log's file has been read, 0 to 1.
+            done: How much of the log was read, 0 to 1.
         """
         fd_count = len(self._fd_flags)
         frames, fd_frames = empty_frames(len(self) - fd_count), empty_fd_frames(fd_count)

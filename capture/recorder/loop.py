@@ -106,7 +106,7 @@ class Recorder:
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
         self._each_tick = tuple(each_tick)
-        tasks = (self._write_clocks, self._tell_odd_frames, _tidy, *each_second)
+        tasks = (self._write_clocks, self._tell_odd_frames, lambda: gc.collect(1), *each_second)
         self._each_second = EachSecond(tasks, time.monotonic_ns())
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
@@ -239,7 +239,8 @@ class Recorder:
         if not pressed and (due or any(bus.behind for bus in self.buses.values())):
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
-                self._decode(name, bus, until_ns, rest=due)
+                bus.decode(self._clock.now_ns, until_ns, rest=due)
+                self._tell_clock(name)
         self._each_second.run(now_ns)
         for each in self._each_tick:
             each()
@@ -278,7 +279,7 @@ class Recorder:
             polled = self._asked(source)
             arrays = (*polled.frames, *polled.fd_frames)
             if self._end_ns is not None and not isinstance(source, EndingSource):
-                kept = (self._before_end(source, frames) for frames in arrays)
+                kept = [self._before(self._end_ns, source, frames) for frames in arrays]
                 arrays = tuple(frames for frames in kept if len(frames))
             self._came += sum(map(len, arrays))
             for event in polled.events:
@@ -289,12 +290,10 @@ class Recorder:
                     bus = self.buses[source.name] = self._open_bus(source)
                 bus.add(frames)
 
-    def _before_end(self, source: Source, frames: FrameArray) -> FrameArray:
+    def _before(self, end_ns: int, source: Source, frames: FrameArray) -> FrameArray:
         """Those of a source's frames that came before the end; a twin's are of its own time."""
-        if self._end_ns is None or source.robot is not None:
-            return frames
-        before = frames["t_host_ns"] <= np.uint64(self._end_ns)
-        if before.all():
+        before = frames["t_host_ns"] <= np.uint64(end_ns)
+        if source.robot is not None or before.all():
             return frames
         self._later.add(source.name)
         return frames[before]
@@ -314,11 +313,14 @@ class Recorder:
         except LogWriteError:
             raise
         except Exception as error:  # noqa: BLE001 - the other sources go on
-            self._failed.add(source.name)
-            self.say("error", source.name, f"this source is given up: it failed with {error!r}")
+            self._give_up(source, f"is given up: it failed with {error!r}")
             self._stop_source(source)
             return Polled()
         return polled
+
+    def _give_up(self, source: Source, why: str) -> None:
+        self._failed.add(source.name)
+        self.say("error", source.name, f"this source {why}")
 
     def _end_source(self, source: Source) -> None:
         """End a source that can refuse what comes later; one that fails in that is given up."""
@@ -326,21 +328,15 @@ class Recorder:
             if isinstance(source, EndingSource):
                 source.end()
         except Exception as error:  # noqa: BLE001 - the other sources are drained
-            self._failed.add(source.name)
-            self.say("error", source.name, f"this source can't be ended: {error!r}")
+            self._give_up(source, f"can't be ended: {error!r}")
 
     def _stop_source(self, source: Source) -> None:
         """Release a source; one that fails in that doesn't keep the others open."""
         try:
             source.stop()
         except Exception as error:  # noqa: BLE001 - the other sources are released
-            self._failed.add(source.name)
             with suppress(LogWriteError):  # a full disk is reported by what ended the recording
-                self.say("error", source.name, f"this source can't be released: {error!r}")
-
-    def _decode(self, name: str, bus: BusRecorder, until_ns: int, *, rest: bool) -> None:
-        bus.decode(self._clock.now_ns, until_ns, rest=rest)
-        self._tell_clock(name)
+                self._give_up(source, f"can't be released: {error!r}")
 
     def _open_bus(self, source: Source) -> BusRecorder:
         robot = self._robot if source.name == self._decoded else None
@@ -429,7 +425,3 @@ def _tidied_by_hand() -> Generator[None]:
     finally:
         gc.enable()
         gc.unfreeze()
-
-
-def _tidy() -> None:
-    gc.collect(1)

@@ -182,7 +182,7 @@ class Recording:
                 each_tick=(self._each_tick,),
                 each_second=(self._look, self._diagnose, self._tell, self._look_at_disk),
             )
-            self._recorder.on_event(self._note_event)
+            self._recorder.on_event(lambda *event: self._events.append(EventLine(*event)))
             log = OperatorLog(self._writer, self._recorder.say, self._clock.now_ns)
             self._control.serve(request_handler(self, log))
             opened.pop_all()
@@ -218,7 +218,6 @@ class Recording:
             SourceError: If a source can never work; no file is left then.
         """
         ending = Ending("an error", failed=True)
-        report: RecordReport | None = None
         self._show = show
         try:
             self._notifier.ready(f"recording {self._settings.output}")
@@ -290,8 +289,7 @@ class Recording:
 
     def _look(self) -> RecorderSnapshot:
         """Take a new snapshot."""
-        self._storage.tick()
-        for level, text in self._storage.take_events():
+        for level, text in self._storage.tick():
             self._recorder.say(level, "recorder", text)
         for text in self._control.take_faults():
             self._recorder.say("error", "recorder", text)
@@ -311,9 +309,8 @@ class Recording:
             self._show(self._snapshot)
 
     def _look_at_disk(self) -> None:
-        shortage = self._storage.shortage
-        if shortage is not None:
-            raise shortage
+        if self._storage.shortage is not None:
+            raise self._storage.shortage
         free = free_space(self._settings.output)
         if free < self._settings.floor and self._recorder.ending is None:
             self._recorder.ending = Ending(
@@ -321,9 +318,6 @@ class Recording:
                 f"{self._settings.floor / 1e6:.0f} MB; nothing later is recorded",
                 failed=True,
             )
-
-    def _note_event(self, t_ns: int, level: str, name: str, text: str) -> None:
-        self._events.append(EventLine(t_ns, level, name, text))
 
     # -- the end -----------------------------------------------------------------------------
 

@@ -39,17 +39,6 @@ class SessionClock:
         """The present time of the session [Unix ns]; never goes back."""
         return self._zero + time.monotonic_ns()
 
-    def from_monotonic_ns(self, monotonic_ns: int) -> int:
-        """The session's time at a moment of the monotonic clock.
-
-        Args:
-            monotonic_ns: As ``time.monotonic_ns`` gives it.
-
-        Returns:
-            Session time [Unix ns].
-        """
-        return self._zero + monotonic_ns
-
 
 _NS = 1_000_000_000
 

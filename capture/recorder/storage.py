@@ -90,7 +90,7 @@ _NS = 1_000_000_000
 
 
 class RingStorage:
-    """The :class:`~.capture.recorder.storage.Storage` of a ring."""
+    """A ring in memory, written to a file when marked."""
 
     part: int | None = None
     shortage: LogWriteError | None = None
@@ -109,14 +109,8 @@ class RingStorage:
             raise LogWriteError(output, f"the folder {output.parent} doesn't exist")
         self.path = output
         self.sink = RingSink(output, round(ring_s * _NS))
-        self._events: list[tuple[str, str]] = []
-        self._size = 0
+        self.size = 0  # bytes of all marks so far
         self._dropped = 0
-
-    @property
-    def size(self) -> int:
-        """Bytes of all marks so far."""
-        return self._size
 
     @property
     def messages(self) -> int:
@@ -128,29 +122,25 @@ class RingStorage:
         """Messages that power loss would cost: all that the ring holds."""
         return self.sink.messages
 
-    def tick(self) -> None:
-        """Look what became of the marks; called once a second. A failed one ends nothing."""
-        for mark in self.sink.take_marks():
-            if mark.error is not None:
-                self._events.append(("error", f"a mark is not whole: {mark.error}"))
-                continue
-            size = mark.path.stat().st_size if mark.path.exists() else 0
-            self._size += size
-            said = f"{mark.path.name} is written: {mark.messages} messages, {format_size(size)}"
-            self._events.append(("info", said))
-        if self.sink.dropped and not self._dropped:
-            held_s = self.sink.span_ns / _NS
-            said = f"the ring is full of bytes and holds only {held_s:.1f} s"
-            self._events.append(("warn", said))
-        self._dropped = self.sink.dropped
-
-    def take_events(self) -> tuple[tuple[str, str], ...]:
-        """What there is to say since the last call.
+    def tick(self) -> list[tuple[str, str]]:
+        """Look what became of the marks; called once a second. A failed one ends nothing.
 
         Returns:
-            Level (``info``, ``warn``, ``error``) and one sentence each.
+            What there is to say: level (``info``, ``warn``, ``error``) and one sentence each.
         """
-        events, self._events = tuple(self._events), []
+        events: list[tuple[str, str]] = []
+        for mark in self.sink.take_marks():
+            if mark.error is not None:
+                events.append(("error", f"a mark is not whole: {mark.error}"))
+                continue
+            size = mark.path.stat().st_size if mark.path.exists() else 0
+            self.size += size
+            said = f"{mark.path.name} is written: {mark.messages} messages, {format_size(size)}"
+            events.append(("info", said))
+        if self.sink.dropped and not self._dropped:
+            held_s = self.sink.span_ns / _NS
+            events.append(("warn", f"the ring is full of bytes and holds only {held_s:.1f} s"))
+        self._dropped = self.sink.dropped
         return events
 
     def mark(self, text: str = "") -> Mapping[str, Any]:
@@ -177,88 +167,6 @@ class RingStorage:
     def files(self) -> tuple[Path, ...]:
         """The marks that are whole, in order."""
         return tuple(mark.path for mark in self.sink.marks if mark.error is None)
-
-
-class Storage(Protocol):
-    """What the recording asks of the place it is kept in."""
-
-    @property
-    def sink(self) -> MessageSink:
-        """Where the records go."""
-        ...
-
-    @property
-    def path(self) -> Path:
-        """The file that is being written, or would be."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """Bytes so far."""
-        ...
-
-    @property
-    def messages(self) -> int:
-        """Messages accepted."""
-        ...
-
-    @property
-    def part(self) -> int | None:
-        """Number of the part that is being written; None where there are none."""
-        ...
-
-    @property
-    def unsynced(self) -> int:
-        """Messages that power loss would cost."""
-        ...
-
-    @property
-    def shortage(self) -> LogWriteError | None:
-        """Why recording must end soon, or has ended."""
-        ...
-
-    def tick(self) -> None:
-        """Do what is due; called once a second.
-
-        Raises:
-            LogWriteError: If it can't be done.
-        """
-        ...
-
-    def take_events(self) -> tuple[tuple[str, str], ...]:
-        """What there is to say since the last call.
-
-        Returns:
-            Level (``info``, ``warn``, ``error``) and one sentence each.
-        """
-        ...
-
-    def mark(self, text: str = "") -> Mapping[str, Any]:
-        """Mark this moment.
-
-        Returns:
-            What there is to say of it.
-
-        Raises:
-            LogWriteError: If a file can't be created.
-        """
-        ...
-
-    def split(self) -> Mapping[str, Any]:
-        """Begin a new part.
-
-        Returns:
-            What there is to say of it.
-
-        Raises:
-            UsageError: If there are no parts.
-            LogWriteError: If the file can't be created.
-        """
-        ...
-
-    def files(self) -> tuple[Path, ...]:
-        """The files written, in order."""
-        ...
 
 
 class DiskStorage:
@@ -310,25 +218,21 @@ class DiskStorage:
         """Why recording must end soon, or has ended."""
         return self.sink.shortage
 
-    def tick(self) -> None:
-        """Flush what has waited for long.
+    def tick(self) -> list[tuple[str, str]]:
+        """Flush what has waited for long; called once a second.
+
+        Returns:
+            Level and one sentence for a part that could not be begun, once each.
 
         Raises:
             LogWriteError: If a part that is due can't be begun.
         """
         self.sink.tick()
-
-    def take_events(self) -> tuple[tuple[str, str], ...]:
-        """Parts that could not be begun, once each.
-
-        Returns:
-            Level and one sentence each.
-        """
         trouble = self.sink.split_trouble
         if trouble is None or str(trouble) == self._told:
-            return ()
+            return []
         self._told = str(trouble)
-        return (("error", f"the next part could not be begun, this one goes on: {trouble}"),)
+        return [("error", f"the next part could not be begun, this one goes on: {trouble}")]
 
     def mark(self, text: str = "") -> Mapping[str, Any]:
         """Nothing to do: everything is written, the mark with it."""
@@ -348,6 +252,10 @@ class DiskStorage:
         """The parts, in order."""
         first = self.sink.path
         return (first, *(part_path(first, k) for k in range(2, self.sink.part + 1)))
+
+
+Storage = DiskStorage | RingStorage
+"""Where a recording is kept."""
 
 
 def open_storage(settings: RecordSettings) -> Storage:

@@ -103,8 +103,7 @@ class PythonCanLink:
             raise error
         if self._lost > self._told:
             lost, self._told = self._lost - self._told, self._lost
-            self._tally.counts.dropped = (self._tally.counts.dropped or 0) + lost
-            self._tally.events.say("warn", "frame dropped: it was not fetched in time", lost)
+            self._tally.lost("frame dropped: it was not fetched in time", lost)
         if not count:
             return ()
         held = [self._held.popleft() for _ in range(count)]

@@ -123,6 +123,16 @@ class Tally:
         """Give the events the same clock."""
         self.events = EventLog(self.now_ns)
 
+    def lost(self, text: str, count: int, level: str = "warn") -> None:
+        """Count frames that were dropped; a source that can tell has a count, if it is 0.
+
+        Args:
+            text: How one was dropped.
+        """
+        self.counts.dropped = (self.counts.dropped or 0) + count
+        if count:
+            self.events.say(level, text, count)
+
     def malformed(self, text: str, count: int) -> None:
         """Count what could not be read, and say so.
 

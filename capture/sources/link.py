@@ -165,6 +165,8 @@ class _Attempt:
 class LinkedSource:
     """The :class:`.capture.sources.contract.Source` over a link."""
 
+    robot: Robot | None = None
+
     def __init__(
         self,
         address: SourceAddress,
@@ -183,12 +185,13 @@ class LinkedSource:
             facts: What the session's metadata say of it.
             directions: Whether the frames tell sent from received.
         """
+        self.name = address.name
+        self.clock = clock
+        self.facts = facts
         self.directions = directions
-        self._address = address
+        self.finished = False  # it was found that it can never work, or it was stopped
         self._open_link = open_link
         self._place = place
-        self._clock = clock
-        self._facts = dict(facts)
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._backoff = Backoff()
@@ -197,27 +200,6 @@ class LinkedSource:
         self._was_up = False
         self._lost_ns: int | None = None
         self._complaint = ""
-        self._finished = False
-
-    @property
-    def name(self) -> str:
-        """What the session calls it."""
-        return self._address.name
-
-    @property
-    def clock(self) -> ClockDomain:
-        """Whose clock ``t_device_ns`` is on."""
-        return self._clock
-
-    @property
-    def robot(self) -> Robot | None:
-        """None: frames say nothing of the robot."""
-        return None
-
-    @property
-    def facts(self) -> Mapping[str, str]:
-        """Interface, bitrate, whether it is listen-only."""
-        return self._facts
 
     @property
     def counts(self) -> SourceCounts:
@@ -228,11 +210,6 @@ class LinkedSource:
     def connected(self) -> bool:
         """Whether the connection is open."""
         return self._link is not None
-
-    @property
-    def finished(self) -> bool:
-        """Whether it was found that it can never work, or it was stopped."""
-        return self._finished
 
     def start(self, context: SourceContext) -> None:
         """Begin to connect, and wait a moment for what is there to answer.
@@ -247,19 +224,19 @@ class LinkedSource:
             try:
                 self._connect(context.now_ns())
             except SourceError:
-                self._finished = True
+                self.finished = True
                 raise
 
     def poll(self) -> Polled:
         """Take what has come."""
-        if self._finished:
+        if self.finished:
             return Polled((), self._tally.events.flush())
         now = self._tally.now_ns()
         if self._link is None:
             try:
                 self._connect(now)
             except SourceError as error:
-                self._finished = True
+                self.finished = True
                 self._tally.events.say("error", str(error))
         frames = self._read(now)
         for array in frames:
@@ -271,7 +248,7 @@ class LinkedSource:
 
     def stop(self) -> None:
         """End and release everything."""
-        self._finished = True
+        self.finished = True
         if self._attempt is not None:
             self._attempt.abandon()
             self._attempt = None

@@ -109,9 +109,8 @@ class DrainedLink:
 
     def _hold(self, frames: FrameArray) -> None:
         if self._count - self._taken + len(frames) > _MOST_HELD:
-            self._tally.counts.dropped = (self._tally.counts.dropped or 0) + len(frames)
             text = "frame dropped, as the recorder was held up for minutes"
-            self._tally.events.say("error", text, len(frames))
+            self._tally.lost(text, len(frames), "error")
             return
         self._count += len(frames)
         self._held.append(frames)

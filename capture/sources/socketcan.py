@@ -157,8 +157,7 @@ class SocketcanLink:
         if batch.drops is not None and batch.drops != self._drops:
             lost = (batch.drops - self._drops) % 2**32
             self._drops = batch.drops
-            self._tally.counts.dropped = (self._tally.counts.dropped or 0) + lost
-            self._tally.events.say("warn", "frame dropped by the kernel", lost)
+            self._tally.lost("frame dropped by the kernel", lost)
 
 
 def open_socketcan(interface: str, tally: Tally) -> SocketcanLink:

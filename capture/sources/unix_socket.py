@@ -74,6 +74,8 @@ class _Sender:
 class UnixSource:
     """The :class:`.capture.sources.contract.Source` that other processes send to."""
 
+    robot: Robot | None = None
+
     def __init__(
         self, address: SourceAddress, clock: ClockDomain, *, directions: bool = False
     ) -> None:
@@ -84,10 +86,12 @@ class UnixSource:
             clock: Whose clock the senders' ``t_device_ns`` is on.
             directions: Whether the senders tell sent frames from received ones.
         """
+        self.name = address.name
+        self.clock = clock
+        self.facts: Mapping[str, str] = {"interface": "unix", "path": str(Path(address.rest))}
         self.directions = directions
         self._address = address
         self._path = Path(address.rest)
-        self._clock = clock
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._arrivals = ArrivalClock(self._tally.now_ns)
@@ -100,26 +104,6 @@ class UnixSource:
         self._waits_since = 0.0
         self._ending = False
         self._finished = False
-
-    @property
-    def name(self) -> str:
-        """What the session calls it."""
-        return self._address.name
-
-    @property
-    def clock(self) -> ClockDomain:
-        """Whose clock ``t_device_ns`` is on."""
-        return self._clock
-
-    @property
-    def robot(self) -> Robot | None:
-        """None: frames say nothing of the robot."""
-        return None
-
-    @property
-    def facts(self) -> Mapping[str, str]:
-        """Where it listens."""
-        return {"interface": "unix", "path": str(self._path)}
 
     @property
     def counts(self) -> SourceCounts:
@@ -320,9 +304,7 @@ class UnixSource:
         else:
             lost = max(0, sequence - sender.expected, dropped - sender.dropped)
         sender.expected, sender.dropped = sequence + count, dropped
-        self._tally.counts.dropped = (self._tally.counts.dropped or 0) + lost
-        if lost:
-            self._tally.events.say("warn", "frame lost before it reached us", lost)
+        self._tally.lost("frame lost before it reached us", lost)
 
     def _forget(self, sender: _Sender) -> None:
         self._senders.remove(sender)

@@ -368,16 +368,14 @@ def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):
     with pytest.raises(UsageError, match="a ring has no parts"):
         storage.split()
     wait_for(lambda: not ring.waiting, "the marks")
-    storage.tick()
+    ((level, text),) = storage.tick()
     assert storage.size == path.stat().st_size
-    ((level, text),) = storage.take_events()
     assert level == "info"
     assert "run_mark0001.mcap is written: 2 messages" in text
     shutil.rmtree(folder)
     storage.mark()
     wait_for(lambda: not ring.waiting, "the marks")
-    storage.tick()
-    ((level, text),) = storage.take_events()
+    ((level, text),) = storage.tick()
     assert level == "error"
     assert "run_mark0002.mcap" in text
     assert storage.files() == (path,)
