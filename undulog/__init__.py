@@ -18,102 +18,51 @@ if TYPE_CHECKING:
     from undulog.capture.common.errors import MissingExtraError
 
 VERBS: dict[str, tuple[str, str]] = {
-    "record": (
-        "undulog.capture.commands.record:record",
-        "Record a robot, or its twin, into a session.",
-    ),
-    "record status": (
-        "undulog.capture.commands.record_control:status",
-        "Say how the running recordings go.",
-    ),
-    "record mark": (
-        "undulog.capture.commands.record_control:mark",
-        "Mark this moment of the running recording.",
-    ),
-    "record note": (
-        "undulog.capture.commands.record_control:note",
-        "Write a remark into the running recording.",
-    ),
-    "record split": ("undulog.capture.commands.record_control:split", "Have it begin a new part."),
-    "record stop": (
-        "undulog.capture.commands.record_control:stop",
-        "End the running recording in good order.",
-    ),
-    "record unit": (
-        "undulog.capture.commands.record_control:unit",
-        "Print a systemd unit for recordings.",
-    ),
-    "import": (
-        "undulog.capture.commands.import_export:import_log",
-        "Bring in a foreign log: CAN traces, CSV.",
-    ),
-    "log info": ("undulog.capture.commands.log_info:log_info", "Say what a log holds."),
+    "record": ("capture.record:record", "Record a robot, or its twin, into a session."),
+    "record status": ("capture.record_control:status", "Say how the running recordings go."),
+    "record mark": ("capture.record_control:mark", "Mark this moment of the running recording."),
+    "record note": ("capture.record_control:note", "Write a remark into the running recording."),
+    "record split": ("capture.record_control:split", "Have it begin a new part."),
+    "record stop": ("capture.record_control:stop", "End the running recording in good order."),
+    "record unit": ("capture.record_control:unit", "Print a systemd unit for recordings."),
+    "import": ("capture.import_export:import_log", "Bring in a foreign log: CAN traces, CSV."),
+    "log info": ("capture.log_info:log_info", "Say what a log holds."),
     "log check": (
-        "undulog.capture.commands.log_check:log_check",
+        "capture.log_check:log_check",
         "Say whether a session is good, degraded or bad, and why.",
     ),
-    "log recover": (
-        "undulog.capture.commands.log_edit:log_recover",
-        "Write a whole file from what a crash left.",
-    ),
-    "log cut": (
-        "undulog.capture.commands.log_edit:log_cut",
-        "Write a part of a log to a new file.",
-    ),
-    "log merge": (
-        "undulog.capture.commands.log_edit:log_merge",
-        "Put several logs into one new file.",
-    ),
+    "log recover": ("capture.log_edit:log_recover", "Write a whole file from what a crash left."),
+    "log cut": ("capture.log_edit:log_cut", "Write a part of a log to a new file."),
+    "log merge": ("capture.log_edit:log_merge", "Put several logs into one new file."),
     "log export": (
-        "undulog.capture.commands.import_export:export_log",
+        "capture.import_export:export_log",
         "Write frames or joint columns for other tools.",
     ),
-    "sim list": ("undulog.sim.commands.run:list_scenarios", "List the shipped scenarios."),
-    "sim run": ("undulog.sim.commands.run:run", "Simulate a scenario and record it."),
-    "sim fit": (
-        "undulog.replay.commands.fit:fit",
-        "Fit the twin's servo and friction to a session.",
-    ),
-    "sim null": ("undulog.sim.commands.run:null", "Model identical modules, for analyse --null."),
-    "sim serve": ("undulog.sim.commands.serve:serve", "Be a robot on a bus, in real time."),
-    "drive": ("undulog.sim.commands.drive:drive", "Drive a gait, a plan or recorded commands."),
-    "analyse": (
-        "undulog.analysis.commands.analyse:analyse",
-        "Numbers: response, energy, spread over the segments.",
-    ),
+    "sim list": ("sim.run:list_scenarios", "List the shipped scenarios."),
+    "sim run": ("sim.run:run", "Simulate a scenario and record it."),
+    "sim fit": ("replay.fit:fit", "Fit the twin's servo and friction to a session."),
+    "sim null": ("sim.run:null", "Model identical modules, for analyse --null."),
+    "sim serve": ("sim.serve:serve", "Be a robot on a bus, in real time."),
+    "drive": ("sim.drive:drive", "Drive a gait, a plan or recorded commands."),
+    "analyse": ("analysis.analyse:analyse", "Numbers: response, energy, spread over the segments."),
     "predict": (
-        "undulog.analysis.commands.predict:predict",
+        "analysis.predict:predict",
         "From kicks: how oscillators that feel their servos synchronise.",
     ),
-    "compare": (
-        "undulog.analysis.commands.compare:compare",
-        "What differs between two sessions or groups.",
-    ),
+    "compare": ("analysis.compare:compare", "What differs between two sessions or groups."),
     "plan lag-sweep": (
-        "undulog.analysis.commands.plan:lag_sweep",
+        "analysis.plan:lag_sweep",
         "Commands that tell the coupling without contact.",
     ),
-    "plan multisine": (
-        "undulog.analysis.commands.plan:multisine",
-        "The same at several frequencies at once.",
-    ),
-    "plan phase-kicks": (
-        "undulog.analysis.commands.plan:phase_kicks",
-        "Commands that tell the coupling.",
-    ),
-    "plan reversal": (
-        "undulog.analysis.commands.plan:reversal",
-        "Commands that tell boundary from module.",
-    ),
-    "report": ("undulog.analysis.commands.report:report", "The offline report, one HTML page."),
-    "replay": (
-        "undulog.replay.commands.replay:replay",
-        "Run a recorded experiment again in the twin; compare.",
-    ),
-    "view": ("undulog.replay.commands.view:view", "See a session in Rerun."),
-    "info": ("undulog.capture.commands.info:info", "Versions and extras, for a bug report."),
+    "plan multisine": ("analysis.plan:multisine", "The same at several frequencies at once."),
+    "plan phase-kicks": ("analysis.plan:phase_kicks", "Commands that tell the coupling."),
+    "plan reversal": ("analysis.plan:reversal", "Commands that tell boundary from module."),
+    "report": ("analysis.report:report", "The offline report, one HTML page."),
+    "replay": ("replay.replay:replay", "Run a recorded experiment again in the twin; compare."),
+    "view": ("replay.view:view", "See a session in Rerun."),
+    "info": ("capture.info:info", "Versions and extras, for a bug report."),
 }
-"""Command to the function behind it and its line in the list of commands."""
+"""Command to the function behind it, in its package's folder ``commands``, and its summary."""
 
 _GROUPS = {
     "plan": "Write the commands of an experiment around a recorded gait.",
@@ -175,8 +124,16 @@ def build(arguments: Sequence[str] = ()) -> App:
         *group, name = verb.split()
         asked = list(arguments[: len(group) + 1]) == [*group, name]
         parent = groups[group[0]] if group else app
-        parent.command(target, name=name, help=None if asked else summary, help_epilogue="")
+        parent.command(
+            _in_commands(target), name=name, help=None if asked else summary, help_epilogue=""
+        )
     return app
+
+
+def _in_commands(target: str) -> str:
+    """The full path of a function: a package's commands are in its folder ``commands``."""
+    package, function = target.split(".")
+    return f"undulog.{package}.commands.{function}"
 
 
 def _group(name: str, arguments: Sequence[str]) -> App:
@@ -190,7 +147,7 @@ def _group(name: str, arguments: Sequence[str]) -> App:
     if name not in VERBS or list(arguments[:1]) != [name]:
         summary = VERBS[name][1] if name in VERBS else _GROUPS[name]
         return App(name=name, help=summary, help_epilogue="")
-    module, function = VERBS[name][0].split(":")
+    module, function = _in_commands(VERBS[name][0]).split(":")
     group = App(name=name, help_epilogue="")
     group.default(getattr(import_module(module), function))
     return group

@@ -110,6 +110,12 @@ class Fault:
         return f"{self.key}: found {self.found}; valid: {self.valid}"
 
 
+def _listing(faults: Sequence[Fault], place: str) -> str:
+    count = len(faults)
+    head = f"{count} fault{'s' if count != 1 else ''} in {place}"
+    return "\n".join([head, *(f"  {fault}" for fault in faults)])
+
+
 class FaultyFileError(UndulogError, ValueError):
     """A description file with faults; the message lists them all."""
 
@@ -123,9 +129,7 @@ class FaultyFileError(UndulogError, ValueError):
         """
         self.path = Path(path)
         self.faults: tuple[Fault, ...] = tuple(faults)
-        count = len(self.faults)
-        head = f"{path}: {count} fault{'s' if count != 1 else ''} in this {self.kind}"
-        super().__init__("\n".join([head, *(f"  {fault}" for fault in self.faults)]))
+        super().__init__(f"{path}: {_listing(self.faults, f'this {self.kind}')}")
 
 
 class RobotFileError(FaultyFileError):
@@ -163,9 +167,7 @@ class SettingsError(UsageError):
                 ``UNDULOG_RECORD_RING`` or ``snake.toml: record.ring``.
         """
         self.faults: tuple[Fault, ...] = tuple(faults)
-        count = len(self.faults)
-        head = f"{count} fault{'s' if count != 1 else ''} in the settings of this recording"
-        super().__init__("\n".join([head, *(f"  {fault}" for fault in self.faults)]))
+        super().__init__(_listing(self.faults, "the settings of this recording"))
 
 
 class SimulationError(UndulogError, ArithmeticError):

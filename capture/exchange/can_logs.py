@@ -44,6 +44,7 @@ from ..log.messages.frames import (
     EXTENDED_FLAG,
     FD_BRS,
     FD_ESI,
+    ID_MASK,
     REMOTE_FLAG,
 )
 from .candump import read_candump
@@ -146,7 +147,6 @@ _MOST_TEXTS = 20  # different warnings of a library that are told
 _LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
 _WITHOUT_DIRECTIONS = (".csv", ".db")
 _LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
-_HIGHEST_ID = 0x1FFF_FFFF
 _MOST_BYTES = 64
 
 
@@ -362,7 +362,7 @@ class _Odd:
             isinstance(time, int | float)
             and -_LATEST_S < time < _LATEST_S
             and isinstance(identifier, int)
-            and 0 <= identifier <= _HIGHEST_ID
+            and 0 <= identifier <= ID_MASK
             and isinstance(code, int)
             and 0 <= code <= _MOST_BYTES
             and isinstance(record.data, bytes | bytearray | memoryview)

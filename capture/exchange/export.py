@@ -20,7 +20,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -171,23 +171,11 @@ class RowBlock:
 WriteRows = Callable[[RowBlock], None]
 
 
-class TableFormat(Protocol):
-    """One format of tables."""
+TableFormat = Callable[[Path, Sequence[str]], AbstractContextManager[WriteRows]]
+"""Creates a table with columns of those names; a ``with`` block around what writes rows.
 
-    def __call__(self, path: Path, columns: Sequence[str]) -> AbstractContextManager[WriteRows]:
-        """Create a table.
-
-        Args:
-            columns: Names of the quantities' columns.
-
-        Returns:
-            A ``with`` block around what writes rows.
-
-        Raises:
-            OSError: If it can't be written.
-            MissingExtraError: If a package for it is not installed.
-        """
-        ...
+It raises OSError if the table can't be written, MissingExtraError if a package for it is missing.
+"""
 
 
 def export_columns(

@@ -117,12 +117,10 @@ class BusRecorder:
         self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
         self._raw_fd: FrameChannel | None = None
         self._clock = clock
-        self._decoder = BusDecoder(robot, directions=directions) if robot is not None else None
-        self._topics = (
-            DecodedTopics(writer, robot, self._decoder)
-            if robot is not None and self._decoder is not None
-            else None
-        )
+        self._decoder = self._topics = None
+        if robot is not None:
+            self._decoder = BusDecoder(robot, directions=directions)
+            self._topics = DecodedTopics(writer, robot, self._decoder)
         self._fresh: list[FrameArray] = []
         self._waiting: deque[FrameArray] = deque()
         self._again: deque[FrameArray] = deque()  # pieces of a slice that failed

@@ -183,7 +183,6 @@ class LiveFeed:
         max_messages: int = 4096,
         max_bytes: int = 2 << 20,
         max_rate_hz: float = 200.0,
-        raw_frames: bool = False,
     ) -> None:
         """Remember where the relay will be; it may come, go and come again.
 
@@ -193,12 +192,11 @@ class LiveFeed:
             max_bytes: How many bytes wait at most, beside one datagram.
             max_rate_hz: Most messages a second that are sent of a channel of samples; events are
                 never left out.
-            raw_frames: Whether raw frames, ``/can/...``, are sent too.
         """
         self.path = Path(path)
         self.counts = LiveCounts()
         self._max_messages, self._max_bytes = max_messages, max_bytes
-        self._words = LiveDefinitions(period_ns=round(1e9 / max_rate_hz), raw_frames=raw_frames)
+        self._words = LiveDefinitions(round(1e9 / max_rate_hz))
         self._feed_id = int.from_bytes(os.urandom(8), "little")
         self._socket: socket.socket | None = None
         self._periods = self._words.periods

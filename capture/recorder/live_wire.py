@@ -207,18 +207,17 @@ Queued = tuple[int, int, int, int, int, bytes]
 class LiveDefinitions:
     """Definitions, and the last messages of topics that speak only on change."""
 
-    def __init__(self, *, period_ns: int, raw_frames: bool) -> None:
+    def __init__(self, period_ns: int) -> None:
         """Know nothing yet.
 
         Args:
             period_ns: Least time between two messages of a channel of samples [ns].
-            raw_frames: Whether raw frames, ``/can/...``, are shown.
         """
         self.periods: dict[int, int] = {}
-        """Channels that are shown, and the least time between their messages [ns]; 0 for any."""
+        """Channels that are shown, and the least time between messages [ns], 0 for any."""
         self.states: dict[int, Queued | LiveMessage | None] = {}
         """Channels whose last message holds, and that message."""
-        self._period_ns, self._raw_frames = period_ns, raw_frames
+        self._period_ns = period_ns
         self._schemas: dict[int, str] = {}
         self._packed: dict[tuple[str, object], bytes] = {}
 
@@ -246,9 +245,7 @@ class LiveDefinitions:
         self._packed[key] = packed
         if isinstance(record, Schema):
             self._schemas[record.id] = record.name
-        elif isinstance(record, Channel) and (
-            self._raw_frames or not record.topic.startswith(FRAME_TOPIC_PREFIXES)
-        ):
+        elif isinstance(record, Channel) and not record.topic.startswith(FRAME_TOPIC_PREFIXES):
             kind = self._schemas.get(record.schema_id)
             self.periods[record.id] = self._period_ns if kind in _STREAMS else 0
             if kind in _STATES:

@@ -10,7 +10,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +31,6 @@ from .settings import RecordSettings
 from .status import EventLine, RecorderSnapshot, SessionClock, statuses
 from .storage import TappedSink, open_storage
 from .systemd import Notifier
-
-
-def machine_facts() -> Mapping[str, str]:
-    """Host, kernel and versions, for the session's metadata."""
-    system = platform.uname()
-    return {
-        "host": system.node,
-        "kernel": f"{system.system} {system.release} {system.machine}",
-        "python": platform.python_version(),
-    }
 
 
 def free_space(path: Path) -> int:
@@ -84,7 +74,7 @@ class RecordReport:
     reasons: tuple[str, ...]
     ending: Ending
     sources: Mapping[str, Mapping[str, Any]]
-    recorder: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    recorder: Mapping[str, Any]
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON."""
@@ -182,7 +172,7 @@ class Recording:
                 each_tick=(self._each_tick,),
                 each_second=(self._look, self._diagnose, self._tell, self._look_at_disk),
             )
-            self._recorder.on_event(lambda *event: self._events.append(EventLine(*event)))
+            self._recorder.on_event(self._note_event)
             log = OperatorLog(self._writer, self._recorder.say, self._clock.now_ns)
             self._control.serve(request_handler(self, log))
             opened.pop_all()
@@ -319,6 +309,9 @@ class Recording:
                 failed=True,
             )
 
+    def _note_event(self, t_ns: int, level: str, name: str, text: str) -> None:
+        self._events.append(EventLine(t_ns, level, name, text))
+
     # -- the end -----------------------------------------------------------------------------
 
     def _recorded(self) -> Ending:
@@ -378,7 +371,12 @@ class Recording:
     # -- facts -------------------------------------------------------------------------------
 
     def _facts(self) -> dict[str, str]:
-        facts = dict(machine_facts())
+        system = platform.uname()
+        facts = {
+            "host": system.node,
+            "kernel": f"{system.system} {system.release} {system.machine}",
+            "python": platform.python_version(),
+        }
         for key in ("operator", "notes"):
             if value := getattr(self._settings, key):
                 facts[key] = value

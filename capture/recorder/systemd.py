@@ -85,13 +85,10 @@ class Notifier:
             self._next_beat_ns = now_ns + int(self.watchdog_ns * _WATCHDOG_PART)
             self._send("WATCHDOG=1")
 
-    def stopping(self, status: str = "") -> None:
-        """Say that the recording ends.
-
-        Args:
-            status: One sentence for ``systemctl status``.
-        """
-        self._send("STOPPING=1", *self._status_line(status))
+    def stopping(self) -> None:
+        """Say that the recording ends."""
+        self._status = ""
+        self._send("STOPPING=1")
 
     def close(self) -> None:
         """Release the socket; nothing is sent any more. Safe to call twice."""

@@ -114,7 +114,7 @@ class PythonCanLink:
         fd = [pair for pair in held if _is_fd(pair[1])] if len(classic) < count else []
         return (
             frames_of(classic, device_time=self._device_time),
-            fd_frames_of(fd, device_time=self._device_time),
+            frames_of(fd, device_time=self._device_time, fd=True),
         )
 
     def close(self) -> None:
@@ -148,41 +148,26 @@ def _is_fd(message: can.Message) -> bool:
     return (message.is_fd or len(message.data) > 8) and not message.is_error_frame
 
 
-def frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:
-    """Turn python-can's messages of classic frames into frames.
+def frames_of(
+    messages: Sequence[tuple[int, can.Message]], *, device_time: bool, fd: bool = False
+) -> FrameArray:
+    """Turn python-can's messages of one kind, classic or CAN FD, into frames.
 
     Args:
-        messages: Arrival [Unix ns] and message, of at most 8 bytes.
+        messages: Arrival [Unix ns] and message, of at most 8 bytes, with ``fd`` 64.
         device_time: Whether to take the messages' times, to the microsecond, as the device's; those
             that are negative, not finite or out of range are replaced by the arrival's.
     """
-    frames = empty_frames(len(messages))
-    _fill(frames, messages, device_time=device_time)
-    frames["dlc"] = [m.dlc for _, m in messages]
-    return frames
-
-
-def fd_frames_of(messages: Sequence[tuple[int, can.Message]], *, device_time: bool) -> FrameArray:
-    """Turn python-can's messages of CAN FD frames into frames.
-
-    Args:
-        messages: Arrival [Unix ns] and message, of at most 64 bytes.
-        device_time: Whether to take the messages' times, to the microsecond, as the device's.
-    """
-    frames = empty_fd_frames(len(messages))
-    _fill(frames, messages, device_time=device_time)
-    frames["len"] = [len(m.data) for _, m in messages]
-    frames["fd_flags"] = [
-        (FD_BRS if m.bitrate_switch else 0) | (FD_ESI if m.error_state_indicator else 0)
-        for _, m in messages
-    ]
-    return frames
-
-
-def _fill(
-    frames: FrameArray, messages: Sequence[tuple[int, can.Message]], *, device_time: bool
-) -> None:
-    """What both kinds have."""
+    if fd:
+        frames = empty_fd_frames(len(messages))
+        frames["len"] = [len(m.data) for _, m in messages]
+        frames["fd_flags"] = [
+            (FD_BRS if m.bitrate_switch else 0) | (FD_ESI if m.error_state_indicator else 0)
+            for _, m in messages
+        ]
+    else:
+        frames = empty_frames(len(messages))
+        frames["dlc"] = [m.dlc for _, m in messages]
     host = np.array([t_ns for t_ns, _ in messages], dtype=np.uint64)
     frames["t_host_ns"] = host
     frames["t_device_ns"] = host
@@ -202,6 +187,7 @@ def _fill(
     cells = frames["data"]
     data = b"".join(bytes(m.data).ljust(cells.shape[1], b"\0") for _, m in messages)
     frames["data"] = np.frombuffer(data, dtype=np.uint8).reshape(cells.shape)
+    return frames
 
 
 def failure(error: Exception) -> OSError:
@@ -236,42 +222,6 @@ def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) ->
     except Exception as error:  # python-can's own fault, e.g. a name that its driver should bring
         kind = type(error).__name__
         raise SourceError(text, f"python-can can't open it: {kind}: {error}") from error
-
-
-def python_can_source(
-    address: SourceAddress,
-    interface: str,
-    options: Mapping[str, object],
-    facts: Mapping[str, str],
-    *,
-    device_time: bool,
-    detail: str,
-) -> LinkedSource:
-    """Make the source of a python-can interface.
-
-    Args:
-        interface: E.g. ``pcan``; one that is known.
-        options: What to give it, the channel among them.
-        facts: For the session's metadata.
-        device_time: Whether its messages' times are the device's.
-        detail: What is worth telling of it.
-
-    Returns:
-        The source; nothing is opened.
-
-    Raises:
-        SourceError: If what it needs is not installed.
-    """
-    bus = bus_class(address.text, interface)
-    return LinkedSource(
-        address,
-        lambda tally: PythonCanLink(
-            open_bus(address.text, bus, options), tally, device_time=device_time, detail=detail
-        ),
-        place=f"{interface} {options['channel']}",
-        clock=ClockDomain.DEVICE if device_time else ClockDomain.HOST,
-        facts=facts,
-    )
 
 
 LISTEN_ONLY: Mapping[str, Mapping[str, object]] = {
@@ -424,8 +374,14 @@ def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
         facts = _facts(interface, channel, listen_only)
     facts |= given
     device_time = flag(address, "device_time", default=interface in DEVICE_TIME)
-    return python_can_source(
-        address, interface, options, facts, device_time=device_time, detail=detail
+    return LinkedSource(
+        address,
+        lambda tally: PythonCanLink(
+            open_bus(address.text, bus, options), tally, device_time=device_time, detail=detail
+        ),
+        place=f"{interface} {options['channel']}",
+        clock=ClockDomain.DEVICE if device_time else ClockDomain.HOST,
+        facts=facts,
     )
 
 

@@ -35,6 +35,7 @@ from ..log.messages.frames import (
     EXTENDED_FLAG,
     FD_BRS,
     FRAME_DTYPE,
+    ID_MASK,
     REMOTE_FLAG,
     FrameArray,
     empty_fd_frames,
@@ -59,7 +60,6 @@ _FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _ANSWERS = "zZVvNF"  # acknowledged, version, serial number, status
 _LONGEST = 200  # a CAN FD frame with 64 bytes has 142
 _HIGHEST_STANDARD = 0x7FF
-_HIGHEST_EXTENDED = 0x1FFF_FFFF
 _NS_PER_MS = 1_000_000
 
 
@@ -111,7 +111,7 @@ class SlcanText:
         length = _FD_LENGTHS[int(digit, 16)]
         digits = 2 * length
         if kind in "TRxDB":
-            if flags > _HIGHEST_EXTENDED:
+            if flags > ID_MASK:
                 return None
             flags |= EXTENDED_FLAG
         elif flags > _HIGHEST_STANDARD:

@@ -14,7 +14,6 @@ import struct
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.errors import SourceError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
@@ -49,55 +48,31 @@ _MOST_BATCHES = 64
 _PAUSE_S = 0.005  # the kernel has the times
 
 
-def frames_of(batch: Batch, times_ns: Sequence[int]) -> FrameArray:
-    """Turn the kernel's frames into ours.
+def frames_of(batch: Batch, times_ns: Sequence[int], *, fd: bool = False) -> FrameArray:
+    """Turn the kernel's frames of one kind, classic or CAN FD, into ours.
 
     Args:
-        batch: Packets of a raw CAN socket; those that aren't classic frames are left out.
+        batch: Packets of a raw CAN socket; those of another kind are left out.
         times_ns: Their arrival [Unix ns].
 
     Returns:
-        The classic frames; device and host time are both the arrival.
+        The frames; device and host time are both the arrival.
     """
-    rows = [row for row, size in enumerate(batch.sizes) if size == CAN_MTU]
-    raw = batch.packets[rows, :CAN_MTU].view(_CAN_FRAME)[:, 0]
-    frames = empty_frames(len(rows))
-    frames["dlc"] = raw["len"]
-    _fill(frames, raw, batch, times_ns, rows)
-    return frames
-
-
-def fd_frames_of(batch: Batch, times_ns: Sequence[int]) -> FrameArray:
-    """Turn the kernel's CAN FD frames into ours.
-
-    Args:
-        batch: Packets of a raw CAN socket; those that aren't CAN FD frames are left out.
-        times_ns: Their arrival [Unix ns].
-
-    Returns:
-        The CAN FD frames; device and host time are both the arrival.
-    """
-    rows = [row for row, size in enumerate(batch.sizes) if size == CANFD_MTU]
-    raw = batch.packets[rows, :CANFD_MTU].view(_CANFD_FRAME)[:, 0]
-    frames = empty_fd_frames(len(rows))
-    frames["len"], frames["fd_flags"] = raw["len"], raw["flags"]
-    _fill(frames, raw, batch, times_ns, rows)
-    return frames
-
-
-def _fill(
-    frames: FrameArray,
-    raw: NDArray[np.void],
-    batch: Batch,
-    times_ns: Sequence[int],
-    rows: Sequence[int],
-) -> None:
-    """What both kinds have."""
+    mtu, layout = (CANFD_MTU, _CANFD_FRAME) if fd else (CAN_MTU, _CAN_FRAME)
+    rows = [row for row, size in enumerate(batch.sizes) if size == mtu]
+    raw = batch.packets[rows, :mtu].view(layout)[:, 0]
+    if fd:
+        frames = empty_fd_frames(len(rows))
+        frames["len"], frames["fd_flags"] = raw["len"], raw["flags"]
+    else:
+        frames = empty_frames(len(rows))
+        frames["dlc"] = raw["len"]
     frames["t_device_ns"] = frames["t_host_ns"] = [times_ns[row] for row in rows]
     frames["id_flags"] = raw["id"]
     local = socket.MSG_DONTROUTE
     frames["dir"] = [DIR_TX if batch.flags[row] & local else DIR_RX for row in rows]
     frames["data"] = raw["data"]
+    return frames
 
 
 class SocketcanLink:
@@ -132,7 +107,7 @@ class SocketcanLink:
                 self._floor_ns = times[-1]
                 found.append(frames_of(batch, times))
                 if CANFD_MTU in batch.sizes:
-                    found.append(fd_frames_of(batch, times))
+                    found.append(frames_of(batch, times, fd=True))
                 self._count(batch)
             else:
                 self._floor_ns = looked_ns

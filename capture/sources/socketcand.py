@@ -48,7 +48,6 @@ _WORD = re.compile(r"< *(hi|ok|echo) *>")
 _TOLD = re.compile(r"< *(error\b[^>]*?) *>")
 _LONGEST = 400  # a CAN FD frame with 64 bytes and blanks has about 220
 _HIGHEST_STANDARD = 0x7FF
-_HIGHEST_EXTENDED = 0x1FFF_FFFF
 
 
 class SocketcandText:
@@ -108,7 +107,7 @@ def _together(found: list[tuple[str, str, str, str]]) -> list[bytes] | None:
     for digits, seconds, micros, field in found:
         flags = int(digits, 16)
         if len(digits) > 3:
-            if flags > _HIGHEST_EXTENDED:
+            if flags > ID_MASK:
                 return None
             flags |= EXTENDED_FLAG
         elif flags > _HIGHEST_STANDARD:
@@ -159,7 +158,7 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     if length > 8 and kind == "frame":
         tally.events.say("warn", "CAN FD frame left out")
         return None
-    highest = _HIGHEST_EXTENDED if extended else _HIGHEST_STANDARD
+    highest = ID_MASK if extended else _HIGHEST_STANDARD
     if data is None or not 0 <= length <= 8 or identifier > highest:
         tally.malformed("malformed message", 1)
         return None

@@ -22,7 +22,6 @@ from undulog.capture.sources.can import (
     NO_CONTROLLER,
     bus_class,
     failure,
-    fd_frames_of,
     frames_of,
     known_options,
     open_can,
@@ -142,7 +141,7 @@ def test_can_fd_frames(bus, listen, traffic, fd_traffic, same) -> None:
 
 def test_a_driver_that_does_not_say_can_fd(same) -> None:
     """Eight bytes fit a classic frame, more don't, whatever the driver calls it."""
-    link_frames = fd_frames_of([(7, can.Message(data=range(12)))], device_time=False)
+    link_frames = frames_of([(7, can.Message(data=range(12)))], device_time=False, fd=True)
     assert (link_frames["len"][0], link_frames["data"][0].tolist()) == (
         12,
         [*range(12), *[0] * 52],
