@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import undulog
+from support.written_frames import T0, imported, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.process import StopRequest
@@ -41,7 +42,7 @@ from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext
 
 S = 1_000_000_000
-T0 = 1_700_000_003_250_000_000
+FD = "/can_fd/can0"
 FIELDS = ("t_host_ns", "id_flags", "len", "dir", "fd_flags", "data")
 
 
@@ -73,23 +74,6 @@ def classic_frames(count, start_ns, step_ns):
     return frames
 
 
-def write_session(path, topics, batch=37):
-    """``topics``: topic to frames, classic or CAN FD by its name."""
-    with SessionWriter(path, session_id="s-1", epoch_ns=T0) as writer:
-        messages = [
-            (int(frames["t_host_ns"][start : start + batch].max()), topic, start)
-            for topic, frames in topics.items()
-            for start in range(0, len(frames), batch)
-        ]
-        channels = {
-            topic: writer.fd_frames(topic) if "_fd/" in topic else writer.frames(topic)
-            for topic in topics
-        }
-        for log_ns, topic, start in sorted(messages):
-            channels[topic].write(log_ns, topics[topic][start : start + batch])
-    return path
-
-
 def same(found, expected, fields=FIELDS):
     for name in fields:
         np.testing.assert_array_equal(found[name], expected[name], name)
@@ -118,7 +102,7 @@ def test_what_is_written_is_read_the_same(data, tmp_path_factory):
 
 def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
     frames = every_kind()[:5]
-    path = write_session(tmp_path / "x.mcap", {"/can_fd/can0": frames})
+    path = write_frames(tmp_path / "x.mcap", {"/can_fd/can0": frames})
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         ((_, channel, _, message),) = reader.iter_decoded_messages()
@@ -144,7 +128,7 @@ def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
 def test_the_kinds_are_not_mixed_up(tmp_path: Path):
     # 4 CAN FD frames have as many bytes as 11 classic ones: the label tells them apart.
     topics = {"/can_fd/can0": every_kind()[:4], "/can/can0_fd": classic_frames(11, T0, 1000)}
-    path = write_session(tmp_path / "x.mcap", topics)
+    path = write_frames(tmp_path / "x.mcap", topics)
     with Session.open(path) as session:
         with pytest.raises(DataError, match="/can_fd/can0 does not hold frames of 32 bytes"):
             session.frames("/can_fd/can0")
@@ -163,7 +147,7 @@ def test_the_check_counts_them(tmp_path: Path, capsys):
     classic = classic_frames(200, T0, 10_000_000)
     classic["t_host_ns"][100:] += 3 * S
     fd = every_kind(step_ns=10_000_000)
-    path = write_session(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
+    path = write_frames(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
     health = check_session(path)
     assert {bus.topic: bus.frames for bus in health.buses} == {
         "/can/can0": 200,
@@ -173,7 +157,7 @@ def test_the_check_counts_them(tmp_path: Path, capsys):
     assert rate["/can_fd/can0"] == pytest.approx(100)
     assert not [finding for finding in health.findings if "silent" in finding.sentence]
     assert not [finding for finding in health.findings if "can't be read" in finding.sentence]
-    alone = write_session(tmp_path / "y.mcap", {"/can/can0": classic, "/can_fd/can1": fd})
+    alone = write_frames(tmp_path / "y.mcap", {"/can/can0": classic, "/can_fd/can1": fd})
     sentences = [finding.sentence for finding in check_session(alone).findings]
     (silence,) = (sentence for sentence in sentences if "silent" in sentence)
     assert silence.startswith("/can/can0: silent for 3.01 s, at ")
@@ -186,18 +170,11 @@ def test_the_check_counts_them(tmp_path: Path, capsys):
 # -- other tools ---------------------------------------------------------------------------
 
 
-def imported(trace, folder, topic="/can_fd/can0"):
-    run = folder / "back.mcap"
-    report = import_can(trace, run, load_robot("snake13"), force=True)
-    with Session.open(run) as session:
-        return report, session.fd_frames(topic)
-
-
 @pytest.fixture(scope="module")
 def session_of_every_kind(tmp_path_factory):
     frames = every_kind()
     folder = tmp_path_factory.mktemp("kinds")
-    return write_session(folder / "run.mcap", {"/can_fd/can0": frames}), frames
+    return write_frames(folder / "run.mcap", {"/can_fd/can0": frames}), frames
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
@@ -205,7 +182,7 @@ def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path:
     source, frames = session_of_every_kind
     report = export_log(source, tmp_path / f"x{suffix}")
     assert (report.buses, report.warnings) == ({"can0": len(frames)}, [])
-    _, back = imported(tmp_path / f"x{suffix}", tmp_path)
+    _, back = imported(tmp_path / f"x{suffix}", tmp_path, FD)
     expected = frames.copy()
     if suffix == ".asc":  # without the date
         expected["t_host_ns"] -= np.uint64(T0 // S * S - RELATIVE_EPOCH_NS)
@@ -266,7 +243,7 @@ def test_logs_of_python_can(suffix, tmp_path: Path):
     with can.Logger(str(source)) as writer:
         for message in messages:
             writer(message)
-    report, frames = imported(source, tmp_path)
+    report, frames = imported(source, tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
     assert (report.frames, report.problems) == (
         len(messages),
@@ -299,7 +276,7 @@ def test_an_mf4_of_python_can(tmp_path: Path):
     with can.MF4Writer(tmp_path / "x.mf4") as writer:
         for message in messages:
             writer(message)
-    report, frames = imported(tmp_path / "x.mf4", tmp_path)
+    report, frames = imported(tmp_path / "x.mf4", tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
     assert report.frames == len(messages)
     same(frames, records_of(fd), [name for name in FIELDS if name != "t_host_ns"])
@@ -340,7 +317,7 @@ def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
     with can.Logger(str(tmp_path / "x.csv")) as writer:
         for message in some_messages():
             writer(message)
-    report, frames = imported(tmp_path / "x.csv", tmp_path, "/can_fd/can0")
+    report, frames = imported(tmp_path / "x.csv", tmp_path, FD)
     long = [message for message in some_messages() if len(message.data) > 8]
     assert report.problems[0] == (
         f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log does not mark them, "
@@ -371,7 +348,7 @@ def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
 def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
     frames = every_kind()
     topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
-    source = write_session(tmp_path / "run.mcap", topics)
+    source = write_frames(tmp_path / "run.mcap", topics)
     report = export_log(source, tmp_path / "x.mcap")
     assert report.buses == {"can0": 50}
     left_out = f"{len(frames)} CAN FD frames left out: the format has 8 bytes a frame"
@@ -384,7 +361,7 @@ def test_what_a_format_loses_is_counted(tmp_path: Path):
     frames = every_kind(start_ns=T0 + 7)[:10]
     frames["id_flags"][:3] |= REMOTE_FLAG  # there is no such thing in CAN FD
     frames["t_device_ns"] = frames["t_host_ns"] + 5
-    source = write_session(tmp_path / "run.mcap", {"/can_fd/can0": frames})
+    source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0": frames})
     assert export_log(source, tmp_path / "x.asc").warnings == [
         "3 CAN FD frames lose their flags",
         "10 CAN FD frames lose their time below 1 us",

@@ -16,7 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import undulog
 from support.paths import TRACE as RECORDING
-from undulog.capture import Session, SessionWriter, load_robot
+from support.written_frames import T0, imported, write_frames
+from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange.can_import import import_can
@@ -33,7 +34,6 @@ from undulog.capture.log.messages.frames import (
 )
 
 S = 1_000_000_000
-T0 = 1_700_000_003_250_000_000
 CAN_MSGS_FRAME = (
     "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\n"
     "uint8 dlc\nuint8[8] data\n"
@@ -63,24 +63,9 @@ def every_kind(step_ns=1_000_000, start_ns=T0):
     return frames
 
 
-def write_session(path, frames_of_bus, batch=37, **metadata):
-    with SessionWriter(path, session_id="s-1", epoch_ns=T0, metadata=metadata) as writer:
-        messages = [
-            (int(frames["t_host_ns"][start : start + batch].max()), bus, frames, start)
-            for bus, frames in frames_of_bus.items()
-            for start in range(0, len(frames), batch)
-        ]
-        channels = {bus: writer.frames(f"/can/{bus}") for bus in frames_of_bus}
-        for log_ns, bus, frames, start in sorted(messages, key=lambda message: message[0]):
-            channels[bus].write(log_ns, frames[start : start + batch])
-    return path
-
-
-def imported(trace, folder, bus="can0"):
-    run = folder / "back.mcap"
-    import_can(trace, run, load_robot("snake13"), force=True)
-    with Session.open(run) as session:
-        return session.frames(f"/can/{bus}")
+def write_session(path, frames_of_bus, **options):
+    topics = {f"/can/{bus}": frames for bus, frames in frames_of_bus.items()}
+    return write_frames(path, topics, **options)
 
 
 def masks(frames):
@@ -119,7 +104,7 @@ def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path:
     source, frames = session_of_every_kind
     report = export_log(source, tmp_path / f"x{suffix}")
     assert report.buses == {"can0": len(frames)}
-    back = imported(tmp_path / f"x{suffix}", tmp_path)
+    back = imported(tmp_path / f"x{suffix}", tmp_path)[1]
     error, other = masks(frames)
     for name in ("id_flags", "dlc", "data", "dir"):
         assert back[name][other].tolist() == frames[name][other].tolist()
@@ -194,7 +179,9 @@ def test_asc_rounds_to_microseconds_and_says_so(tmp_path: Path):
     frames = frames[~masks(frames)[0]]
     source = write_session(tmp_path / "run.mcap", {"can0": frames})
     report = export_log(source, tmp_path / "x.asc")
-    back = imported(tmp_path / "x.asc", tmp_path)["t_host_ns"] + (T0 // S * S - RELATIVE_EPOCH_NS)
+    back = imported(tmp_path / "x.asc", tmp_path)[1]["t_host_ns"] + (
+        T0 // S * S - RELATIVE_EPOCH_NS
+    )
     difference = back.astype(np.int64) - frames["t_host_ns"].astype(np.int64)
     assert abs(difference).max() <= 500
     remote = (frames["id_flags"] & REMOTE_FLAG) != 0
@@ -221,7 +208,7 @@ def test_what_no_format_but_candump_has_is_counted(tmp_path: Path):
     assert " can0 005#0000000000000000_B R\n" in (tmp_path / "x.log").read_text()
     report = export_log(source, tmp_path / "x.blf")
     assert report.warnings == [device]
-    assert imported(tmp_path / "x.blf", tmp_path)["dlc"].tolist() == [11, 8, 8]
+    assert imported(tmp_path / "x.blf", tmp_path)[1]["dlc"].tolist() == [11, 8, 8]
     report = export_log(source, tmp_path / "x.asc")
     assert report.warnings == ["1 data frame loses its length code", device]
 
@@ -303,7 +290,7 @@ def test_a_trace_without_a_date(tmp_path: Path):
     assert report.warnings[0] == (
         "its dates begin in 1990: the times are those since 1970, without a date"
     )
-    back = imported(tmp_path / "x.blf", tmp_path)["t_host_ns"] - RELATIVE_EPOCH_NS
+    back = imported(tmp_path / "x.blf", tmp_path)[1]["t_host_ns"] - RELATIVE_EPOCH_NS
     assert back.tolist() == frames["t_host_ns"].tolist()
 
 
@@ -329,7 +316,7 @@ def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
         times = [line.split()[0] for line in (tmp_path / "parts.log").read_text().splitlines()]
         assert times == sorted(times)
     for bus, frames in buses.items() if suffix != ".mcap" else ():
-        back = imported(tmp_path / f"parts{suffix}", tmp_path, bus)
+        back = imported(tmp_path / f"parts{suffix}", tmp_path, f"/can/{bus}")[1]
         keep = masks(frames)[1]
         for name in ("id_flags", "dlc", "data", "dir"):
             assert back[name][keep].tolist() == frames[name][keep].tolist()
@@ -353,7 +340,7 @@ def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
     path, frames = arcsnake
     report = export_log(path, tmp_path / f"x{suffix}")
     assert (report.buses, report.warnings) == ({"can0": 19_297}, [])
-    back = imported(tmp_path / f"x{suffix}", tmp_path)
+    back = imported(tmp_path / f"x{suffix}", tmp_path)[1]
     for name in ("id_flags", "dlc", "data", "dir"):
         np.testing.assert_array_equal(back[name], frames[name])
     start_ns = int(frames["t_host_ns"][0]) // S * S - RELATIVE_EPOCH_NS if suffix == ".asc" else 0
