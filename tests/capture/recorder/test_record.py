@@ -8,15 +8,14 @@ import socket
 import subprocess
 import threading
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support import processes
 from support.paths import ROOT
-from support.processes import UNDULOG, run, wait_for
+from support.processes import run, wait_for
+from support.recorders import command, events, recording, send
 from undulog.capture import Session, load_robot
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.health.session_check import check_session
@@ -26,27 +25,6 @@ from undulog.capture.recorder.recording import Recording
 from undulog.capture.recorder.settings import resolve
 
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
-
-
-def command(output, *arguments):
-    control = output.with_name("control.sock")
-    return [*UNDULOG, "record", *arguments, "-o", str(output), "--socket", str(control)]
-
-
-@contextmanager
-def recording(output, *arguments, env=None, floor="0"):
-    """A recorder in another process; it is running when the block begins."""
-    process = processes.start(
-        *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
-    )
-    try:
-        control = output.with_name("control.sock")
-        wait_for(lambda: control.exists() or process.poll() is not None, "the recorder")
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
 
 
 def ask(output, **request):
@@ -68,11 +46,6 @@ def ended(process):
     return json.loads(out) if out else None, err
 
 
-def events(path):
-    with Session.open(path) as session:
-        return [(message.name, message.msg) for _, message in session.messages("/rosout")]
-
-
 def polling(cycles, period_ns=10_000_000):
     """Frames of a polling cycle of the shipped robot: each servo's command, then its answer."""
     robot = load_robot("snake25")
@@ -87,18 +60,6 @@ def polling(cycles, period_ns=10_000_000):
     hundredths = np.rint(2000 * np.sin(0.05 * number)).astype("<i2")
     frames["data"][:, :2] = hundredths[:, None].view(np.uint8)
     return frames, hundredths
-
-
-def send(path, frames, per_packet=50, pause_s=0.01, stamp=False):
-    wait_for(path.exists, "the source's socket")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
-        sender.connect(str(path))
-        for start in range(0, len(frames), per_packet):
-            packet = frames[start : start + per_packet]
-            if stamp:
-                packet["t_device_ns"] = time.monotonic_ns() - np.arange(len(packet))[::-1] * 100_000
-            sender.send(packet.tobytes())
-            time.sleep(pause_s)
 
 
 # -- sources ---------------------------------------------------------------------------------

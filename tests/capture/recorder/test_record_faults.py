@@ -10,11 +10,8 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +19,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from support import processes
 from support.paths import ROOT
 from support.processes import wait_for
+from support.recorders import events, recording, send
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.log.messages.frames import DIR_TX, FrameArray, empty_frames
@@ -49,21 +46,6 @@ def polling() -> FrameArray:
     return frames
 
 
-@contextmanager
-def recording(
-    folder: Path, *arguments: str, env: Mapping[str, str] | None = None
-) -> Iterator[subprocess.Popen[str]]:
-    """A recorder in another process; its output is ``run.mcap``."""
-    control = folder / "control.sock"
-    command = [sys.executable, "-m", "undulog", "record", *arguments]
-    command += ["-o", str(folder / "run.mcap"), "--socket", str(control), "--floor", "0", "--json"]
-    with processes.start(*command, cwd=ROOT, env=env) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def report_of(process: subprocess.Popen[str]) -> dict[str, Any]:
     """The recorder's report."""
     said, trouble = process.communicate(timeout=60)
@@ -81,20 +63,6 @@ def counts(path: Path) -> dict[str, int]:
     return found
 
 
-def events(path: Path) -> list[tuple[str, str]]:
-    with Session.open(path) as session:
-        return [(message.name, message.msg) for _, message in session.messages("/rosout")]
-
-
-def send(path: Path, frames: FrameArray, pause_s: float = 0.004) -> None:
-    wait_for(path.exists, "the source's socket")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
-        sender.connect(str(path))
-        for start in range(0, len(frames), 2 * JOINTS):
-            sender.send(frames[start : start + 2 * JOINTS].tobytes())
-            time.sleep(pause_s)
-
-
 # -- impossible times ---------------------------------------------------------------------------
 
 ODD_NS = (1 << 63, (1 << 63) + 18 * 10**17 - 1, 1 << 62, (1 << 63) - 1, 2**64 - 1)
@@ -105,8 +73,8 @@ def test_an_impossible_device_time_ends_no_decoding(first: int, tmp_path: Path) 
     bus, frames = tmp_path / "bus.sock", polling()
     odd = frames[first::200]
     odd["t_device_ns"] = np.resize(np.array(ODD_NS, dtype=np.uint64), len(odd))
-    with recording(tmp_path, f"can0=unix:{bus}", "--robot", "snake25") as process:
-        send(bus, frames)
+    with recording(tmp_path / "run.mcap", f"can0=unix:{bus}", "--robot", "snake25") as process:
+        send(bus, frames, pause_s=0.004)
         process.send_signal(signal.SIGTERM)
         report = report_of(process)
     assert counts(tmp_path / "run.mcap")["/joint_states"] == CYCLES
@@ -153,7 +121,12 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path:
     server = threading.Thread(target=serve)
     server.start()
     address = f"can0=can:socketcand:can0?host=127.0.0.1&port={listener.getsockname()[1]}"
-    with listener, recording(tmp_path, address, "--robot", "snake25", "--duration", "4") as process:
+    with (
+        listener,
+        recording(
+            tmp_path / "run.mcap", address, "--robot", "snake25", "--duration", "4"
+        ) as process,
+    ):
         report = report_of(process)
     server.join()
     assert counts(tmp_path / "run.mcap")["/joint_states"] == CYCLES
@@ -253,7 +226,9 @@ def test_a_decoder_that_always_fails_ends_in_bounded_time(
 
 def test_a_duration_ends_sources_of_simulated_time(tmp_path: Path) -> None:
     bus = tmp_path / "bus.sock"
-    with recording(tmp_path, f"can0=unix:{bus}?clock=simulated", "--duration", "1.5") as process:
+    with recording(
+        tmp_path / "run.mcap", f"can0=unix:{bus}?clock=simulated", "--duration", "1.5"
+    ) as process:
         wait_for(bus.exists, "the source's socket")
         report = report_of(process)
     assert process.returncode == 0
@@ -309,7 +284,7 @@ def test_a_plug_in_that_fails_to_start_is_an_error_with_its_name(
     where: str, plugged: dict[str, str], tmp_path: Path
 ) -> None:
     good = f"can0=unix:{tmp_path / 'bus.sock'}"
-    with recording(tmp_path, good, f"bad=faulty:{where}", env=plugged) as process:
+    with recording(tmp_path / "run.mcap", good, f"bad=faulty:{where}", env=plugged) as process:
         said, trouble = process.communicate(timeout=60)
     assert (process.returncode, said) == (1, "")
     assert "Traceback" not in trouble
@@ -324,8 +299,8 @@ def test_a_plug_in_that_fails_later_is_given_up_alone(
 ) -> None:
     bus, frames = tmp_path / "bus.sock", polling()[: 50 * 2 * JOINTS]
     sources = [f"can0=unix:{bus}", f"bad=faulty:{where}"]
-    with recording(tmp_path, *sources, env=plugged) as process:
-        send(bus, frames)
+    with recording(tmp_path / "run.mcap", *sources, env=plugged) as process:
+        send(bus, frames, pause_s=0.004)
         process.send_signal(signal.SIGTERM)
         report = report_of(process)
     assert process.returncode == 1

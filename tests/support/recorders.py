@@ -1,0 +1,51 @@
+"""Recorders in processes of their own, and what tests send to them and read of them."""
+
+import socket
+import time
+from contextlib import contextmanager
+
+import numpy as np
+
+from support import processes
+from support.paths import ROOT
+from support.processes import UNDULOG, wait_for
+from undulog.capture import Session
+
+
+def command(output, *arguments):
+    control = output.with_name("control.sock")
+    return [*UNDULOG, "record", *arguments, "-o", str(output), "--socket", str(control)]
+
+
+@contextmanager
+def recording(output, *arguments, env=None, floor="0"):
+    """A recorder in another process; it is running when the block begins."""
+    process = processes.start(
+        *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
+    )
+    try:
+        control = output.with_name("control.sock")
+        wait_for(lambda: control.exists() or process.poll() is not None, "the recorder")
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def events(path):
+    """Who said what on ``/rosout``."""
+    with Session.open(path) as session:
+        return [(message.name, message.msg) for _, message in session.messages("/rosout")]
+
+
+def send(path, frames, per_packet=50, pause_s=0.01, stamp=False):
+    """Send frames to a source ``unix:PATH``, as soon as it is there."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sender:
+        wait_for(lambda: sender.connect_ex(str(path)) == 0, "the source")
+        for start in range(0, len(frames), per_packet):
+            packet = frames[start : start + per_packet]
+            if stamp:
+                packet["t_device_ns"] = time.monotonic_ns() - np.arange(len(packet))[::-1] * 100_000
+            sender.send(packet.tobytes())
+            time.sleep(pause_s)
