@@ -18,49 +18,49 @@ if TYPE_CHECKING:
     from undulog.capture.common.errors import MissingExtraError
 
 VERBS: dict[str, tuple[str, str]] = {
-    "record": ("capture.record:record", "Record a robot, or its twin, into a session."),
-    "record status": ("capture.record_control:status", "Say how the running recordings go."),
-    "record mark": ("capture.record_control:mark", "Mark this moment of the running recording."),
-    "record note": ("capture.record_control:note", "Write a remark into the running recording."),
-    "record split": ("capture.record_control:split", "Have it begin a new part."),
-    "record stop": ("capture.record_control:stop", "End the running recording in good order."),
-    "record unit": ("capture.record_control:unit", "Print a systemd unit for recordings."),
-    "import": ("capture.import_export:import_log", "Bring in a foreign log: CAN traces, CSV."),
-    "log info": ("capture.log_info:log_info", "Say what a log holds."),
+    "record": ("capture record:record", "Record a robot, or its twin, into a session."),
+    "record status": ("capture record_control:status", "Say how the running recordings go."),
+    "record mark": ("capture record_control:mark", "Mark this moment of the running recording."),
+    "record note": ("capture record_control:note", "Write a remark into the running recording."),
+    "record split": ("capture record_control:split", "Have it begin a new part."),
+    "record stop": ("capture record_control:stop", "End the running recording in good order."),
+    "record unit": ("capture record_control:unit", "Print a systemd unit for recordings."),
+    "import": ("capture import_export:import_log", "Bring in a foreign log: CAN traces, CSV."),
+    "log info": ("capture log_info:log_info", "Say what a log holds."),
     "log check": (
-        "capture.log_check:log_check",
+        "capture log_check:log_check",
         "Say whether a session is good, degraded or bad, and why.",
     ),
-    "log recover": ("capture.log_edit:log_recover", "Write a whole file from what a crash left."),
-    "log cut": ("capture.log_edit:log_cut", "Write a part of a log to a new file."),
-    "log merge": ("capture.log_edit:log_merge", "Put several logs into one new file."),
+    "log recover": ("capture log_edit:log_recover", "Write a whole file from what a crash left."),
+    "log cut": ("capture log_edit:log_cut", "Write a part of a log to a new file."),
+    "log merge": ("capture log_edit:log_merge", "Put several logs into one new file."),
     "log export": (
-        "capture.import_export:export_log",
+        "capture import_export:export_log",
         "Write frames or joint columns for other tools.",
     ),
-    "sim list": ("sim.run:list_scenarios", "List the shipped scenarios."),
-    "sim run": ("sim.run:run", "Simulate a scenario and record it."),
-    "sim fit": ("replay.fit:fit", "Fit the twin's servo and friction to a session."),
-    "sim null": ("sim.run:null", "Model identical modules, for analyse --null."),
-    "sim serve": ("sim.serve:serve", "Be a robot on a bus, in real time."),
-    "drive": ("sim.drive:drive", "Drive a gait, a plan or recorded commands."),
-    "analyse": ("analysis.analyse:analyse", "Numbers: response, energy, spread over the segments."),
+    "sim list": ("sim run:list_scenarios", "List the shipped scenarios."),
+    "sim run": ("sim run:run", "Simulate a scenario and record it."),
+    "sim fit": ("replay fit:fit", "Fit the twin's servo and friction to a session."),
+    "sim null": ("sim run:null", "Model identical modules, for analyse --null."),
+    "sim serve": ("sim serve:serve", "Be a robot on a bus, in real time."),
+    "drive": ("sim drive:drive", "Drive a gait, a plan or recorded commands."),
+    "analyse": ("analysis analyse:analyse", "Numbers: response, energy, spread over the segments."),
     "predict": (
-        "analysis.predict:predict",
+        "analysis predict:predict",
         "From kicks: how oscillators that feel their servos synchronise.",
     ),
-    "compare": ("analysis.compare:compare", "What differs between two sessions or groups."),
+    "compare": ("analysis compare:compare", "What differs between two sessions or groups."),
     "plan lag-sweep": (
-        "analysis.plan:lag_sweep",
+        "analysis plan:lag_sweep",
         "Commands that tell the coupling without contact.",
     ),
-    "plan multisine": ("analysis.plan:multisine", "The same at several frequencies at once."),
-    "plan phase-kicks": ("analysis.plan:phase_kicks", "Commands that tell the coupling."),
-    "plan reversal": ("analysis.plan:reversal", "Commands that tell boundary from module."),
-    "report": ("analysis.report:report", "The offline report, one HTML page."),
-    "replay": ("replay.replay:replay", "Run a recorded experiment again in the twin; compare."),
-    "view": ("replay.view:view", "See a session in Rerun."),
-    "info": ("capture.info:info", "Versions and extras, for a bug report."),
+    "plan multisine": ("analysis plan:multisine", "The same at several frequencies at once."),
+    "plan phase-kicks": ("analysis plan:phase_kicks", "Commands that tell the coupling."),
+    "plan reversal": ("analysis plan:reversal", "Commands that tell boundary from module."),
+    "report": ("analysis report:report", "The offline report, one HTML page."),
+    "replay": ("replay replay:replay", "Run a recorded experiment again in the twin; compare."),
+    "view": ("replay view:view", "See a session in Rerun."),
+    "info": ("capture info:info", "Versions and extras, for a bug report."),
 }
 """Command to the function behind it, in its package's folder ``commands``, and its summary."""
 
@@ -132,7 +132,7 @@ def build(arguments: Sequence[str] = ()) -> App:
 
 def _in_commands(target: str) -> str:
     """The full path of a function: a package's commands are in its folder ``commands``."""
-    package, function = target.split(".")
+    package, function = target.split()
     return f"undulog.{package}.commands.{function}"
 
 
