@@ -171,16 +171,12 @@ def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
     assert [int(f["t_device_ns"][0]) for f, _ in found] == [round(s * 1000) * 10**6 for s in true_s]
 
 
-def test_an_adapter_that_was_asked_for_stamps_and_gives_none(traffic, same) -> None:
+@pytest.mark.parametrize(("asked", "given"), [(True, None), (False, np.arange(50))])
+def test_stamps_that_are_missing_or_not_asked_for_are_no_times_and_no_data(
+    asked, given, traffic, same
+) -> None:
     truth = traffic(50)
-    frames, _ = SlcanText(stamps=True).feed(lines(truth), 77, Tally(lambda: 0))
-    assert same(frames, truth)
-    assert set(frames["t_device_ns"].tolist()) == {77}
-
-
-def test_stamps_that_nobody_asked_for_are_not_data(traffic, same) -> None:
-    truth = traffic(50)
-    frames, _ = SlcanText(stamps=False).feed(lines(truth, np.arange(50)), 77, Tally(lambda: 0))
+    frames, _ = SlcanText(stamps=asked).feed(lines(truth, given), 77, Tally(lambda: 0))
     assert same(frames, truth)
     assert set(frames["t_device_ns"].tolist()) == {77}
 
