@@ -23,7 +23,6 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import Robot, Safety
 
-from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.gate import POSE_S, Gate
 from ..gate.limits import GateLimits, Ramp, gate_limits, missing_limits
 from ..gate.outcome import DriveEnding, GateEvent, GateFault
@@ -33,7 +32,7 @@ from ..twin.recording import Driver, open_session
 from ..twin.session_log import SessionLog
 from ..twin.stability import warnings
 from ..twin.twin import Sample, Twin
-from .dry_run_gait import Demand, GatedGait, JointDemand
+from .dry_run_gait import Demand, GatedGait, JointDemand, NotedGait
 from .motion import MotionSource
 
 _NOMINAL = """
@@ -172,19 +171,16 @@ def dry_run(
     robot = planned.robot
     missing = missing_limits(robot)
     limits = gate_limits(_unlimited(robot, missing))
-    gait = GatedGait(driven.make(robot, planned), robot, limits)
-    gate = Gate(
-        gait.inner,
-        limits,
-        duration_s=planned.duration_s,
-        rate_hz=CONTROL_RATE_HZ,
-        place=f"the twin of {robot.name}",
-    )
-    longest_s = planned.duration_s + POSE_S + 2.0 * _longest_ramp_s(limits)
+    inner = NotedGait(driven.make(robot, planned), robot)
+    place = f"the twin of {robot.name}"
+    gate = Gate(inner, limits, duration_s=planned.duration_s, place=place)
+    gait = GatedGait(inner, gate, robot, limits)
+    longest_ramp_s = Ramp(limits.lower, limits.upper, limits.ramp_rate).duration_s
+    longest_s = planned.duration_s + POSE_S + 2.0 * longest_ramp_s
     scenario = planned.changed(duration_s=min(longest_s, LONGEST_S))
     with ExitStack() as opened:
         twin = opened.enter_context(Twin(scenario, gait))
-        gait.attach(gate, twin)
+        gait.twin = twin
         session = None
         if output is not None:
             facts = {"planned_duration_s": repr(planned.duration_s), "dry_run": "yes"}
@@ -199,13 +195,13 @@ def dry_run(
                     session.write(sample, gait.fresh_remarks())
                 if on_time is not None:
                     on_time(gate.run_s)
-                if gait.done or (stop is not None and stop.requested):
+                if gate.done or (stop is not None and stop.requested):
                     break
         except SimulationError as error:
             if session is not None:
                 session.fail(str(error))
             raise
-        outcome, first = gate.outcome, gait.inner.first
+        outcome, first = gate.outcome, inner.first
         complete = outcome is not None and outcome.how is DriveEnding.COMPLETE
         if session is not None:
             why = "it was stopped" if outcome is None else outcome.why
@@ -220,7 +216,7 @@ def dry_run(
         joints=gait.tally.joints(),
         first_pose=first,
         approach_s=math.nan if "ramp_rate" in missing else _approach_s(first, limits),
-        cut=gait.inner.cut,
+        cut=inner.cut,
         missing=missing,
         fault=None if outcome is None else outcome.fault,
         started=gate.run_from is not None,
@@ -268,10 +264,6 @@ def _unlimited(robot: Robot, missing: tuple[str, ...]) -> Robot:
     """The robot without the limits that it lacks: what they would be is what is to be found out."""
     given = {name: _NO_LIMIT.get(name, math.inf) for name in missing}
     return dataclasses.replace(robot, safety=dataclasses.replace(robot.safety or Safety(), **given))
-
-
-def _longest_ramp_s(limits: GateLimits) -> float:
-    return Ramp(limits.lower, limits.upper, limits.ramp_rate).duration_s
 
 
 def _approach_s(first: FloatArray, limits: GateLimits) -> float:

@@ -270,20 +270,24 @@ class NotedGait:
 
 
 class GatedGait:
-    """Stands between a gait and the twin's servos; :meth:`attach` it before the twin runs.
+    """Stands between a gait and the twin's servos.
 
     Attributes:
+        twin: Whose servos they are; to be set before it runs.
         tally: What it asks of each joint while it runs.
         remarks: What the gate had to say.
     """
 
-    def __init__(self, gait: Gait, robot: Robot, limits: GateLimits) -> None:
+    def __init__(self, gait: NotedGait, gate: Gate, robot: Robot, limits: GateLimits) -> None:
         """Wrap a gait.
 
         Args:
+            gate: Its gate, before the first tick.
             limits: What the gate keeps to.
         """
-        self.inner = NotedGait(gait, robot)
+        self.names = gait.names
+        self.twin: Twin | None = None
+        self._gate = gate
         self.tally = DemandTally(robot, limits)
         self.remarks: list[GateEvent] = []
         self._told = 0
@@ -293,26 +297,6 @@ class GatedGait:
         self._values: FloatArray = np.full(len(gait.names), np.nan)
         self._tick = 0
         self._phase = Phase.POSE
-        self._gate: Gate | None = None
-        self._twin: Twin | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: the gait's own."""
-        return self.inner.names
-
-    @property
-    def done(self) -> bool:
-        """Whether the last command was the last."""
-        return self._gate is not None and self._gate.done
-
-    def attach(self, gate: Gate, twin: Twin) -> None:
-        """Say what it is between.
-
-        Args:
-            gate: The gate, before its first tick.
-        """
-        self._gate, self._twin = gate, twin
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - ticks count
         """Ask the gate.
@@ -324,9 +308,8 @@ class GatedGait:
         Returns:
             What passes the gate; the command before it where nothing is sent.
         """
-        assert self._gate is not None  # noqa: S101 - attached
-        assert self._twin is not None  # noqa: S101
-        for sample in self._twin.sensed:
+        assert self.twin is not None  # noqa: S101 - it steps this
+        for sample in self.twin.sensed:
             if isinstance(sample, JointSample):
                 self._current = sample.current
         status = JointStatus(
@@ -343,7 +326,7 @@ class GatedGait:
         self._phase = step.phase
         if was is Phase.RUN:
             self.tally.measured(readings.angle - before)
-            self.tally.hear(self._twin.sensed)
+            self.tally.hear(self.twin.sensed)
         if step.command is not None:
             self._command = step.command
         if step.gait is None or step.wanted is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,7 @@ from undulog.capture.common.console import Column, table
 
 from ..gate.limits import safety_example
 from .dry_run import DryRun, Verdict
-from .dry_run_gait import JointDemand
-
-if TYPE_CHECKING:
-    from .dry_run_gait import Demand
-
+from .dry_run_gait import Demand, JointDemand
 
 _NOTHING = "-"
 _TOO_NARROW = "; the terminal is too narrow for all of it, --json has it"
@@ -226,14 +222,8 @@ def _stop(run: DryRun) -> dict[str, Any] | None:
     fault = run.fault
     if fault is None:
         return None
-    return {
-        "time_s": run.duration_s if run.started else None,
-        "why": fault.text,
-        "kind": str(fault.kind),
-        "joint": fault.joint or None,
-        "value": fault.value,
-        "limit": fault.limit,
-    }
+    time_s = run.duration_s if run.started else None
+    return {"time_s": time_s, "why": fault.text, **fault.to_dict()}
 
 
 def _joint(joint: JointDemand) -> dict[str, Any]:

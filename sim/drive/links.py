@@ -79,11 +79,8 @@ class BusReadings:
             for sensor in robot.sensors
         }
         count = len(robot.joints)
-        self._joint_values: dict[Quantity, FloatArray] = {}
-        self._joint_times: dict[Quantity, FloatArray] = {}
-        for quantity in _OF_JOINTS:
-            self._joint_values[quantity] = np.full(count, np.nan)
-            self._joint_times[quantity] = np.full(count, -np.inf)
+        self._joint_values = {quantity: np.full(count, np.nan) for quantity in _OF_JOINTS}
+        self._joint_times = {quantity: np.full(count, -np.inf) for quantity in _OF_JOINTS}
         self._ranges: dict[str, tuple[float, float]] = {}
         self._vectors: dict[Quantity, dict[str, tuple[float, FloatArray]]] = {
             q: {} for q in _VECTORS

@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,6 @@ class ConsoleWatch:
 
     def gone(self) -> bool:
         """Whether the terminal is gone; once it is, nothing is written to it any more."""
-        if not self._terminals:
-            return False
         if not self._poll.poll(0):
             return False
         nowhere = os.open(os.devnull, os.O_RDWR)
@@ -59,42 +57,22 @@ LOST_S = 5.0
 """A robot in lockstep that doesn't come to its next tick within this time is lost [s]."""
 
 
-class Pace(Protocol):
-    """Gives one tick after the other."""
-
-    by_the_clock: bool
-    """Whether the clock sets the pace, rather than the robot."""
-    overruns: int
-    """Ticks that were left out because the one before took too long."""
-    late_s: float
-    """How late the newest tick is, against the first one that had not been taken [s]."""
-
-    def next(self) -> tuple[int, Sequence[FrameArray]]:
-        """Wait for the next tick.
-
-        Returns:
-            Its number, from 0, and the frames that have come by it.
-
-        Raises:
-            SourceError: If the bus is lost.
-        """
-        ...
-
-
 class WallPace:
-    """Ticks of the computer's monotonic clock, anchored at the first one."""
+    """Ticks of the computer's monotonic clock, anchored at the first one.
+
+    Attributes:
+        overruns: Ticks that were left out because the one before took too long.
+        late_s: How late the newest tick is, against the first one that had not been taken [s].
+    """
 
     by_the_clock = True
+    """Whether the clock sets the pace, rather than the robot."""
 
-    def __init__(self, link: Link, rate_hz: int) -> None:
-        """The first tick is at once.
-
-        Args:
-            rate_hz: Ticks a second.
-        """
+    def __init__(self, link: Link) -> None:
+        """The first tick is at once."""
         self.overruns = 0
         self.late_s = 0.0
-        self._link, self._period_ns = link, 1_000_000_000 // rate_hz
+        self._link, self._period_ns = link, 1_000_000_000 // CONTROL_RATE_HZ
         self._tick = -1
         self._start_ns = 0
 
@@ -124,18 +102,14 @@ class WallPace:
 
 
 class LockstepPace:
-    """The ticks of a robot that waits for the commands of each."""
+    """The ticks of a robot that waits for the commands of each: none is late."""
 
     by_the_clock = False
+    overruns = 0
+    late_s = 0.0
 
     def __init__(self, link: VirtualRobotLink) -> None:
-        """The first tick that the robot tells is tick 0.
-
-        Args:
-            link: The robot's bus.
-        """
-        self.overruns = 0
-        self.late_s = 0.0
+        """The first tick that the robot tells is tick 0."""
         self._link = link
         self._first: int | None = None
 
@@ -256,7 +230,7 @@ class ControlLoop:
         gate: Gate,
         robot: Robot,
         link: Link,
-        pace: Pace,
+        pace: WallPace | LockstepPace,
         *,
         spacing: Spacing | None,
         confirmation: Confirmation | None,

@@ -12,7 +12,7 @@ from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
 from undulog.capture.recorder.status import SessionClock
-from undulog.capture.robot.model import Bus, Direction, Quantity, Robot
+from undulog.capture.robot.model import Direction, Quantity, Robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.contract import SourceAddress, SourceCounts
 from undulog.capture.sources.events import Tally
@@ -102,24 +102,16 @@ def check_drivable(driven: MotionSource, robot: Robot) -> None:
     """
     if robot.bus is None:
         raise UsageError(f"{robot.name} has no bus map: {driven.name} can't be driven on one")
-    _check_map(robot.name, robot.joint_names, robot.bus)
-    driven.check_fits(robot)
-
-
-def _check_map(robot_name: str, joint_names: tuple[str, ...], bus: Bus) -> None:
-    """See that every joint can be commanded and tells its angle."""
-    for direction, quantity in (
-        (Direction.TX, Quantity.COMMAND),
-        (Direction.RX, Quantity.POSITION),
-    ):
-        asked = direction, quantity
-        there = {one.target for one in bus.signals if (one.direction, one.quantity) == asked}
-        lacking = [name for name in joint_names if name not in there]
+    for asked in (Direction.TX, Quantity.COMMAND), (Direction.RX, Quantity.POSITION):
+        there = {one.target for one in robot.bus.signals if (one.direction, one.quantity) == asked}
+        lacking = [name for name in robot.joint_names if name not in there]
         if lacking:
+            direction, quantity = asked
             raise UsageError(
-                f"the bus map of {robot_name} has no {quantity} ({direction}) of "
+                f"the bus map of {robot.name} has no {quantity} ({direction}) of "
                 f"{', '.join(lacking)}: it can't be driven on a bus"
             )
+    driven.check_fits(robot)
 
 
 def bus_address(on: str) -> SourceAddress:
@@ -189,11 +181,10 @@ def drive_bus(
             gait,
             plan.limits,
             duration_s=plan.duration_s,
-            rate_hz=CONTROL_RATE_HZ,
             place=plan.address.text,
             listen_s=0.0 if lockstep else LISTEN_S,
         )
-        pace = LockstepPace(virtual) if virtual and lockstep else WallPace(link, CONTROL_RATE_HZ)
+        pace = LockstepPace(virtual) if virtual and lockstep else WallPace(link)
         # In simulated time all ticks are a period apart, whenever they come.
         spacing = confirmation = None
         if not lockstep:
@@ -258,7 +249,7 @@ def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -
         records=plan.driven.records,
         force=plan.force,
     )
-    session.note("undulog.gate", plan.limits.facts())
+    session.writer.note("undulog.gate", plan.limits.facts())
     return session
 
 
@@ -360,7 +351,7 @@ class _Telling:
         if self._feedback is not None:
             self._session.say("warn", f"gate: {UNASKED}")
         self._feedback = feedback
-        self._session.note("undulog.gate.feedback", feedback.facts())
+        self._session.writer.note("undulog.gate.feedback", feedback.facts())
 
     def end(self, report: BusReport) -> None:
         for event in self._events.flush():
@@ -368,7 +359,7 @@ class _Telling:
         self._session.finish(report.outcome, remarks_of(report))
         if report.jitter is not None:
             facts = {name: str(value) for name, value in report.jitter.to_dict().items()}
-            self._session.note("undulog.gate.jitter", facts)
+            self._session.writer.note("undulog.gate.jitter", facts)
         if self._teller is not None:
             name, outcome = self._plan.driven.name, report.outcome
             why = f", {outcome.why}" if outcome.why else ""

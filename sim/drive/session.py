@@ -276,10 +276,6 @@ class BusSession:
             self._said.add(text)
             self._events.write(self._t_ns, level, _EVENTS_OF, text)
 
-    def note(self, name: str, facts: Mapping[str, str]) -> None:
-        """Write a metadata record."""
-        self.writer.note(name, facts)
-
     def finish(self, outcome: Outcome, remarks: Sequence[GateEvent]) -> None:
         """Say how it went.
 

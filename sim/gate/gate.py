@@ -16,13 +16,15 @@ ending begins when a joint is received again. It opens nothing and waits for not
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.robot.model import OnFault
 
-from ..gait.contract import Gait, GaitTick
+from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick
 from .feedback import CurrentLimiter, Silence, Watch
 from .limits import Clamp, Clamped, Ending, GateLimits, Ramp, why_not_from
 from .outcome import (
@@ -42,6 +44,7 @@ POSE_S = 2.0
 """So long the gate waits for the pose of every joint [s]."""
 HOLD_S = 10.0
 """So long the joints are held while the bus is silent [s]; then the drive ends without a ramp."""
+_PERIOD_S = 1.0 / CONTROL_RATE_HZ
 
 
 class Gate:
@@ -53,7 +56,6 @@ class Gate:
         limits: GateLimits,
         *,
         duration_s: float,
-        rate_hz: int,
         place: str,
         listen_s: float = 0.0,
     ) -> None:
@@ -62,7 +64,6 @@ class Gate:
         Args:
             limits: What the robot may do.
             duration_s: Time of the gait's last tick.
-            rate_hz: Control ticks a second.
             listen_s: So long the bus is listened to at least before anything is sent, to see whose
                 it is and to measure its reply interval [s]; 0: it is the robot's, which waits for
                 each command, so that no command can be held up.
@@ -85,8 +86,8 @@ class Gate:
         self._silent_ticks = 0  # those of the silence that were counted by then
         self._received_again = False  # in the tick before this one, while holding
         self._gait, self._limits, self._place = gait, limits, place
-        self._rate_hz, self._listen_s = rate_hz, listen_s
-        self._last = round(duration_s * rate_hz)
+        self._listen_s = listen_s
+        self._last = round(duration_s * CONTROL_RATE_HZ)
         self._watch, self._yielding = Watch(limits), CurrentLimiter(limits.current)
         self._first: GaitTick | None = None
         self._clamp: Clamp | None = None
@@ -106,12 +107,6 @@ class Gate:
     def cuts(self) -> dict[str, int]:
         """How often commands of single joints were changed, by why."""
         return dict(self._clamp.cuts) if self._clamp is not None else {}
-
-    @property
-    def joints_that_yielded(self) -> tuple[str, ...]:
-        """Joints whose commands gave way, as they drew too much."""
-        names = self._limits.joint_names
-        return tuple(name for name in names if f"yields {name}" in self._said)
 
     def step(
         self, tick: int, heard: GateInput, stop: str = "", *, at_once: bool = False
@@ -167,7 +162,7 @@ class Gate:
 
     def _begin(self, tick: int, heard: GateInput, stop: str) -> Clamp | None:
         """Start from the pose, once it is known; None while it isn't."""
-        waited_s = tick / self._rate_hz
+        waited_s = tick / CONTROL_RATE_HZ
         if (trouble := heard.trouble or self._reported) is not None:
             raise SourceError(self._place, f"no command was sent: {trouble.text}")
         if stop:
@@ -187,12 +182,12 @@ class Gate:
         if not measured:
             why = f"too few reports of joint angles in {waited_s:.2g} s to supervise a drive"
             raise SourceError(self._place, f"no command was sent: {why}")
-        clamp = self._clamp = Clamp(limits, angle, 1.0 / self._rate_hz)
+        clamp = self._clamp = Clamp(limits, angle, _PERIOD_S)
         first = self._first = self._gait.step(0.0, heard.readings)
         target = np.clip(first.command, limits.lower, limits.upper)
         target = np.where(np.isfinite(target), target, clamp.last)
         far = np.abs(target - clamp.last)
-        if (far <= limits.ramp_rate / self._rate_hz).all():
+        if (far <= limits.ramp_rate / CONTROL_RATE_HZ).all():
             self._run(tick)
             return clamp
         self._way, self._progress_s = Ramp(clamp.last, target, limits.ramp_rate), 0.0
@@ -210,16 +205,13 @@ class Gate:
         self, tick: int, heard: GateInput, clamp: Clamp
     ) -> tuple[FloatArray, GaitTick | None]:
         """What the phase wants to be commanded."""
-        if self.phase is Phase.APPROACH and self._way is not None:
-            self._progress_s += 1.0 / self._rate_hz  # also where it is late: no jump
-            if self._progress_s < self._way.duration_s:
+        if self.phase is not Phase.RUN and self._way is not None:
+            self._progress_s += _PERIOD_S  # also where it is late: no jump
+            if self.phase is Phase.ENDING or self._progress_s < self._way.duration_s:
                 return self._way.at(self._progress_s), None
             self._run(tick)
-        if self.phase is Phase.ENDING and self._way is not None:
-            self._progress_s += 1.0 / self._rate_hz  # also where it is late: no jump
-            return self._way.at(self._progress_s), None
         run_tick = min(tick - (self.run_from or 0), self._last)
-        self.run_s = run_tick / self._rate_hz
+        self.run_s = run_tick / CONTROL_RATE_HZ
         self.run_ticks += 1
         said, self._first = self._first, None
         try:
@@ -233,7 +225,7 @@ class Gate:
 
     def _end_in_time(self) -> None:
         """See whether the last command was the last one."""
-        if self.phase is Phase.RUN and self.run_s * self._rate_hz >= self._last - 1e-6:
+        if self.phase is Phase.RUN and self.run_s * CONTROL_RATE_HZ >= self._last - 1e-6:
             self.outcome = Outcome(DriveEnding.COMPLETE, "", "the servos hold their last commands")
             self._become(Phase.DONE)
             return
@@ -277,7 +269,7 @@ class Gate:
                 f"a control tick was {heard.late_s:.2g} s late, more than {self._limits.late_s:g} s"
             )
             return GateFault(FaultKind.LATE, text, "", heard.late_s, self._limits.late_s)
-        return self._watch.look(tick / self._rate_hz, heard.status, clamp.last)
+        return self._watch.look(tick / CONTROL_RATE_HZ, heard.status, clamp.last)
 
     def _fail(self, fault: GateFault, clamp: Clamp, status: JointStatus) -> None:
         self._said.add(f"{fault.kind} {fault.joint}")
@@ -294,13 +286,14 @@ class Gate:
 
     def _silent(self, tick: int) -> GateFault:
         """Nothing was received for too long."""
-        silence, period_s = self.silence, 1.0 / self._rate_hz
-        silent_s, limit_s = silence.ticks * period_s, silence.limit * period_s
+        silence = self.silence
+        silent_s, limit_s = silence.ticks * _PERIOD_S, silence.limit * _PERIOD_S
+        interval_s = (silence.interval or 0) * _PERIOD_S
         text = (
             f"the bus was silent: no joint was received for {silence.ticks} control ticks "
-            f"({silent_s:.3g} s), at a reply interval of {(silence.interval or 0) * period_s:.3g} s"
+            f"({silent_s:.3g} s), at a reply interval of {interval_s:.3g} s"
         )
-        since_s = tick * period_s - silent_s
+        since_s = tick * _PERIOD_S - silent_s
         return GateFault(FaultKind.SILENT, text, "", silent_s, limit_s, since_s)
 
     def _go_on_holding(self, clamp: Clamp, status: JointStatus, *, at_once: bool) -> None:
@@ -320,7 +313,7 @@ class Gate:
         self._received_again = False
         self.held_ticks += self.silence.ticks - self._silent_ticks
         self._silent_ticks = self.silence.ticks
-        if at_once or self.silence.ticks >= HOLD_S * self._rate_hz:
+        if at_once or self.silence.ticks >= HOLD_S * CONTROL_RATE_HZ:
             self._halt("" if self.outcome is None else self.outcome.why)
 
     def _end(self, clamp: Clamp, status: JointStatus) -> None:
@@ -332,20 +325,18 @@ class Gate:
         else:
             how = f"the joints were brought straight within {ending.duration_s:.2g} s"
         if self.held_ticks:
-            how = f"the servos held for {self.held_ticks / self._rate_hz:.2g} s, then {how}"
+            how = f"the servos held for {self.held_ticks / CONTROL_RATE_HZ:.2g} s, then {how}"
         if self.outcome is not None:
-            self.outcome = Outcome(self.outcome.how, self.outcome.why, how, self.outcome.fault)
+            self.outcome = dataclasses.replace(self.outcome, ended=how)
             self._become(Phase.ENDING, f"{self.outcome.why}; {self._limits.on_fault}")
 
     def _halt(self, why: str) -> None:
         """Send nothing from here on."""
-        before = self.outcome or Outcome(DriveEnding.STOPPED, why, "")
-        self.outcome = Outcome(
-            before.how,
-            before.why if before.how is DriveEnding.FAULT else why,
-            "nothing more was sent; the servos hold their last commands",
-            before.fault,
-        )
+        ended = "nothing more was sent; the servos hold their last commands"
+        if self.outcome is not None and self.outcome.how is DriveEnding.FAULT:
+            self.outcome = dataclasses.replace(self.outcome, ended=ended)
+        else:
+            self.outcome = Outcome(DriveEnding.STOPPED, why, ended)
         self._become(Phase.DONE, "nothing is sent any more")
 
     # -- telling ---------------------------------------------------------------------------
@@ -356,7 +347,7 @@ class Gate:
         left_out = 0 if before is None else tick - before - 1
         if left_out > 0:
             many = f"{left_out} control ticks were" if left_out > 1 else "a control tick was"
-            of_gait = f", {left_out / self._rate_hz:g} s of the gait" * (self.phase is Phase.RUN)
+            of_gait = f", {left_out / CONTROL_RATE_HZ:g} s of the gait" * (self.phase is Phase.RUN)
             text = f"gate: {late_s:.3f} s late, {many} left out{of_gait}"
             self._remark("warn", text)
 

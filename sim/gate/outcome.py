@@ -53,6 +53,15 @@ class GateFault:
     limit: float | None = None
     since_s: float | None = None
 
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: its kind, joint, value and limit."""
+        return {
+            "kind": str(self.kind),
+            "joint": self.joint or None,
+            "value": self.value,
+            "limit": self.limit,
+        }
+
 
 _EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
@@ -78,13 +87,7 @@ class Jitter:
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the same, with the bounds of the counts."""
         bounds = [f"<= {edge:g} ms" for edge in _EDGES_MS] + [f"> {_EDGES_MS[-1]:g} ms"]
-        return {
-            "ticks": self.ticks,
-            "median_s": self.median_s,
-            "p99_s": self.p99_s,
-            "worst_s": self.worst_s,
-            "counts": dict(zip(bounds, self.counts, strict=True)),
-        }
+        return {**vars(self), "counts": dict(zip(bounds, self.counts, strict=True))}
 
     def __str__(self) -> str:
         """One line."""
@@ -147,15 +150,7 @@ class Outcome:
             "outcome": str(self.how),
             "why": self.why or None,
             "ended": self.ended,
-            "fault": None
-            if fault is None
-            else {
-                "kind": str(fault.kind),
-                "joint": fault.joint or None,
-                "value": fault.value,
-                "limit": fault.limit,
-                "since_s": fault.since_s,
-            },
+            "fault": None if fault is None else {**fault.to_dict(), "since_s": fault.since_s},
         }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -68,18 +69,14 @@ class ReplyEncoder:
         }
         coded = {(s.target, s.quantity) for s in bus.signals if s.unknown is not None}
         offered = set(_OF_JOINT) | set(self._vector_of.values()) | {Quantity.RANGE}
-        self._made_up = sorted(
+        self.made_up = sorted(
             {
                 f"{target} {quantity}"
                 for target, quantity, _ in self._encoder.values
                 if quantity not in offered and (target, quantity) not in coded
             }
         )
-
-    @property
-    def made_up(self) -> list[str]:
         """What the frames have to carry, the twin doesn't have and the map can't call unknown."""
-        return self._made_up
 
     def identifiers(self, target: str = "") -> IntArray:
         """Identifiers of frames, with flags.
@@ -133,10 +130,8 @@ class ReplyEncoder:
         Returns:
             Their frames, in the order of the map; what the twin knows no better is 0.
         """
-        values: dict[BusValue, float] = {}
-        for keys, quantity in zip(self._keys, _OF_JOINT, strict=True):
-            known = _numbers(angle) if quantity is Quantity.POSITION else [0.0] * len(keys)
-            values.update(zip(keys, known, strict=True))
+        values = dict.fromkeys(itertools.chain(*self._keys), 0.0)
+        values.update(zip(self._keys[0], _numbers(angle), strict=True))  # the position's
         frames = self._encoder.encode(values)
         frames["t_device_ns"] = t_ns
         return frames

@@ -198,15 +198,8 @@ class VirtualRobot:
         if made_up := self._replies.made_up:
             say("warn", f"reads 0 on the bus, as the twin has none: {', '.join(made_up)}")
 
-    @property
-    def robot(self) -> Robot:
-        """Who it is."""
-        return self._robot
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """No values: what the controller meant is not on the bus."""
-        return ()
+    names: tuple[str, ...] = ()
+    """No values: what the controller meant is not on the bus."""
 
     def run(self, ready: Callable[[], None] = lambda: None) -> Served:
         """Live until the scenario ends or a stop is asked for.

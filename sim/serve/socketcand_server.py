@@ -116,12 +116,11 @@ class SocketcandServer:
         """The oldest frame that a client sent and nobody has taken; None where there is none."""
         if not self._sent:
             return None
-        if len(self._sent) == MOST_SENT:
-            found = self._sent.popleft()
+        found = self._sent.popleft()
+        if len(self._sent) == MOST_SENT - 1:
             for client in self._clients.values():
                 self._watch(client)
-            return found
-        return self._sent.popleft()
+        return found
 
     def broadcast(self, frames: FrameArray, but: int | None = None) -> None:
         """Give frames to every client in raw mode.

@@ -588,7 +588,7 @@ class _NoBus:
 
 
 def test_late_ticks_are_left_out_and_counted():
-    pace = WallPace(_NoBus(), 100)
+    pace = WallPace(_NoBus())
     assert pace.next()[0] == 0
     before = pace.next()[0]  # 1, where nothing else keeps the computer busy
     assert pace.overruns == before - 1

@@ -85,7 +85,7 @@ def on_the_bus(command):
 def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn, how):
     gait = Drawn()
     limits = dataclasses.replace(gate_limits(ROBOT), on_fault=how)
-    gate = Gate(gait, limits, duration_s=0.3, rate_hz=RATE_HZ, place="can:test")
+    gate = Gate(gait, limits, duration_s=0.3, place="can:test")
     sent, tick, last = [], 0, {"stop": "", "at_once": False}
     unknown = np.full(COUNT, np.nan)
 
