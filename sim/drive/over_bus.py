@@ -63,10 +63,10 @@ def bus_plan(
     on: str,
     *,
     robot: Robot | None = None,
-    duration_s: float | None,
+    duration_s: float | None = None,
     output: Path,
-    recorder: Path | None,
-    force: bool,
+    recorder: Path | None = None,
+    force: bool = False,
 ) -> BusPlan:
     """Check what was asked for.
 

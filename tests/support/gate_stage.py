@@ -17,8 +17,9 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from support.processes import UNDULOG, process, wait_for
-from undulog.capture import SessionWriter, load_robot
+from support.processes import UNDULOG, process, serving, wait_for
+from support.written_sessions import write_commands
+from undulog.capture import load_robot
 
 LISTENER = Path(__file__).with_name("bus_listener.py")
 RATE_HZ = 100
@@ -26,7 +27,6 @@ MARK = 0x7F0  # an identifier that nobody else uses
 STEP = math.radians(0.01)  # of a command on the bus
 JOINTS = ("joint01", "joint02", "joint03", "joint04")
 LIMIT, MAX_RATE, RAMP_RATE = math.radians(30.0), 4.0, 1.0
-EPOCH_NS = 1_735_689_600_000_000_000
 FRAME = np.dtype(
     [
         *(("t_device_ns", "<u8"), ("t_host_ns", "<u8"), ("id_flags", "<u4")),
@@ -114,22 +114,11 @@ def wave(times_s):
     return np.array([0.3, 0.15, 0.45, 0.1]) * np.sin(2 * np.pi * turns)
 
 
-def write_commands(path, robot, duration_s, *, names=JOINTS, commands=wave):
+def commanded(path, robot, duration_s, *, names=JOINTS, commands=wave):
     """A session of commands for a robot (its name or file)."""
-    times_s = np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
-    given = commands(times_s)
-    with SessionWriter(
-        path,
-        session_id="recorded-before",
-        epoch_ns=EPOCH_NS,
-        robot=load_robot(robot),
-        clock={"computer": "host"},
-    ) as writer:
-        channel = writer.joint_state("/joint_commands", names, unit="rad")
-        for time_s, row in zip(times_s, given, strict=True):
-            channel.write(EPOCH_NS + round(1e9 * time_s), row[: len(names)])
-        writer.set_verdict("good")
-    return path
+    given = commands(np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ)
+    facts = {"robot": load_robot(robot), "clock": {"computer": "host"}}
+    return write_commands(path, names, given[:, : len(names)], **facts)
 
 
 class Stage:
@@ -206,11 +195,7 @@ def staged(folder, scenario, *faults, pace="--wait"):
     ordered = [word for fault in faults for word in ("--fault", fault)]
     database, heard = folder / "listened.dbc", folder / "heard.jsonl"
     database.write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
-    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", "0", pace, "--json", *ordered)
-    with process(*serve) as robot:
-        line = robot.stdout.readline()
-        assert line, robot.stderr.read()
-        ready = json.loads(line)
+    with serving(scenario, pace, *ordered) as (robot, ready):
         words = (sys.executable, LISTENER, ready["port"], ready["bus"], database, heard)
         with process(*words) as listener:
             assert listener.stdout.readline() == "listening\n", listener.stderr.read()

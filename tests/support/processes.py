@@ -1,5 +1,6 @@
 """Commands and other processes run from tests, and patience with them."""
 
+import json
 import os
 import signal
 import subprocess
@@ -46,6 +47,16 @@ def process(*words, **options):
         except subprocess.TimeoutExpired:
             running.kill()
             running.communicate(timeout=20)
+
+
+@contextmanager
+def serving(scenario, *words, place="0", **options):
+    """A virtual robot's process, and what it says when it is ready."""
+    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", place, "--json", *words)
+    with process(*serve, **options) as robot:
+        line = robot.stdout.readline()
+        assert line, robot.communicate()
+        yield robot, json.loads(line)
 
 
 def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):

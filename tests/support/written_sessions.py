@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
+from numpy.typing import ArrayLike
 
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.definitions import schema_text
@@ -37,6 +40,33 @@ def write_session(path: Path, count: int = 300, **options: object) -> np.ndarray
             odometry.write(t_ns, position, np.array([0, 0, 0, 1.0]), velocity, effort)
         writer.set_verdict("good", ["nothing lost"])
     return data
+
+
+def write_commands(
+    path: Path,
+    names: Sequence[str],
+    commands: Iterable[ArrayLike],
+    *,
+    times_ns: Iterable[int] | None = None,
+    plan: dict[str, str] | None = None,
+    **options: object,
+) -> Path:
+    """A session of joint commands and nothing else.
+
+    Args:
+        commands: Angles of each tick [rad].
+        times_ns: When they were given, after the start [ns]; 10 ms apart if None.
+        plan: The record of the plan that they are from.
+        options: Of the session's writer.
+    """
+    with SessionWriter(path, session_id="commands", epoch_ns=EPOCH_NS, **options) as writer:
+        if plan is not None:
+            writer.note("undulog.plan", plan)
+        channel = writer.joint_state("/joint_commands", names, unit="rad")
+        for t_ns, command in zip(times_ns or itertools.count(0, STEP_NS), commands, strict=False):
+            channel.write(EPOCH_NS + t_ns, command)
+        writer.set_verdict("good")
+    return path
 
 
 def write_foreign(

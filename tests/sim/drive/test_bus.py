@@ -14,7 +14,8 @@ import pytest
 
 import undulog as front
 from support.processes import wait_for
-from undulog.capture import Session, SessionWriter, load_robot
+from support.written_sessions import write_commands
+from undulog.capture import Session, load_robot
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
 from undulog.capture.common.process import StopRequest
@@ -177,15 +178,7 @@ def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):
 
 
 def planned(what, on, output, *, duration_s=0.2, robot=None):
-    return bus_plan(
-        find_motion(what),
-        on,
-        robot=robot,
-        duration_s=duration_s,
-        output=output,
-        recorder=None,
-        force=False,
-    )
+    return bus_plan(find_motion(what), on, robot=robot, duration_s=duration_s, output=output)
 
 
 @pytest.mark.parametrize("how", list(OnFault))
@@ -270,10 +263,8 @@ def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
     recorded, path = tmp_path / "bent.mcap", tmp_path / "a.mcap"
     robot = load_robot("snake25")
     bent = np.where(np.arange(25) % 2, 0.0, 0.2)
-    with SessionWriter(recorded, session_id="bent", epoch_ns=10**18, robot=robot) as writer:
-        commands = writer.joint_state("/joint_commands", robot.joint_names, unit="rad")
-        for tick in range(31):
-            commands.write(10**18 + tick * 10_000_000, bent * np.cos(tick / 100))
+    commands = [bent * np.cos(tick / 100) for tick in range(31)]
+    write_commands(recorded, robot.joint_names, commands, robot=robot)
     with alive(weak(9.0)) as (on, _):
         report = drive_bus(planned(str(recorded), on, path, duration_s=0.3), stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE
@@ -281,11 +272,11 @@ def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
     assert report.approach_s == pytest.approx(way_s, abs=0.011)
     with Session.open(path) as session:
         given = np.array(session.joints("/joint_commands").values)
-        assert session.metadata["undulog"]["driven.session_id"] == "bent"
+        assert session.metadata["undulog"]["driven.session_id"] == "commands"
         phases = [message.data for _, message in session.messages("/gate/phase")]
     assert phases == ["approach", "run"]
     approach, run = given[:, :-31], given[:, -31:]
-    np.testing.assert_array_equal(run.T, [bent * np.cos(tick / 100) for tick in range(31)])
+    np.testing.assert_array_equal(run.T, commands)
     assert np.abs(np.diff(approach)).max() <= 0.5 * 0.01 * (1 + 1e-9)
     assert np.abs(run[:, 0] - approach[:, -1]).max() <= 0.5 * 0.01
 
@@ -478,18 +469,9 @@ def test_wrong_usage_exits_2(words, told, capsys, tmp_path, monkeypatch):
 def test_commands_of_another_joint_set_are_refused_with_both_lists(tmp_path, capsys):
     recorded = tmp_path / "other.mcap"
     names = [f"joint{i:02d}" for i in range(1, 13)]
-    with SessionWriter(recorded, session_id="o", epoch_ns=10**18) as writer:
-        writer.joint_state("/joint_commands", names, unit="rad").write(10**18, np.zeros(12))
-    words = [
-        "--on",
-        "can:virtual:bus",
-        "--arm",
-        "--robot",
-        "snake25",
-        "-o",
-        str(tmp_path / "a.mcap"),
-    ]
-    assert front.run(["drive", str(recorded), *words]) == 2
+    write_commands(recorded, names, [np.zeros(12)])
+    on = ["--on", "can:virtual:bus", "--arm", "--robot", "snake25"]
+    assert front.run(["drive", str(recorded), *on, "-o", str(tmp_path / "a.mcap")]) == 2
     said = capsys.readouterr().err
     assert "other.mcap is of another joint set than snake25; nothing was sent" in said
     assert "it commands 12 joints: joint01, joint02, " in said

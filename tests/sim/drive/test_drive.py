@@ -12,9 +12,9 @@ from mcap.reader import make_reader
 
 import undulog as front
 from support.processes import UNDULOG, start
+from support.written_sessions import write_commands
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
-from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from undulog.sim.drive.in_process import FadingGait
@@ -22,7 +22,6 @@ from undulog.sim.drive.motion import CommandReplay, RecordedCommands
 from undulog.sim.gait.contract import GaitTick
 from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 
-T0_NS = 10**18
 COLUMNS = (
     ("/joint_commands", "position"),
     ("/joint_states", "position"),
@@ -263,12 +262,10 @@ def test_fading_leaves_what_a_controller_tells_of_itself(make_robot):
     assert half.command == pytest.approx(np.full(4, 0.1))
 
 
-def written(path, rows, names=("joint01", "joint02"), **options):
+def written(path, rows, names=("joint01", "joint02")):
     """A session of commands: (time [ns], values) for each message."""
-    with SessionWriter(path, session_id="s", epoch_ns=0, **options) as writer:
-        channel = writer.joint_state("/joint_commands", names, unit="rad")
-        for t_ns, values in rows:
-            channel.write(T0_NS + t_ns, values)
+    times_ns, commands = zip(*rows, strict=True)
+    write_commands(path, names, commands, times_ns=times_ns)
     with Session.open(path) as session:
         return RecordedCommands.read(session)
 
@@ -315,12 +312,8 @@ def test_commands_without_a_gait_give_a_session_without_one(tmp_path, capsys):
 def test_what_planned_commands_are_for_goes_on_to_the_run(tmp_path):
     names, plan = ("joint01", "joint02"), {"plan": "phase-kicks", "run": "3"}
     source, path = tmp_path / "planned.mcap", tmp_path / "run.mcap"
-    facts = {"settle_s": "0.04"}
-    with SessionWriter(source, session_id="s", epoch_ns=T0_NS, metadata=facts) as writer:
-        writer.note("undulog.plan", plan)
-        channel = writer.joint_state("/joint_commands", names, unit="rad")
-        for k in range(11):
-            channel.write(T0_NS + k * 10_000_000, (0.01 * k, 0.0))
+    commands = [(0.01 * k, 0.0) for k in range(11)]
+    write_commands(source, names, commands, plan=plan, metadata={"settle_s": "0.04"})
     assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) == 0
     with Session.open(path) as session:
         assert session.metadata["undulog.plan"] == plan
@@ -330,12 +323,8 @@ def test_what_planned_commands_are_for_goes_on_to_the_run(tmp_path):
 
 
 def planned_commands(path, **plan):
-    with SessionWriter(path, session_id="s", epoch_ns=T0_NS) as writer:
-        writer.note("undulog.plan", {"plan": "reversal", **plan})
-        channel = writer.joint_state("/joint_commands", ("joint01",), unit="rad")
-        for k in range(3):
-            channel.write(T0_NS + k * 10_000_000, (0.01 * k,))
-    return path
+    commands = [(0.01 * k,) for k in range(3)]
+    return write_commands(path, ("joint01",), commands, plan={"plan": "reversal", **plan})
 
 
 def test_a_plan_turns_the_robot_and_gives_each_run_noise_of_its_own(tmp_path):
@@ -391,10 +380,8 @@ def test_a_slope_can_be_set(tmp_path):
 
 @pytest.mark.parametrize("stated", ["soon", "-1", "inf", "nan"])
 def test_a_senseless_settling_time_is_none(tmp_path, stated):
-    path = tmp_path / "a.mcap"
     facts = {"settle_s": stated}
-    with SessionWriter(path, session_id="s", epoch_ns=T0_NS, metadata=facts) as writer:
-        writer.joint_state("/joint_commands", ("joint01",), unit="rad").write(T0_NS, (0.0,))
+    path = write_commands(tmp_path / "a.mcap", ("joint01",), [(0.0,)], metadata=facts)
     with Session.open(path) as session:
         assert session.settle_s is None
 

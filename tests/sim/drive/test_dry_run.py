@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import undulog as front
-from undulog.capture import Session, SessionWriter, load_robot
+from support.written_sessions import write_commands
+from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
@@ -17,7 +18,6 @@ from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world
 from undulog.sim.drive.dry_run_text import reported, told
 from undulog.sim.drive.motion import find_motion
 
-EPOCH_NS = 1_735_689_600_000_000_000
 RATE_HZ = 100
 WIDE = 10_000
 STEP = 1e-9
@@ -54,14 +54,8 @@ def robot():
 
 def write(path, robot, commands):
     """A session of commands, rows at 100 Hz."""
-    with SessionWriter(
-        path, session_id="made", epoch_ns=EPOCH_NS, robot=robot, clock={"computer": "host"}
-    ) as writer:
-        channel = writer.joint_state("/joint_commands", robot.joint_names, unit="rad")
-        for k, row in enumerate(commands):
-            channel.write(EPOCH_NS + k * (10**9 // RATE_HZ), row)
-        writer.set_verdict("good")
-    return path
+    clock = {"computer": "host"}
+    return write_commands(path, robot.joint_names, commands, robot=robot, clock=clock)
 
 
 def wave(robot, seconds, amplitude=0.2, frequency_hz=1.0, phase=0.5):
@@ -270,16 +264,10 @@ def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, capsys):
     assert front.run(["drive", "snake13-horizontal-pi3", *on]) == 2
     assert "snake13 has no bus map" in capsys.readouterr().err
     whole = load_robot("snake25")
-    with SessionWriter(
-        tmp_path / "few.mcap",
-        session_id="made",
-        epoch_ns=EPOCH_NS,
-        robot=whole,
-        clock={"c": "host"},
-    ) as writer:
-        channel = writer.joint_state("/joint_commands", ("joint01", "joint02"), unit="rad")
-        channel.write(EPOCH_NS, np.zeros(2))
-    assert front.run(["drive", str(tmp_path / "few.mcap"), *on]) == 2
+    few = tmp_path / "few.mcap"
+    joints = ("joint01", "joint02")
+    write_commands(few, joints, [np.zeros(2)], robot=whole, clock={"c": "host"})
+    assert front.run(["drive", str(few), *on]) == 2
     told = capsys.readouterr().err
     assert "it commands 2 joints: joint01, joint02" in told
     assert "snake25 has 25: joint01, joint02, joint03" in told

@@ -9,7 +9,8 @@ import can
 import numpy as np
 import pytest
 
-from undulog.capture import Session, SessionWriter
+from support.written_sessions import write_commands
+from undulog.capture import Session
 from undulog.capture.bus.encoding import poll_frames
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
@@ -82,19 +83,9 @@ def robot(tmp_path):
 
 
 def planned(tmp_path, robot, channel, angles):
-    recorded = tmp_path / "commands.mcap"
-    with SessionWriter(recorded, session_id="c", epoch_ns=10**18, robot=robot) as writer:
-        channel_of = writer.joint_state("/joint_commands", ["joint01"], unit="rad")
-        for k, angle in enumerate(angles):
-            channel_of.write(10**18 + k * 10_000_000, np.array([angle]))
-    return bus_plan(
-        find_motion(str(recorded)),
-        f"can:virtual:{channel}",
-        duration_s=None,
-        output=tmp_path / "a.mcap",
-        recorder=None,
-        force=False,
-    )
+    recorded = write_commands(tmp_path / "commands.mcap", ["joint01"], angles[:, None], robot=robot)
+    on = f"can:virtual:{channel}"
+    return bus_plan(find_motion(str(recorded)), on, output=tmp_path / "a.mcap")
 
 
 def test_the_request_of_the_shipped_joint_is_the_one_of_its_manual():

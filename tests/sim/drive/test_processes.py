@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from support.processes import UNDULOG, process, undulog, wait_for
+from support.processes import UNDULOG, process, serving, undulog, wait_for
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import DIR_TX
 
@@ -23,12 +23,7 @@ STEP = np.radians(0.01)
 @contextmanager
 def served(scenario, *words):
     """A virtual robot: its bus's address, and the process."""
-    with process(
-        *UNDULOG, "sim", "serve", scenario, "--socketcand", "0", "--json", *words
-    ) as robot:
-        line = robot.stdout.readline()
-        assert line, robot.stderr.read()
-        ready = json.loads(line)
+    with serving(scenario, *words) as (robot, ready):
         assert ready["event"] == "ready"
         yield f"can:socketcand:{ready['bus']}?host=127.0.0.1&port={ready['port']}", robot
 

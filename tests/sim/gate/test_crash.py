@@ -13,24 +13,9 @@ import pytest
 
 from support import gate_stage
 from support.gate_stage import JOINTS, Written, staged
-from support.processes import UNDULOG, process, undulog
+from support.processes import UNDULOG, process, serving, undulog
 from undulog.capture import Session
 from undulog.capture.log.health.session_check import check_session
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """Robot file and scenario."""
-    return gate_stage.robot_files(tmp_path_factory.mktemp("small"))
-
-
-@pytest.fixture(scope="module")
-def session(small, tmp_path_factory):
-    """A minute of commands."""
-    return gate_stage.write_commands(
-        tmp_path_factory.mktemp("session") / "wave.mcap", small[0], 60.0
-    )
-
 
 # -- kill -9 --------------------------------------------------------------------------------------
 
@@ -139,10 +124,8 @@ def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, 
 def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of):
     disk = disk_of("50m")
     path = disk / "a.mcap"
-    serve = (*UNDULOG, "sim", "serve", "flat", "--socketcand", "0")
-    with process(*serve, "--lockstep", "--fast", "--json") as robot:
-        port = json.loads(robot.stdout.readline())["port"]
-        words = (*UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={port}")
+    with serving("flat", "--lockstep", "--fast") as (_, ready):
+        words = (*UNDULOG, "drive", "flat", "--on", f"can:socketcand:can0?port={ready['port']}")
         words += ("--arm", "-o", path, "--duration", "600")
         with process(*words) as controller:
             err, written = check_told(controller, path, disk, ramp_rate=0.5)

@@ -21,21 +21,7 @@ from support.gate_stage import SAFETY, Written, staged
 from support.processes import process
 
 FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over by then
-LONG_S = 60.0
 ERROR = 40  # of rcl_interfaces/msg/Log
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """Robot file and scenario."""
-    return gate_stage.robot_files(tmp_path_factory.mktemp("small"))
-
-
-@pytest.fixture(scope="module")
-def session(small, tmp_path_factory):
-    """A minute of commands."""
-    path = tmp_path_factory.mktemp("session") / "wave.mcap"
-    return gate_stage.write_commands(path, small[0], LONG_S)
 
 
 def ended(on_stage, controller, path, *, code=1):
@@ -46,6 +32,17 @@ def ended(on_stage, controller, path, *, code=1):
     lines = on_stage.lines
     gate_stage.check_limits(lines)
     return out, err, gate_stage.check_session(path, lines)
+
+
+def after_fault(fault, scenario, session, tmp_path):
+    """A drive with a fault to come: what was complained of, and the new session."""
+    path = tmp_path / "a.mcap"
+    with (
+        staged(tmp_path, scenario, fault) as on_stage,
+        on_stage.replay(session, path) as controller,
+    ):
+        _, err, written = ended(on_stage, controller, path)
+    return err, written
 
 
 def errors(written):
@@ -66,12 +63,7 @@ def check_told(written, reason):
 
 @pytest.mark.slow
 def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with (
-        staged(tmp_path, small[1], f"stuck:joint03@{FAULT_AT_S}") as on_stage,
-        on_stage.replay(session, path) as controller,
-    ):
-        _, err, written = ended(on_stage, controller, path)
+    err, written = after_fault(f"stuck:joint03@{FAULT_AT_S}", small[1], session, tmp_path)
     assert err.startswith("error: joint03: tracking error 0.")
     # It lasts to the first tick that finds 0.5 s over, a little later on a busy computer.
     assert re.search(
@@ -83,29 +75,19 @@ def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(small, sessi
 
 @pytest.mark.slow
 def test_lost_replies_end_it_and_name_the_joint(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with (
-        staged(tmp_path, small[1], f"lost:joint02:1@{FAULT_AT_S}") as on_stage,
-        on_stage.replay(session, path) as controller,
-    ):
-        _, err, written = ended(on_stage, controller, path)
+    err, written = after_fault(f"lost:joint02:1@{FAULT_AT_S}", small[1], session, tmp_path)
     assert err.startswith("error: joint02 is lost: no angle for more than 1 s; the joints were bro")
     check_told(written, "joint02 is lost: no angle for more than 1 s")
     gate_stage.check_ramp_down(written, "fault: ")
 
 
 @pytest.mark.slow
-def test_the_robots_file_can_say_that_joints_are_held(session, tmp_path):
-    path = tmp_path / "a.mcap"
+def test_the_robots_file_can_say_that_joints_are_held(tmp_path):
     robot, scenario = gate_stage.robot_files(
         tmp_path / "holds", safety=SAFETY | {"on_fault": '"hold"'}
     )
-    holding = gate_stage.write_commands(tmp_path / "holding.mcap", robot, LONG_S)
-    with (
-        staged(tmp_path, scenario, f"lost:1@{FAULT_AT_S}") as on_stage,
-        on_stage.replay(holding, path) as controller,
-    ):
-        _, err, written = ended(on_stage, controller, path)
+    holding = gate_stage.commanded(tmp_path / "holding.mcap", robot, 60.0)
+    err, written = after_fault(f"lost:1@{FAULT_AT_S}", scenario, holding, tmp_path)
     assert err.startswith("error: the bus was silent: no joint was received for ")
     assert "nothing more was sent; the servos hold their last commands" in err
     gate_stage.check_hold(written, "fault: ")
@@ -113,12 +95,7 @@ def test_the_robots_file_can_say_that_joints_are_held(session, tmp_path):
 
 @pytest.mark.slow
 def test_after_bus_off_nothing_more_is_sent(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with (
-        staged(tmp_path, small[1], f"bus-off@{FAULT_AT_S}+2") as on_stage,
-        on_stage.replay(session, path) as controller,
-    ):
-        _, err, written = ended(on_stage, controller, path)
+    err, written = after_fault(f"bus-off@{FAULT_AT_S}+2", small[1], session, tmp_path)
     assert err.startswith("error: bus-off: ")
     assert "nothing more was sent" in err
     check_told(written, "bus-off: ")
@@ -128,12 +105,9 @@ def test_after_bus_off_nothing_more_is_sent(small, session, tmp_path):
 
 @pytest.mark.slow
 def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with (
-        staged(tmp_path, small[1], f"over-current:joint02:1.5@{FAULT_AT_S}") as on_stage,
-        on_stage.replay(session, path) as controller,
-    ):
-        _, err, written = ended(on_stage, controller, path)
+    err, written = after_fault(
+        f"over-current:joint02:1.5@{FAULT_AT_S}", small[1], session, tmp_path
+    )
     assert err.startswith("error: joint02: current 1.5 A, more than 1.4 A for 0.")
     check_told(written, "joint02: current 1.5 A")
     yields = "gate: joint02: draws more than 1.4 A: its command gives way"
@@ -207,7 +181,7 @@ def refused(folder, scenario, sessions):
 
 def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
     bare, _ = gate_stage.robot_files(tmp_path / "bare", safety=None)
-    session = gate_stage.write_commands(tmp_path / "limits.mcap", bare, 1.0)
+    session = gate_stage.commanded(tmp_path / "limits.mcap", bare, 1.0)
     said = refused(tmp_path, small[1], {"limits": session})["limits"]
     assert said.startswith(
         "error: snake4 can't be armed: its description lacks max_rate, ramp_rate, "
@@ -218,7 +192,7 @@ def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
 
 @pytest.mark.slow
 def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(small, tmp_path):
-    write, sessions = gate_stage.write_commands, {}
+    write, sessions = gate_stage.commanded, {}
     joints = ("joint01", "joint02", "joint03", "wheel")
     sessions["foreign"] = write(tmp_path / "foreign.mcap", small[0], 1.0, names=joints)
     sessions["fewer"] = write(tmp_path / "fewer.mcap", small[0], 1.0, names=joints[:3])
@@ -349,7 +323,7 @@ def test_a_robot_that_is_gone_leaves_a_whole_session(small, session, tmp_path):
 @pytest.mark.parametrize("plain", [False, True])
 def test_without_a_fault_it_runs_to_its_end(plain, small, tmp_path):
     path = tmp_path / "a.mcap"
-    short = gate_stage.write_commands(tmp_path / "short.mcap", small[0], 3.0)
+    short = gate_stage.commanded(tmp_path / "short.mcap", small[0], 3.0)
     with staged(tmp_path, small[1]) as on_stage:
         if plain:  # python-can's own socketcand: the robot isn't asked who it is
             on_stage.on += "&plain=yes"
@@ -369,7 +343,7 @@ def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
             np.arange(len(times_s)) // 20
         ]
 
-    steps = gate_stage.write_commands(
+    steps = gate_stage.commanded(
         tmp_path / "steps.mcap", "snake25", 1.0, names=names, commands=wild
     )
     # In lockstep the robot waits for its commands: no machine is too slow for 25 joints.

@@ -20,7 +20,8 @@ import pytest
 from support import far_end
 from support.far_end import beyond_rate, largest_burst
 from support.processes import start
-from undulog.capture import Session, SessionWriter
+from support.written_sessions import write_commands
+from undulog.capture import Session
 from undulog.capture.robot.description import load_robot
 
 FAR_END = far_end.__file__
@@ -71,12 +72,9 @@ def folder(tmp_path_factory):
     for kind, toml in tomls.items():
         (folder / f"{kind}.toml").write_text(toml)
         robot = load_robot(folder / f"{kind}.toml")
-        path = folder / f"{kind}.mcap"
-        with SessionWriter(path, session_id=kind, epoch_ns=10**18, robot=robot) as writer:
-            channel = writer.joint_state("/joint_commands", robot.joint_names, unit="rad")
-            for tick in range(3000):
-                angle = 2.6 * (1 - abs((tick + 80) % 320 - 160) / 80)  # a triangle
-                channel.write(10**18 + tick * 10_000_000, np.full(len(robot.joints), angle))
+        triangle = 2.6 * (1 - np.abs((np.arange(3000) + 80) % 320 - 160) / 80)
+        commands = np.repeat(triangle[:, None], len(robot.joints), axis=1)
+        write_commands(folder / f"{kind}.mcap", robot.joint_names, commands, robot=robot)
     return folder
 
 

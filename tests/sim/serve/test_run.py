@@ -19,7 +19,7 @@ import pytest
 
 import undulog as front
 from support.paths import ROOT
-from support.processes import UNDULOG, process, undulog, wait_for
+from support.processes import UNDULOG, process, serving, undulog, wait_for
 from undulog.capture import Session, load_robot
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.sources.address import parse_address
@@ -64,14 +64,6 @@ shape = "wall"
 from = [0.8, -3.0]
 to = [0.8, 3.0]
 """
-
-
-@contextmanager
-def robot_process(scenario, *words, place="0", **options):
-    """A virtual robot, and what it says when it is ready."""
-    serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", place, "--json", *words)
-    with process(*serve, **options) as started:
-        yield started, json.loads(started.stdout.readline())
 
 
 def ask(control, **request):
@@ -151,7 +143,7 @@ def on_the_bus(folder, scenario, *words, controller=driven):
     bus = folder / "bus.sock"
     over_bus = {way: folder / f"{way}.mcap" for way in ("tcp", "unix")}
     words = ("--unix", str(bus), "--duration", str(DURATION_S), "--lockstep", *words)
-    with robot_process(scenario, *words) as (robot, ready), ExitStack() as recorders:
+    with serving(scenario, *words) as (robot, ready), ExitStack() as recorders:
         tcp = f"can:socketcand:can0?port={ready['port']}"
         control = recorders.enter_context(recorder(tcp, over_bus["tcp"]))
         recorders.enter_context(recorder(f"unix:{bus}", over_bus["unix"]))
@@ -273,7 +265,7 @@ def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
 def test_it_ends_in_good_order(number, tmp_path):
     bus = tmp_path / "bus.sock"
     words = ("--wait", "--unix", str(bus)) if number is signal.SIGINT else ()
-    with robot_process("flat", *words, stderr=subprocess.PIPE) as (robot, ready):
+    with serving("flat", *words, stderr=subprocess.PIPE) as (robot, ready):
         assert ready["waits"] is bool(words)
         with socket.create_connection((ready["host"], ready["port"])) as client:
             assert client.recv(100) == b"< hi >"
@@ -331,7 +323,7 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
 def test_the_manuals_own_controller_moves_the_robot():
     page = (ROOT / "docs" / "virtual-robot.md").read_text()
     (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    with robot_process("flat", "--wait") as (robot, ready):
+    with serving("flat", "--wait") as (robot, ready):
         snippet = snippet.replace("29536", str(ready["port"])).replace("range(1000)", "range(50)")
         subprocess.run([sys.executable, "-c", snippet], check=True, timeout=PATIENCE_S)
         robot.send_signal(signal.SIGTERM)

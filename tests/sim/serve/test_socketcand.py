@@ -108,9 +108,6 @@ class Serving:
         with self.lock:
             self.bus.send(frames)
 
-    def until(self, condition, what):
-        wait_for(condition, what)
-
     def frames(self):
         return np.concatenate([empty_frames(0), *self.pulled])
 
@@ -244,7 +241,7 @@ def test_remote_requests_have_a_length_and_no_data():
 def test_frames_go_to_everyone_but_their_sender(serving):
     own, other = traffic(300, 1), traffic(200, 2)
     with peer(serving) as first, peer(serving) as second:
-        serving.until(lambda: serving.raw() == 2, "two clients")
+        wait_for(lambda: serving.raw() == 2, "two clients")
         serving.send(own)
         assert same(as_frames(received(first, 300)), own)
         assert same(as_frames(received(second, 300)), own)
@@ -253,7 +250,7 @@ def test_frames_go_to_everyone_but_their_sender(serving):
         messages = received(second, 200)
         assert same(as_frames(messages), other)
         assert {message.timestamp for message in messages} == {12.345678}
-        serving.until(lambda: len(serving.frames()) == 200, "all frames at the robot")
+        wait_for(lambda: len(serving.frames()) == 200, "all frames at the robot")
         assert same(serving.frames(), other)
         assert first.recv(0.2) is None
 
@@ -264,7 +261,7 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
     with SessionWriter(tmp_path / "x.mcap", session_id="s", epoch_ns=time.time_ns()) as writer:
         source.start(SourceContext(time.monotonic_ns, writer))
         try:
-            serving.until(lambda: serving.raw() == 1, "our source")
+            wait_for(lambda: serving.raw() == 1, "our source")
             arrays = []
             serving.send(own)
             with peer(serving) as foreign:
@@ -275,7 +272,7 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
                     arrays.extend(source.poll().frames)
                     return sum(map(len, arrays)) >= 400
 
-                serving.until(enough, "all frames")
+                wait_for(enough, "all frames")
         finally:
             source.stop()
     found = np.concatenate(arrays)
@@ -319,7 +316,7 @@ def test_answers_are_those_of_the_protocol(serving):
             sock.sendall(b"< %s >" % said)
             assert heard(sock, b">") == answer
         sock.sendall(b"< send 123 1 A >")  # without the raw mode one can send, too
-        serving.until(lambda: len(serving.pulled), "the frame")
+        wait_for(lambda: len(serving.pulled), "the frame")
     with hand(serving) as sock:
         sock.sendall(b"< send 123 1 A >")
         assert heard(sock, b">") == b"< error could not open bus >"
@@ -328,13 +325,13 @@ def test_answers_are_those_of_the_protocol(serving):
         sock.sendall(b"< open can7 >")
         assert heard(sock, b">") == b"< error could not open bus >"
         assert sock.recv(10) == b""
-    serving.until(lambda: any("there is only can0" in text for _, text in serving.said), "why")
+    wait_for(lambda: any("there is only can0" in text for _, text in serving.said), "why")
 
 
 def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
     own = traffic(1000, 6)
     with hand(serving, b"open can0", b"rawmode"), peer(serving) as good:
-        serving.until(lambda: serving.raw() == 2, "two clients")
+        wait_for(lambda: serving.raw() == 2, "two clients")
         sent = 0
         while not serving.server.dropped:
             serving.send(own)
@@ -363,12 +360,12 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
     with hand(serving, b"open can0") as sock:
         thread = threading.Thread(target=sock.sendall, args=(text,))
         thread.start()
-        serving.until(lambda: serving.bus.waiting >= MOST_SENT, "a full queue")
+        wait_for(lambda: serving.bus.waiting >= MOST_SENT, "a full queue")
         time.sleep(0.2)
         assert serving.bus.waiting < MOST_SENT + 2000
         with serving.lock:
             serving.pulling = True
-        serving.until(lambda: sum(map(len, serving.pulled)) == len(many), "all frames")
+        wait_for(lambda: sum(map(len, serving.pulled)) == len(many), "all frames")
         thread.join()
     assert same(serving.frames(), many)
 
@@ -391,7 +388,7 @@ def test_silent_clients_lock_nobody_out(serving, said):
         for _ in range(3 * MOST_CLIENTS):
             clients.enter_context(hand(serving, *said))
         late = clients.enter_context(peer(serving))
-        serving.until(lambda: serving.raw() == 2, "both in raw mode")
+        wait_for(lambda: serving.raw() == 2, "both in raw mode")
         serving.send(frames)
         found = received(late, len(frames))
         text = frame_text(frames)
