@@ -121,6 +121,17 @@ unit = "N m"
 """
 
 
+_PLAIN = {"compression": CompressionType.NONE, "enable_crcs": False}
+MAKES = {
+    "lz4": {"compression": CompressionType.LZ4, "chunk_size": 2000},
+    "open": {**_PLAIN, "chunk_size": 1500},
+    "bare": {**_PLAIN, "use_chunking": False},
+    "lone": {**_PLAIN, "index_types": IndexType.NONE, "chunk_size": 3000},
+    "cramped": {"chunk_size": 200},
+}
+"""How other makes write a log: options of its writer."""
+
+
 @dataclass(frozen=True)
 class Base:
     """Files that belong together.
@@ -170,13 +181,13 @@ def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) 
         writer.set_verdict("good", ["no fault"])
 
 
-def foreign_session(path: Path) -> None:
+def foreign_session(path: Path, ticks: int = 240) -> None:
     """A bag of mcap-ros2-support: one message a servo, without a robot."""
     with path.open("wb") as stream:
         writer = RosWriter(stream, chunk_size=4000)
         kind = "sensor_msgs/msg/JointState"
         schema = writer.register_msgdef(kind, schema_text(kind))
-        for tick in range(240):
+        for tick in range(ticks):
             t_ns = EPOCH_NS + tick * PERIOD_NS
             for topic, lag in (("/joint_commands", 0.0), ("/joint_states", 0.2)):
                 for k, name in enumerate(JOINTS[:2]):
@@ -217,6 +228,22 @@ def rewrite(source: Path, path: Path, **options: object) -> None:
         writer.finish()
 
 
+def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
+    """The session, a foreign one, and what other makes write: name to content.
+
+    Args:
+        folder: Has the robot.
+        ticks: Of the session.
+    """
+    gait, foreign = folder / "gait.mcap", folder / "foreign.mcap"
+    gait_session(gait, ticks)
+    foreign_session(foreign, ticks + 40)
+    for name, options in MAKES.items():
+        rewrite(gait, folder / f"{name}.mcap", **options)
+    names = [f"{name}.mcap" for name in ("gait", "foreign", *MAKES)]
+    return {name: (folder / name).read_bytes() for name in names}
+
+
 def can_messages(count: int = 160) -> Iterator[can.Message]:
     """Commands and states of the small robot, a servo at a time."""
     for number in range(count):
@@ -240,7 +267,8 @@ def _trace(path: Path, make: Callable[..., can.Listener] = can.Logger) -> Path:
     return path
 
 
-def _texts() -> dict[str, bytes]:
+def write_texts(folder: Path) -> dict[str, bytes]:
+    """Robot, scenario, plan, settings and table: name to content."""
     rows = "".join(f"{k / 100},{k % 360},{0.1 * k}\n" for k in range(80))
     texts = {
         "snake4.toml": ROBOT,
@@ -251,6 +279,8 @@ def _texts() -> dict[str, bytes]:
         "columns.toml": COLUMNS,
         "table.csv": "time,angle,torque\n" + rows,
     }
+    for name, text in texts.items():
+        (folder / name).write_text(text)
     return {name: text.encode() for name, text in texts.items()}
 
 
@@ -269,27 +299,10 @@ def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
     Returns:
         All of them.
     """
-    texts = _texts()
-    for name, data in texts.items():
-        (folder / name).write_bytes(data)
-    gait, plain = folder / "gait.mcap", {"compression": CompressionType.NONE, "enable_crcs": False}
-    gait_session(gait)
-    foreign_session(folder / "foreign.mcap")
-    makes = {
-        "lz4": {"compression": CompressionType.LZ4, "chunk_size": 2000},
-        "open": {**plain, "chunk_size": 1500},
-        "bare": {**plain, "use_chunking": False},
-        "lone": {**plain, "index_types": IndexType.NONE, "chunk_size": 3000},
-        "cramped": {"chunk_size": 200},
-    }
-    for name, options in makes.items():
-        rewrite(gait, folder / f"{name}.mcap", **options)
-    bases = [
-        Base("log", f"{name}.mcap", {f"{name}.mcap": data, **texts}, (f"{name}.mcap",))
-        for name in ("gait", "foreign", *makes)
-        for data in [(folder / f"{name}.mcap").read_bytes()]
-    ]
-    bases += _of_recorder(folder, texts)
+    texts = write_texts(folder)
+    logs = write_logs(folder)
+    bases = [Base("log", name, {name: data, **texts}, (name,)) for name, data in logs.items()]
+    bases += of_recorder(folder, texts)
     traces = [folder / f"trace.{kind}" for kind in ("log", "blf", "asc", "trc", "csv", "db")]
     for path in traces:
         _trace(path)
@@ -305,12 +318,13 @@ def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
         "settings": ("settings.toml", ("settings.toml",)),
     }
     bases += [Base(kind, name, trace, mutable) for kind, (name, mutable) in of_text.items()]
-    files = {"gait.mcap": gait.read_bytes(), "result.json": result_of(gait), **texts}
+    result = result_of(folder / "gait.mcap")
+    files = {"gait.mcap": logs["gait.mcap"], "result.json": result, **texts}
     bases.append(Base("result", "gait.mcap", files, ("result.json",)))
     return bases
 
 
-def _of_recorder(folder: Path, texts: dict[str, bytes]) -> list[Base]:
+def of_recorder(folder: Path, texts: dict[str, bytes]) -> list[Base]:
     """What a killed recorder leaves, and a session in parts."""
     work = folder / "recorded"
     work.mkdir()

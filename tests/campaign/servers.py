@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import random
@@ -115,8 +114,26 @@ def _wait(condition: Callable[[], object]) -> object:
     return found
 
 
+def _answer(address: tuple[str, int] | str, words: bytes, is_good: Callable[[bytes], bool]) -> str:
+    """What is wrong with the answer that a client gets; empty where it is good."""
+    with suppress(OSError), _connect(address) as link:
+        link.settimeout(0.5)
+        link.sendall(words)
+        data = _heard(link, is_good)
+        return "" if is_good(data) else f"only {data[:80]!r}"
+    return "the connection was refused or closed"
+
+
 def _descriptors(pid: int) -> int:
     return len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
+
+
+def _check_descriptors(result: Result, pid: int, before: int, of: str = "") -> None:
+    """Once the clients have gone, no more descriptors are open than before them."""
+    with suppress(TimeoutError):
+        _wait(lambda: _descriptors(pid) <= before + MORE)
+    if (left := _descriptors(pid)) > before + MORE:
+        result.failures.append(f"descriptors: {before} before, {left} after{of}")
 
 
 def _watched(
@@ -141,10 +158,7 @@ def _watched(
             result.failures.append(f"locked out: beside {len(links)} clients: {said}")
     if said := good():
         result.failures.append(f"locked out: after the attack: {said}")
-    with suppress(TimeoutError):
-        _wait(lambda: _descriptors(pid) <= before + MORE)
-    if (left := _descriptors(pid)) > before + MORE:
-        result.failures.append(f"descriptors: {before} before, {left} after")
+    _check_descriptors(result, pid, before)
 
 
 def serve(result: Result, folder: Path, rng: random.Random) -> None:
@@ -155,17 +169,14 @@ def serve(result: Result, folder: Path, rng: random.Random) -> None:
     def meanwhile(pid: int) -> None:
         try:
             ready = _wait(lambda: out.exists() and out.read_bytes().split(b"\n")[0])
-            port = json.loads(ready)["port"]
+            address = ("127.0.0.1", json.loads(ready)["port"])
 
             def good() -> str:
-                with suppress(OSError), _connect(("127.0.0.1", port)) as link:
-                    link.settimeout(0.5)
-                    link.sendall(b"< open can0 >< rawmode >")
-                    data = _heard(link, lambda data: data.count(b"< frame 20") > 10)
-                    return "" if b"< frame 20" in data else f"no frames, only {data[:60]!r}"
-                return "the connection was refused or closed"
+                return _answer(
+                    address, b"< open can0 >< rawmode >", lambda data: b"< frame 20" in data
+                )
 
-            _watched(result, pid, ("127.0.0.1", port), rng, good)
+            _watched(result, pid, address, rng, good)
         except (TimeoutError, ValueError) as error:
             result.failures.append(f"server: {error}")
         os.kill(pid, signal.SIGTERM)
@@ -184,11 +195,11 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
             _wait(lambda: Path(path).exists() and Path(source).exists())
 
             def good() -> str:
-                with suppress(OSError), _connect(path) as link:
-                    link.sendall(b'{"do": "status"}\n')
-                    data = _heard(link, lambda data: b"\n" in data)
-                    return "" if b'"ok": true' in data or b'"ok":true' in data else f"{data[:80]!r}"
-                return "the connection was refused or closed"
+                return _answer(
+                    path,
+                    b'{"do": "status"}\n',
+                    lambda data: b'"ok":true' in data.replace(b" ", b""),
+                )
 
             _watched(result, pid, path, rng, good)
             before = _descriptors(pid)
@@ -205,26 +216,14 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
                 result.failures.append(f"locked out: beside {len(silent)} senders: {said}")
             for link in silent:
                 link.close()
-            with suppress(TimeoutError):
-                _wait(lambda: _descriptors(pid) <= before + MORE)
-            if (left := _descriptors(pid)) > before + MORE:
-                result.failures.append(f"descriptors: {before} before, {left} after senders")
+            _check_descriptors(result, pid, before, " senders")
         except TimeoutError as error:
             result.failures.append(f"server: {error}")
-        with contextlib.suppress(ProcessLookupError):
+        with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGTERM)
 
-    words = [
-        "record",
-        f"unix:{source}",
-        "--quiet",
-        "--floor",
-        "1MB",
-        "--socket",
-        path,
-        "-o",
-        "new.mcap",
-    ]
+    words = ["record", f"unix:{source}", "--quiet", "--floor", "1MB"]
+    words += ["--socket", path, "-o", "new.mcap"]
     outcome = run_command(words, folder, meanwhile=meanwhile)
     result.add(outcome)
     if outcome.code != 0:
@@ -241,17 +240,13 @@ def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> No
             found = _wait(
                 lambda: out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
             )
-            port = int(found.group(1))
+            address = ("127.0.0.1", int(found.group(1)))
+            request = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 
             def good() -> str:
-                with suppress(OSError), _connect(("127.0.0.1", port)) as link:
-                    link.settimeout(0.5)
-                    link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-                    data = _heard(link, lambda data: b"\n" in data)
-                    return "" if data.startswith(b"HTTP/1") else f"{data[:60]!r}"
-                return "the connection was refused or closed"
+                return _answer(address, request, lambda data: data.startswith(b"HTTP/1"))
 
-            _watched(result, pid, ("127.0.0.1", port), rng, good, foreign=True)
+            _watched(result, pid, address, rng, good, foreign=True)
         except TimeoutError as error:
             result.failures.append(f"server: {error}")
         os.kill(pid, signal.SIGINT)
